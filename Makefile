@@ -1,0 +1,42 @@
+.DEFAULT_GOAL := help
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: help setup demo test test-all bench lint clean
+
+help:  ## Say what the targets do
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+$(BIN)/.installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "hairstage needs Python 3.11 or newer; set PYTHON=python3.x"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) 2>/dev/null || { \
+	  echo "installing python3-venv (Debian ships Python without it)"; \
+	  deploy/install-debian-package.sh python3-venv && $(PYTHON) -m venv $(VENV); }
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+setup: $(BIN)/.installed  ## Make .venv, install everything, find or install libLLVM >= 16
+	@deploy/ensure-llvm.sh
+
+demo: setup  ## Capture, reconstruct, fit and relight; SUBJECT=strands HEAD=mesh OUT=folder
+	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD))
+
+test: setup lint  ## Run the tests (under 12 minutes on 2 cores)
+	$(BIN)/python -m pytest
+
+test-all: setup lint  ## Run the slow tests too (under 60 minutes)
+	$(BIN)/python -m pytest -m 'slow or not slow'
+
+bench: setup  ## Run every benchmark
+	$(BIN)/hairstage bench all
+
+lint: setup  ## Style, types, floors
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:  ## Remove what the targets made
+	rm -rf $(VENV) runs build *.egg-info

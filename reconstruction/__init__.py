@@ -1,0 +1,1 @@
+"""Ground floor: calibrated geometry, capture folders, and strands from images."""

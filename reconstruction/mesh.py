@@ -1,0 +1,102 @@
+"""Triangle meshes: the head under the hair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh: `vertices (V, 3) float64` in metres, `faces (F, 3) int64`.
+
+    `scalp (F,) bool` marks the faces that hair grows from, or is None where nobody said.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    scalp: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64).reshape(-1, 3)
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        if not np.isfinite(vertices).all():
+            raise ValueError("mesh vertices must be finite")
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise ValueError(f"mesh faces must index the {len(vertices)} vertices")
+        if self.scalp is not None and np.shape(self.scalp) != (len(faces),):
+            raise ValueError(f"scalp must mark the {len(faces)} faces, got {np.shape(self.scalp)}")
+
+    def face_normals(self) -> NDArray[np.float64]:
+        """Unit normals `(F, 3)` by the right-hand rule; 0 for faces without area."""
+        n = self._cross()
+        length = np.linalg.norm(n, axis=1, keepdims=True)
+        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+
+    def face_areas(self) -> NDArray[np.float64]:
+        """Areas `(F,)` in square metres."""
+        return 0.5 * np.linalg.norm(self._cross(), axis=1)
+
+    def vertex_normals(self) -> NDArray[np.float64]:
+        """Area-weighted unit normals `(V, 3)`; 0 for vertices of no face."""
+        n = np.zeros_like(self.vertices)
+        np.add.at(n, self.faces.ravel(), np.repeat(self._cross(), 3, axis=0))
+        length = np.linalg.norm(n, axis=1, keepdims=True)
+        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+
+    def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Mesh:
+        """The mesh moved by `x -> rotation @ x + translation`."""
+        moved = self.vertices @ np.asarray(rotation, float).T + np.asarray(translation, float)
+        return Mesh(moved, self.faces, self.scalp)
+
+    def _cross(self) -> NDArray[np.float64]:
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return np.cross(b - a, c - a)
+
+
+def read_obj(path: str | Path) -> Mesh:
+    """Read the triangles of a Wavefront OBJ; polygons are fanned.
+
+    Faces in a group, object or material whose name contains "scalp" are marked as scalp; without
+    such a name `scalp` is None. Raises `ValueError` naming the file where it holds no triangles.
+    """
+    vertices: list[list[float]] = []
+    faces: list[list[int]] = []
+    scalp: list[bool] = []
+    in_scalp = {"g": False, "o": False, "usemtl": False}
+    for number, line in enumerate(Path(path).read_text().splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            if words[0] == "v":
+                vertices.append([float(w) for w in words[1:4]])
+            elif words[0] == "f":
+                index = [int(w.split("/")[0]) for w in words[1:]]
+                index = [i - 1 if i > 0 else len(vertices) + i for i in index]
+                for k in range(1, len(index) - 1):
+                    faces.append([index[0], index[k], index[k + 1]])
+                    scalp.append(any(in_scalp.values()))
+            elif words[0] in in_scalp:
+                in_scalp[words[0]] = "scalp" in " ".join(words[1:]).lower()
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from error
+    if not faces:
+        raise ValueError(f"{path}: no faces; expected a triangle mesh in Wavefront OBJ")
+    return Mesh(np.array(vertices), np.array(faces), np.array(scalp) if any(scalp) else None)
+
+
+def write_obj(path: str | Path, mesh: Mesh) -> None:
+    """Write a Wavefront OBJ; marked scalp faces go into a group called `scalp`."""
+    scalp = mesh.scalp if mesh.scalp is not None else np.zeros(len(mesh.faces), bool)
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices]
+    for name, which in (("head", ~scalp), ("scalp", scalp)):
+        if which.any():
+            lines.append(f"g {name}")
+            lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces[which] + 1]
+    Path(path).write_text("\n".join(lines) + "\n")

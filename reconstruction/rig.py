@@ -1,0 +1,176 @@
+"""The calibrated geometry of a stage, read from a rig file."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from reconstruction.cameras import Camera, Pinhole
+from reconstruction.lights import Light, dome_positions
+from reconstruction.projectors import Projector
+
+P = TypeVar("P", bound=Pinhole)
+
+
+class RigError(ValueError):
+    """A rig file that cannot be used; the message names the file, the table and the field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras, lights and projectors of one stage, in one world frame (metres, z up)."""
+
+    name: str
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    projectors: tuple[Projector, ...] = ()
+
+    def __post_init__(self) -> None:
+        for kind in ("cameras", "lights", "projectors"):
+            names = [item.name for item in getattr(self, kind)]
+            twice = {n for n in names if names.count(n) > 1}
+            if twice:
+                raise RigError(f"rig {self.name}: {kind} must have distinct names, twice: {twice}")
+
+    def camera(self, name: str) -> Camera:
+        """The camera called `name`; KeyError names the ones there are."""
+        return _named(self.cameras, name, "camera")
+
+    def light(self, name: str) -> Light:
+        """The light called `name`; KeyError names the ones there are."""
+        return _named(self.lights, name, "light")
+
+    def projector(self, name: str) -> Projector:
+        """The projector called `name`; KeyError names the ones there are."""
+        return _named(self.projectors, name, "projector")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Rig:
+        """Read a rig from TOML (explicit devices, `look_at` poses, domes) or from JSON.
+
+        Raises `RigError` naming file, table and field when something is missing or wrong.
+        """
+        path = Path(path)
+        try:
+            data = (
+                json.loads(path.read_text())
+                if path.suffix == ".json"
+                else tomllib.loads(path.read_text())
+            )
+        except FileNotFoundError:
+            raise RigError(f"{path}: no such rig file") from None
+        except (json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
+            raise RigError(f"{path}: {error}") from error
+        try:
+            return cls.from_dict(data)
+        except (RigError, ValueError, TypeError) as error:
+            raise RigError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Rig:
+        """Build a rig from the tables of a rig file; the device tables are not looked at."""
+        cameras = tuple(_pinholes(Camera, data, "cameras"))
+        if not cameras:
+            raise RigError("a rig needs at least one [[cameras]] table")
+        projectors = tuple(_pinholes(Projector, data, "projectors"))
+        return cls(str(data.get("name", "rig")), cameras, tuple(_lights(data, cameras)), projectors)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready description with every pose explicit; `from_dict` reads it back exactly."""
+        return {
+            "name": self.name,
+            "cameras": [c.to_dict() for c in self.cameras],
+            "lights": [light.to_dict() for light in self.lights],
+            "projectors": [p.to_dict() for p in self.projectors],
+        }
+
+
+T = TypeVar("T", Camera, Light, Projector)
+
+
+def _named(items: tuple[T, ...], name: str, kind: str) -> T:
+    for item in items:
+        if item.name == name:
+            return item
+    raise KeyError(f"no {kind} {name!r} in this rig; it has {[i.name for i in items]}")
+
+
+def _take(table: dict[str, Any], field: str, where: str) -> Any:
+    if field not in table:
+        raise RigError(f"{where}: the field {field!r} is missing")
+    return table[field]
+
+
+def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
+    """Pinholes from explicit `K, R, t` or from `position, target, fov_deg[, roll_deg]`."""
+    out: list[P] = []
+    for i, table in enumerate(data.get(key, [])):
+        where = f"[[{key}]] number {i + 1} ({table.get('name', 'unnamed')})"
+        size = (
+            str(_take(table, "name", where)),
+            *(int(_take(table, f, where)) for f in ("width", "height")),
+        )
+        more = {f: table[f] for f in ("intensity", "line_sigma") if f in table}
+        allowed = {
+            "name",
+            "width",
+            "height",
+            "K",
+            "R",
+            "t",
+            "position",
+            "target",
+            "fov_deg",
+            "roll_deg",
+        }
+        if kind is Projector:
+            allowed |= {"intensity", "line_sigma"}
+        unknown = set(table) - allowed
+        if unknown:
+            raise RigError(
+                f"{where}: unknown fields {sorted(unknown)}; known are {sorted(allowed)}"
+            )
+        try:
+            if "K" in table:
+                pose = (_take(table, f, where) for f in ("K", "R", "t"))
+                out.append(kind(*size, *pose, **more))
+            else:
+                pose = (_take(table, f, where) for f in ("position", "target", "fov_deg"))
+                out.append(kind.look_at(*size, *pose, roll_deg=table.get("roll_deg", 0.0), **more))
+        except (ValueError, TypeError) as error:
+            raise error if isinstance(error, RigError) else RigError(f"{where}: {error}") from error
+    return out
+
+
+def _lights(data: dict[str, Any], cameras: tuple[Camera, ...]) -> list[Light]:
+    """Explicit `[[lights]]`, then the `[dome]`: the nearest dome lamp moves beside each camera."""
+    lights = []
+    for i, table in enumerate(data.get("lights", [])):
+        where = f"[[lights]] number {i + 1}"
+        fields = [_take(table, f, where) for f in ("name", "position", "intensity")]
+        lights.append(Light(*fields, table.get("beside")))
+    dome = data.get("dome")
+    if dome is None:
+        return lights
+    count = int(_take(dome, "lights", "[dome]"))
+    intensity = _take(dome, "intensity", "[dome]")
+    positions = dome_positions(
+        count, float(_take(dome, "radius", "[dome]")), float(dome.get("lowest_deg", -90.0))
+    )
+    beside: dict[int, str] = {}
+    offset = float(dome.get("beside_cameras_at", 0.0))
+    if offset > 0:
+        for camera in cameras:
+            distance = np.linalg.norm(positions - camera.center, axis=1)
+            distance[list(beside)] = np.inf
+            nearest = int(distance.argmin())
+            beside[nearest] = camera.name
+            positions[nearest] = camera.center - offset * camera.R[1]
+    return lights + [
+        Light(f"light_{i:03d}", positions[i], intensity, beside.get(i)) for i in range(count)
+    ]

@@ -1,0 +1,147 @@
+"""Hair as polylines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Strands:
+    """Strands as polylines, root first.
+
+    `points (N, 3) float32` in metres; strand `i` is `points[offsets[i]:offsets[i + 1]]` with
+    `offsets (S + 1,) int64`; `radius` in metres, a scalar or `(N,)`.
+
+    Raises `ValueError` where offsets do not partition the points, a strand has under two points,
+    or a coordinate is not finite.
+    """
+
+    points: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    radius: float | NDArray[np.float32] = 4e-5
+
+    def __post_init__(self) -> None:
+        points = np.ascontiguousarray(self.points, dtype=np.float32).reshape(-1, 3)
+        offsets = np.ascontiguousarray(self.offsets, dtype=np.int64)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "offsets", offsets)
+        if offsets.ndim != 1 or len(offsets) == 0 or offsets[0] != 0 or offsets[-1] != len(points):
+            raise ValueError(f"offsets must run from 0 to the {len(points)} points, got {offsets}")
+        short = np.flatnonzero(np.diff(offsets) < 2)
+        if len(short):
+            raise ValueError(f"{len(short)} strands have under two points, the first is {short[0]}")
+        if not np.isfinite(points).all():
+            raise ValueError("points must be finite")
+        if isinstance(self.radius, np.ndarray):
+            radius = np.ascontiguousarray(self.radius, dtype=np.float32)
+            if radius.shape != (len(points),):
+                raise ValueError(f"radius must be a scalar or ({len(points)},), got {radius.shape}")
+            object.__setattr__(self, "radius", radius)
+        if not (np.all(np.asarray(self.radius) > 0) and np.all(np.isfinite(self.radius))):
+            raise ValueError("radius must be positive and finite")
+
+    @classmethod
+    def from_list(cls, strands: list[NDArray[np.floating]], radius: float = 4e-5) -> Strands:
+        """Strands from a list of `(n_i, 3)` arrays; an empty list gives a head without hair."""
+        counts = [len(s) for s in strands]
+        points = np.concatenate(strands) if strands else np.zeros((0, 3))
+        return cls(
+            points.astype(np.float32),
+            np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            radius,
+        )
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, i: int) -> NDArray[np.float32]:
+        """Points `(n, 3)` of strand `i`."""
+        if not 0 <= i < len(self):
+            raise IndexError(f"strand {i} of {len(self)}")
+        return self.points[self.offsets[i] : self.offsets[i + 1]]
+
+    @property
+    def strand_of_point(self) -> NDArray[np.int64]:
+        """Index of the strand of each point `(N,)`."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    @property
+    def segment_starts(self) -> NDArray[np.int64]:
+        """Index of the first point of each segment `(N - S,)`; its second is one further."""
+        keep = np.ones(len(self.points), bool)
+        keep[self.offsets[1:] - 1] = False
+        return np.flatnonzero(keep)
+
+    @property
+    def roots(self) -> NDArray[np.float32]:
+        """First points `(S, 3)`."""
+        return self.points[self.offsets[:-1]]
+
+    def lengths(self) -> NDArray[np.float64]:
+        """Arc length of each strand `(S,)`, metres."""
+        starts = self.segment_starts
+        step = np.linalg.norm(
+            self.points[starts + 1].astype(float) - self.points[starts].astype(float), axis=1
+        )
+        return np.bincount(self.strand_of_point[starts], weights=step, minlength=len(self))
+
+    def tangents(self) -> NDArray[np.float32]:
+        """Unit tangents `(N, 3)` by central differences, root to tip; 0 where points coincide."""
+        p = self.points.astype(float)
+        last = np.zeros(len(p), bool)
+        last[self.offsets[1:] - 1] = True
+        first = np.zeros(len(p), bool)
+        first[self.offsets[:-1]] = True
+        index = np.arange(len(p))
+        d = p[index + ~last] - p[index - ~first]
+        norm = np.linalg.norm(d, axis=1, keepdims=True)
+        return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
+
+    def subset(self, which: ArrayLike) -> Strands:
+        """The strands at the indices (or the mask) `which`, in that order."""
+        index = np.arange(len(self))[np.asarray(which)]
+        counts = np.diff(self.offsets)[index]
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        take = np.arange(offsets[-1]) + np.repeat(self.offsets[index] - offsets[:-1], counts)
+        radius = self.radius[take] if isinstance(self.radius, np.ndarray) else self.radius
+        return Strands(self.points[take], offsets, radius)
+
+    def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Strands:
+        """The strands moved by `x -> rotation @ x + translation`."""
+        moved = self.points.astype(float) @ np.asarray(rotation, float).T + np.asarray(translation)
+        return replace(self, points=moved.astype(np.float32))
+
+    def resampled(self, step: float) -> Strands:
+        """Every strand resampled at equal arc lengths of about `step` metres, ends kept.
+
+        Strands of no length keep their two end points. A per-point radius is interpolated.
+        """
+        if not step > 0:
+            raise ValueError(f"step must be positive, got {step}")
+        if len(self) == 0:
+            return self
+        p = self.points.astype(float)
+        starts = self.segment_starts
+        arc = np.zeros(len(p))
+        arc[starts + 1] = np.linalg.norm(p[starts + 1] - p[starts], axis=1)
+        arc = np.cumsum(arc)  # one growing coordinate over all strands: interpolate only once
+        lengths = self.lengths()
+        counts = np.maximum(np.ceil(lengths / step).astype(np.int64), 1) + 1
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        k = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts)
+        strand = np.repeat(np.arange(len(self)), counts)
+        s = arc[self.offsets[:-1]][strand] + lengths[strand] * (k / (counts[strand] - 1))
+        low, high = self.offsets[:-1][strand], self.offsets[1:][strand] - 2
+        left = np.clip(np.searchsorted(arc, s, side="right") - 1, low, high)
+        span = arc[left + 1] - arc[left]
+        w = np.clip(np.divide(s - arc[left], span, out=np.zeros_like(s), where=span > 0), 0, 1)
+        end = k == counts[strand] - 1
+        left, w = np.where(end, high, left), np.where(end, 1.0, w)
+        points = p[left] * (1 - w)[:, None] + p[left + 1] * w[:, None]
+        radius = self.radius
+        if isinstance(radius, np.ndarray):
+            radius = (radius[left] * (1 - w) + radius[left + 1] * w).astype(np.float32)
+        return Strands(points.astype(np.float32), offsets, radius)

@@ -1,0 +1,1 @@
+"""The device side of the wires: a rig without hardware, its frames rendered."""

@@ -1,0 +1,1 @@
+"""Runs the stage: HTTP API, CLI, jobs, sequencing, device drivers."""
