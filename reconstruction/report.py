@@ -1,4 +1,4 @@
-"""One report that every stage fills: seconds, error against run time, what was left out, warnings."""
+"""One report for every stage: seconds, error against run time, work left out, warnings."""
 
 from __future__ import annotations
 

@@ -111,10 +111,8 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
     out: list[P] = []
     for i, table in enumerate(data.get(key, [])):
         where = f"[[{key}]] number {i + 1} ({table.get('name', 'unnamed')})"
-        size = (
-            str(_take(table, "name", where)),
-            *(int(_take(table, f, where)) for f in ("width", "height")),
-        )
+        name = str(_take(table, "name", where))
+        width, height = (int(_take(table, f, where)) for f in ("width", "height"))
         more = {f: table[f] for f in ("intensity", "line_sigma") if f in table}
         allowed = {
             "name",
@@ -137,11 +135,14 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
             )
         try:
             if "K" in table:
-                pose = (_take(table, f, where) for f in ("K", "R", "t"))
-                out.append(kind(*size, *pose, **more))
+                K, R, t = (_take(table, f, where) for f in ("K", "R", "t"))
+                out.append(kind(name, width, height, K, R, t, **more))
             else:
-                pose = (_take(table, f, where) for f in ("position", "target", "fov_deg"))
-                out.append(kind.look_at(*size, *pose, roll_deg=table.get("roll_deg", 0.0), **more))
+                position, target, fov = (
+                    _take(table, f, where) for f in ("position", "target", "fov_deg")
+                )
+                roll = float(table.get("roll_deg", 0.0))
+                out.append(kind.look_at(name, width, height, position, target, fov, roll, **more))
         except (ValueError, TypeError) as error:
             raise error if isinstance(error, RigError) else RigError(f"{where}: {error}") from error
     return out
@@ -152,8 +153,10 @@ def _lights(data: dict[str, Any], cameras: tuple[Camera, ...]) -> list[Light]:
     lights = []
     for i, table in enumerate(data.get("lights", [])):
         where = f"[[lights]] number {i + 1}"
-        fields = [_take(table, f, where) for f in ("name", "position", "intensity")]
-        lights.append(Light(*fields, table.get("beside")))
+        name, position, intensity = (
+            _take(table, f, where) for f in ("name", "position", "intensity")
+        )
+        lights.append(Light(name, position, intensity, table.get("beside")))
     dome = data.get("dome")
     if dome is None:
         return lights

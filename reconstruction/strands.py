@@ -86,7 +86,7 @@ class Strands:
         step = np.linalg.norm(
             self.points[starts + 1].astype(float) - self.points[starts].astype(float), axis=1
         )
-        return np.bincount(self.strand_of_point[starts], weights=step, minlength=len(self))
+        return np.bincount(self.strand_of_point[starts], step, len(self)).astype(np.float64)
 
     def tangents(self) -> NDArray[np.float32]:
         """Unit tangents `(N, 3)` by central differences, root to tip; 0 where points coincide."""
