@@ -1,0 +1,123 @@
+"""Points on hair and skin, each with the ray that saw it and how well it is known."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Triangulated points in the reference pose (that of the first tracking frame).
+
+    points (N, 3)         float64, metres
+    covariance (N, 3, 3)  float64, m²: along the ray from row and angle, across from the pixel
+    view (N, 3)           float64, unit direction from the point to the camera that saw it
+    pixel (N, 2)          int32, (x, y) in that camera's image at the time of the step: a subject
+                          that moved is elsewhere in the reference frame, project the point for that
+    camera (N,)           int16, index into `cameras`
+    projector (N,)        int16, index into `projectors`
+    row (N,)              float32, fractional row of the projector at the temporal maximum
+    step (N,)             int32, `Step.index` of the frame with the maximum
+    brightness (N,)       float32, response at the maximum, mean of the channels, W/(sr m²)
+    weight (N,)           float32 in (0, 1], 1 for a point as well conditioned as any: the squared
+                          ratio of the best attainable deviation along the ray to this point's
+
+    Raises `ValueError` when shapes disagree or a coordinate is not finite.
+    """
+
+    points: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    view: NDArray[np.float64]
+    pixel: NDArray[np.int32]
+    camera: NDArray[np.int16]
+    projector: NDArray[np.int16]
+    row: NDArray[np.float32]
+    step: NDArray[np.int32]
+    brightness: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    cameras: tuple[str, ...]
+    projectors: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        for name, (shape, kind) in _COLUMNS.items():
+            value = np.ascontiguousarray(getattr(self, name), dtype=kind)
+            if value.shape != (n, *shape):
+                raise ValueError(f"point cloud: {name} must be {(n, *shape)}, got {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"point cloud: {name} must be finite")
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def empty(cls, cameras: tuple[str, ...], projectors: tuple[str, ...]) -> PointCloud:
+        """A cloud without points."""
+        columns = {k: np.zeros((0, *shape), kind) for k, (shape, kind) in _COLUMNS.items()}
+        return cls(**columns, cameras=cameras, projectors=projectors)
+
+    @classmethod
+    def merged(cls, clouds: list[PointCloud]) -> PointCloud:
+        """The points of clouds that share cameras and projectors; at least one cloud."""
+        first = clouds[0]
+        if any((c.cameras, c.projectors) != (first.cameras, first.projectors) for c in clouds):
+            raise ValueError("point clouds of different rigs cannot be merged")
+        columns = {k: np.concatenate([getattr(c, k) for c in clouds]) for k in _COLUMNS}
+        return cls(**columns, cameras=first.cameras, projectors=first.projectors)
+
+    def subset(self, which: ArrayLike) -> PointCloud:
+        """The points at the indices (or the mask) `which`."""
+        index = np.arange(len(self))[np.asarray(which)]
+        columns = {k: getattr(self, k)[index] for k in _COLUMNS}
+        return PointCloud(**columns, cameras=self.cameras, projectors=self.projectors)
+
+    def of_camera(self, name: str) -> PointCloud:
+        """The points that the camera called `name` saw."""
+        return self.subset(self.camera == self.cameras.index(name))
+
+    def deviation_along_view(self) -> NDArray[np.float64]:
+        """Standard deviation along the ray `(N,)`, metres."""
+        variance = np.einsum("ni,nij,nj->n", self.view, self.covariance, self.view)
+        return np.asarray(np.sqrt(variance))
+
+    def save(self, path: str | Path) -> None:
+        """Write a compressed `.npz`; the reverse of `load`."""
+        path = Path(path)
+        temporary = path.with_name(path.name + ".part")
+        columns = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **columns)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> PointCloud:
+        """Read what `save` wrote; `ValueError` names the file and the column that is missing."""
+        with np.load(path, allow_pickle=False) as data:
+            missing = [f.name for f in fields(cls) if f.name not in data]
+            if missing:
+                raise ValueError(f"{path}: not a point cloud, {missing} are missing")
+            columns = {k: data[k] for k in _COLUMNS}
+            names = {k: tuple(str(n) for n in data[k]) for k in ("cameras", "projectors")}
+        return cls(**columns, **names)
+
+
+_COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
+    "points": ((3,), np.float64),
+    "covariance": ((3, 3), np.float64),
+    "view": ((3,), np.float64),
+    "pixel": ((2,), np.int32),
+    "camera": ((), np.int16),
+    "projector": ((), np.int16),
+    "row": ((), np.float32),
+    "step": ((), np.int32),
+    "brightness": ((), np.float32),
+    "weight": ((), np.float32),
+}
