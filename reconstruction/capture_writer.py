@@ -1,0 +1,333 @@
+"""Writing capture folders: frames first, then their journal lines, the manifest last.
+
+A crash at any moment leaves every frame that the journal names whole: a frame's file is flushed
+and renamed before its line is appended and flushed. `reopen` continues such a folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import threading
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture import Capture, CaptureError, FrameRecord, Step
+from reconstruction.exr import read_exr, replace_durably, write_exr
+from reconstruction.mesh import Mesh, write_obj
+from reconstruction.report import Progress, silent
+from reconstruction.rig import Rig
+
+
+class CaptureWriter:
+    """Writes one capture folder; `write_frame` and `record_missing` may be called from any thread.
+
+    Get one from `create` or `reopen`. The layout is described in `reconstruction.capture`.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self.path = capture.path
+        self.rig = capture.rig
+        self.steps = capture.steps
+        self.records: dict[tuple[int, str], FrameRecord] = dict(capture.records)
+        self._known = {s.index: s for s in capture.steps}
+        self._lock = threading.Lock()
+        self._journal = (self.path / "journal.jsonl").open("ab")
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        rig: Rig,
+        plan: dict[str, Any],
+        *,
+        masks: dict[str, NDArray[Any]] | None = None,
+        head: Mesh | None = None,
+    ) -> Self:
+        """Start a capture in the new or empty folder `path`.
+
+        `plan["steps"]` lists `Step.to_dict()`s (or `Step`s); what else the plan holds is kept.
+        `masks` maps camera names to hair masks `(H, W)`, boolean or 0..255. Raises `CaptureError`.
+        """
+        path = Path(path)
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise CaptureError(f"{path}: a capture needs a new or empty folder")
+        if "steps" not in plan:
+            raise CaptureError("plan.json: the field 'steps' is missing")
+        steps = [s if isinstance(s, Step) else Step.from_dict(s) for s in plan["steps"]]
+        indices = [s.index for s in steps]
+        if len(set(indices)) != len(indices):
+            twice = sorted({i for i in indices if indices.count(i) > 1})[:5]
+            raise CaptureError(f"plan.json: step indices must be distinct, twice: {twice}")
+        images = {name: _mask(rig, name, mask) for name, mask in (masks or {}).items()}
+
+        (path / "frames").mkdir(parents=True)
+        _write_json(path / "rig.json", rig.to_dict())
+        if images:
+            (path / "masks").mkdir()
+        for name, image in images.items():
+            done, png = cv2.imencode(".png", image)
+            if not done:
+                raise CaptureError(f"masks/{name}.png: cannot be written")
+            _write_bytes(path / "masks" / f"{name}.png", png.tobytes())
+        if head is not None:
+            write_obj(path / "head.obj.part", head)
+            replace_durably(path / "head.obj.part", path / "head.obj")
+        (path / "journal.jsonl").touch()
+        _write_json(path / "plan.json", {**plan, "steps": [s.to_dict() for s in steps]})
+        _sync_folder(path)
+        return cls(Capture(path))
+
+    @classmethod
+    def reopen(cls, path: str | Path) -> Self:
+        """Continue a capture that was interrupted: a torn last journal line is cut off, the
+        manifest, if there is one, is removed until `finish` writes it anew."""
+        journal = Path(path) / "journal.jsonl"
+        if journal.is_file():
+            data = journal.read_bytes()
+            whole = data[: data.rfind(b"\n") + 1]
+            if len(whole) < len(data):
+                with journal.open("r+b") as file:
+                    file.truncate(len(whole))
+                    os.fsync(file.fileno())
+        capture = Capture(path)
+        (capture.path / "manifest.json").unlink(missing_ok=True)
+        return cls(capture)
+
+    def missing(self) -> list[tuple[Step, str]]:
+        """The frames (step, camera) that are not there yet, in the plan's order."""
+        return [(s, c.name) for s in self.steps for c in self.rig.cameras if not self._has(s, c)]
+
+    def write_frame(
+        self,
+        step: Step,
+        camera: str,
+        radiance: NDArray[np.floating],
+        *,
+        full_scale: float = math.inf,
+        count_scale: float = 0.0,
+        pulse: int | None = None,
+        block_id: int | None = None,
+        timestamp: float | None = None,
+        attempt: int = 0,
+    ) -> FrameRecord:
+        """Write one frame durably and append its journal line.
+
+        `radiance (H, W, 3)` is scene-linear, W/(sr m²), as exposed at the step's level;
+        `full_scale` is the radiance at which a channel saturates (inf: never), `count_scale` the
+        radiance of one count (0: not quantised). Raises `CaptureError` for a frame of the wrong
+        size, with numbers that are not finite, of an unknown step, or written before.
+        """
+        self._check(step, camera)
+        expected = (self.rig.camera(camera).height, self.rig.camera(camera).width, 3)
+        if radiance.shape != expected:
+            raise CaptureError(
+                f"step {step.index}, {camera}: expected an image {expected}, got {radiance.shape}"
+            )
+        if not np.isfinite(radiance).all():
+            raise CaptureError(f"step {step.index}, {camera}: the frame is not finite everywhere")
+        attributes: dict[str, float | str] = {"exposureTime": float(step.exposure)}
+        if math.isfinite(full_scale):
+            attributes["fullScale"] = float(full_scale)
+        if count_scale > 0:
+            attributes["countScale"] = float(count_scale)
+        file = f"frames/{step.index:05d}/{camera}.exr"
+        (self.path / file).parent.mkdir(exist_ok=True)
+        write_exr(self.path / file, radiance, attributes, compress=False)
+        _sync_folder((self.path / file).parent)
+        record = FrameRecord(
+            step.index,
+            camera,
+            file,
+            sha256(self.path / file),
+            pulse,
+            block_id,
+            timestamp,
+            attempt,
+            utc_now(),
+        )
+        self._append(record)
+        return record
+
+    def record_missing(
+        self,
+        step: Step,
+        camera: str,
+        *,
+        reason: str,
+        pulse: int | None = None,
+        block_id: int | None = None,
+        timestamp: float | None = None,
+        attempt: int = 0,
+    ) -> FrameRecord:
+        """Journal that a frame did not come and why; a later `write_frame` of it still counts."""
+        self._check(step, camera)
+        record = FrameRecord(
+            step.index,
+            camera,
+            None,
+            None,
+            pulse,
+            block_id,
+            timestamp,
+            attempt,
+            utc_now(),
+            reason,
+        )
+        self._append(record)
+        return record
+
+    def finish(self, outcome: str, extra: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Write `manifest.json`, close the journal and return the manifest.
+
+        It holds `state` ("done"), `outcome`, frame counts, checksums of the small files and of the
+        journal, whose lines hold the frames' checksums, and whatever `extra` adds.
+        """
+        with self._lock:
+            self._journal.close()
+        manifest = {
+            **(extra or {}),
+            "state": "done",
+            "outcome": outcome,
+            "finished": utc_now(),
+            "frames": {
+                "planned": len(self.steps) * len(self.rig.cameras),
+                "written": sum(r.file is not None for r in self.records.values()),
+                "missing": len(self.missing()),
+            },
+            **_checksums(self.path),
+        }
+        _write_json(self.path / "manifest.json", manifest)
+        _sync_folder(self.path)
+        return manifest
+
+    def close(self) -> None:
+        """Close the journal without a manifest: the folder stays an interrupted capture."""
+        with self._lock:
+            self._journal.close()
+
+    def _has(self, step: Step, camera: Any) -> bool:
+        record = self.records.get((step.index, camera.name))
+        return record is not None and record.file is not None
+
+    def _check(self, step: Step, camera: str) -> None:
+        if self._known.get(step.index) != step:
+            raise CaptureError(f"step {step.index}: {step} is not in this capture's plan")
+        if self._has(step, self.rig.camera(camera)):
+            raise CaptureError(f"step {step.index}, {camera}: this frame is written already")
+
+    def _append(self, record: FrameRecord) -> None:
+        with self._lock:
+            append_line(self._journal, record)
+            self.records[record.step, record.camera] = record
+
+
+def compress(path: str | Path, progress: Progress = silent) -> int:
+    """Rewrite the uncompressed frames of a capture with ZIP, losslessly; returns the bytes saved.
+
+    Each frame gets a new name, then a journal line, and only then is the old file removed, so a
+    crash leaves the capture whole; run it again to go on. Raises `CaptureError` for a frame
+    whose checksum is wrong: compression must not make damage look sound.
+    """
+    capture = Capture(path)
+    if capture.manifest is None:
+        raise CaptureError(f"{path}: not finished; compress a capture after its manifest is there")
+    todo = [r for r in capture.records.values() if r.file and not r.file.endswith(".zip.exr")]
+    saved = 0
+    with (capture.path / "journal.jsonl").open("ab") as journal:
+        for i, record in enumerate(todo):
+            assert record.file is not None
+            old = capture.path / record.file
+            if sha256(old) != record.sha256:
+                raise CaptureError(f"{old}: its checksum is not the journal's; run verify")
+            new = old.with_name(f"{record.camera}.zip.exr")
+            image, attributes = read_exr(old)
+            write_exr(new, image, _own_attributes(attributes), compress=True)
+            _sync_folder(new.parent)
+            file = str(new.relative_to(capture.path))
+            append_line(
+                journal, FrameRecord(**{**asdict(record), "file": file, "sha256": sha256(new)})
+            )
+            saved += old.stat().st_size - new.stat().st_size
+            old.unlink()
+            progress("compressing frames", (i + 1) / len(todo))
+    _write_json(capture.path / "manifest.json", {**capture.manifest, **_checksums(capture.path)})
+    return saved
+
+
+def append_line(journal: Any, record: FrameRecord) -> None:
+    """Append one record to an open journal and flush it to disk."""
+    line = {k: v for k, v in asdict(record).items() if v is not None}
+    line.setdefault("file", None)
+    journal.write(json.dumps(line, allow_nan=False).encode() + b"\n")
+    journal.flush()
+    os.fsync(journal.fileno())
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def utc_now() -> str:
+    """The time as UTC ISO 8601, with milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def _own_attributes(attributes: dict[str, float | str]) -> dict[str, float | str]:
+    return {
+        k: attributes[k] for k in ("exposureTime", "fullScale", "countScale") if k in attributes
+    }
+
+
+def _checksums(path: Path) -> dict[str, Any]:
+    """Checksums of the small files, and of the journal as long as it is now.
+
+    Compression appends to the journal before it renews the manifest; the length lets `verify`
+    check the part that the manifest knows.
+    """
+    small = [path / n for n in ("rig.json", "plan.json", "head.obj")]
+    small += sorted((path / "masks").glob("*.png"))
+    journal = path / "journal.jsonl"
+    return {
+        "files": {str(f.relative_to(path)): sha256(f) for f in small if f.is_file()},
+        "journal": {"bytes": journal.stat().st_size, "sha256": sha256(journal)},
+    }
+
+
+def _mask(rig: Rig, camera: str, mask: NDArray[Any]) -> NDArray[np.uint8]:
+    c = rig.camera(camera)
+    if mask.shape != (c.height, c.width):
+        raise CaptureError(
+            f"mask of {camera}: expected shape {(c.height, c.width)}, got {mask.shape}"
+        )
+    grey = mask * np.uint8(255) if mask.dtype == bool else mask
+    return np.asarray(grey, np.uint8)
+
+
+def _write_json(path: Path, data: dict[str, Any]) -> None:
+    _write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_bytes(data)
+    replace_durably(temporary, path)
+
+
+def _sync_folder(path: Path) -> None:
+    """Make renames in the folder durable, not only the files' contents."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
