@@ -1,0 +1,185 @@
+"""The rig file as the service reads it: geometry, the wires, defaults for captures.
+
+Geometry goes through `reconstruction.rig`; the tables `[devices]` and `[capture]` are read
+strictly: an unknown or wrong field is an error that names file and field.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from reconstruction.rig import Rig, RigError
+
+Exposure = Annotated[float, Field(ge=1e-6, le=10.0)]
+"""Seconds; the limits are the trigger box's."""
+Level = Annotated[float, Field(gt=0.0, le=1.0)]
+Port = Annotated[int, Field(ge=1, le=65535)]
+Seconds = Annotated[float, Field(gt=0.0)]
+
+
+class Strict(BaseModel):
+    """A table whose unknown fields are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class LightBankConfig(Strict):
+    """`[devices.lights]`: a Modbus TCP light bank. `settle_s` passes between lamp and pulse."""
+
+    kind: Literal["modbus_tcp"] = "modbus_tcp"
+    host: str = "127.0.0.1"
+    port: Port = 502
+    unit: int = Field(default=1, ge=0, le=255)
+    timeout_s: Seconds = 1.0
+    settle_s: float = Field(default=0.0, ge=0.0, le=10.0)
+
+
+class SerialConfig(Strict):
+    """`[devices.trigger]` and `[devices.projectors]`: a serial port and a request's deadline."""
+
+    kind: Literal["serial"] = "serial"
+    port: str = Field(min_length=1)
+    baud: int = Field(default=115200, ge=300)
+    timeout_s: Seconds = 1.0
+
+
+class CamerasConfig(Strict):
+    """`[devices.cameras]`: the camera link.
+
+    `timeout_s` bounds each answer, `busy_s` how long a camera may say that its frame is not ready.
+    `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are for predictions.
+    """
+
+    kind: Literal["link"] = "link"
+    host: str = "127.0.0.1"
+    port: Port
+    timeout_s: Seconds = 2.0
+    busy_s: Seconds = 60.0
+    readout_s: float = Field(default=0.02, ge=0.0)
+    bytes_per_s: float = Field(default=100e6, gt=0.0)
+
+
+class DevicesConfig(Strict):
+    """`[devices]`: how to reach the stage. Without `projectors` there are no sweeps."""
+
+    heartbeat_s: Seconds = 0.5
+    watchdog_s: float = Field(default=2.0, ge=0.1, le=60.0)
+    lights: LightBankConfig
+    trigger: SerialConfig
+    projectors: SerialConfig | None = None
+    cameras: CamerasConfig
+
+    @model_validator(mode="after")
+    def _heartbeat_before_watchdog(self) -> DevicesConfig:
+        if self.heartbeat_s > self.watchdog_s / 2:
+            raise ValueError(
+                f"heartbeat_s {self.heartbeat_s} must be at most half of watchdog_s "
+                f"{self.watchdog_s}, or one late beat puts the lamps off"
+            )
+        return self
+
+
+class Exposures(Strict):
+    """Seconds of exposure per kind of step."""
+
+    dark: Exposure = 0.02
+    all_on: Exposure = 0.02
+    olat: Exposure = 0.02
+    scanline: Exposure = 0.02
+    tracking: Exposure = 0.02
+
+
+class Levels(Strict):
+    """Lamp (`olat`, `all_on`) and projector (`scanline`, `tracking`) levels, 0 to 1.
+
+    All lamps at once are some hundred times one lamp: `all_on` must be low, or it saturates.
+    """
+
+    all_on: Level = 0.02
+    olat: Level = 1.0
+    scanline: Level = 1.0
+    tracking: Level = 0.5
+
+
+class CaptureDefaults(Strict):
+    """`[capture]`: what a plan gets where it does not say otherwise."""
+
+    tracking_every: int = Field(default=10, ge=0)
+    retries: int = Field(default=2, ge=0, le=20)
+    storage_bytes_per_s: float = Field(default=200e6, gt=0.0)
+    exposure: Exposures = Exposures()
+    level: Levels = Levels()
+
+
+@dataclass(frozen=True, eq=False)
+class RigFile:
+    """A rig file, read: `devices` is None where the file describes geometry alone."""
+
+    path: Path
+    rig: Rig
+    devices: DevicesConfig | None
+    capture: CaptureDefaults
+
+
+class _Tables(Strict):
+    devices: DevicesConfig | None = None
+    capture: CaptureDefaults = CaptureDefaults()
+
+
+GEOMETRY = {"name", "dome", "cameras", "lights", "projectors"}
+
+
+def load_rig_file(path: str | Path, devices: str | Path | None = None) -> RigFile:
+    """Read a rig file; the `[devices]` table of the file `devices`, field by field, wins over it.
+
+    Raises `RigError` that names the file and the field.
+    """
+    path = Path(path)
+    rig = Rig.load(path)
+    tables = {k: v for k, v in _read(path).items() if k not in GEOMETRY}
+    if devices is None:
+        read = _validate(path, tables)
+    else:
+        devices = Path(devices)
+        override = _read(devices)
+        if set(override) != {"devices"}:
+            raise RigError(f"{devices}: expected one table [devices], got {sorted(override)}")
+        _validate(path, {k: v for k, v in tables.items() if k != "devices"})
+        merged = _merge(tables.get("devices", {}), override["devices"])
+        read = _validate(devices, {**tables, "devices": merged})
+    return RigFile(path, rig, read.devices, read.capture)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text()
+        return json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except FileNotFoundError:
+        raise RigError(f"{path}: no such file") from None
+    except (json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RigError(f"{path}: {error}") from error
+
+
+def _validate(path: Path, tables: dict[str, Any]) -> _Tables:
+    try:
+        return _Tables.model_validate(tables)
+    except ValidationError as error:
+        problems = [
+            f"{'.'.join(str(p) for p in e['loc'])}: {e['msg']}, got {e['input']!r}"
+            for e in error.errors()
+        ]
+        raise RigError(f"{path}: " + "; ".join(problems)) from error
+
+
+def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(out.get(key), dict)
+        out[key] = _merge(out[key], value) if both else value
+    return out
