@@ -143,9 +143,16 @@ class Capture:
 
     def saturated(self, step: Step, camera: str) -> NDArray[np.bool_]:
         """Pixels `(H, W)` with a channel at the sensor's full scale."""
+        return self.response_and_saturated(step, camera)[1]
+
+    def response_and_saturated(
+        self, step: Step, camera: str
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """`response` and `saturated` of one frame for the price of reading it once."""
         image, attributes = self._read(step, camera)
         full_scale = float(attributes.get("fullScale", np.inf))
-        return np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))
+        saturated = np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))
+        return (image if step.level in (0, 1) else image / np.float32(step.level)), saturated
 
     def _read(self, step: Step, camera: str) -> tuple[NDArray[np.float32], dict[str, float | str]]:
         record = self.records.get((step.index, camera))
