@@ -1,0 +1,1 @@
+"""Renderers: many lights at once, scanline sweeps, environments, coverage."""

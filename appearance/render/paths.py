@@ -1,0 +1,262 @@
+"""What every renderer here shares: camera rays, surface answers, path continuation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from appearance.scene import SCALE, HairScene
+from reconstruction.cameras import Camera
+
+
+def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
+    """Mitsuba rays through the image points `u`, `v` (Dr.Jit floats), in scene units.
+
+    `u`, `v` are in the renderers' convention, where the top-left pixel covers [0, 1) x [0, 1):
+    this is the one place that takes off the half pixel to `Camera`'s convention, where that
+    pixel's centre is (0, 0).
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    k = opaque([camera.K[0, 0], camera.K[0, 1], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]])
+    y = (v - 0.5 - k[4]) / k[3]
+    x = (u - 0.5 - k[2] - k[1] * y) / k[0]
+    direction = opaque_matrix(camera.R.T) @ mi.Vector3f(x, y, mi.Float(1))
+    return mi.Ray3f(mi.Point3f(*opaque(camera.center * SCALE)), dr.normalize(direction))
+
+
+def opaque(values: ArrayLike) -> list[Any]:
+    """One Dr.Jit float per number, which kernels read from memory.
+
+    A literal would become part of the kernel, and every camera, pose or light bank would be
+    compiled anew: seconds instead of milliseconds.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    return [dr.opaque(mi.Float, float(v)) for v in np.asarray(values, float).ravel()]
+
+
+def opaque_index(value: int) -> Any:
+    """`value` as a Dr.Jit integer that kernels read from memory."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.opaque(mi.UInt32, value)
+
+
+def opaque_matrix(matrix: NDArray[np.float64]) -> Any:
+    """`matrix (3, 3)` that kernels read from memory."""
+    import mitsuba as mi
+
+    return mi.Matrix3f(*opaque(matrix))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """How the surfaces of `scene` answer light; made once a kernel."""
+
+    scene: HairScene
+
+    def interact(self, ray: Any, active: Any) -> Any:
+        """The first `SurfaceInteraction3f` along `ray`."""
+        return self.scene.mi_scene.ray_intersect(ray, active)
+
+    def is_hair(self, si: Any) -> Any:
+        """Whether `si` lies on a fibre."""
+        import mitsuba as mi
+
+        if self.scene.hair_shape is None:
+            return mi.Bool(False)
+        if self.scene.head_shape is None:
+            return si.is_valid()
+        return si.shape == mi.ShapePtr(self.scene.hair_shape)
+
+    def eval(self, si: Any, wo: Any, active: Any) -> Any:
+        """BSDF times cosine `Color3f` towards the local direction `wo`."""
+        import drjit as dr
+        import mitsuba as mi
+
+        hair = self.is_hair(si)
+        value = self._diffuse(hair) * self._cosine(si, wo, hair) * dr.inv_pi
+        if self.scene.hair_bsdf is not None:
+            fibre = self.scene.hair_bsdf.eval(mi.BSDFContext(), si, wo, active & hair)
+            value = dr.select(hair, fibre, value)
+        return dr.select(active, value, 0)
+
+    def sample(self, si: Any, u1: Any, u2: Any, active: Any) -> tuple[Any, Any]:
+        """A local direction and its weight (BSDF times cosine over density)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        hair = self.is_hair(si)
+        wo = mi.warp.square_to_cosine_hemisphere(u2)
+        inside = ~hair & (si.wi.z < 0)
+        wo.z = dr.select(inside, -wo.z, wo.z)
+        weight = dr.select(hair & (si.wi.z < 0), 0, self._diffuse(hair))
+        if self.scene.hair_bsdf is not None:
+            sample, value = self.scene.hair_bsdf.sample(
+                mi.BSDFContext(), si, u1, u2, active & hair
+            )
+            wo = dr.select(hair, sample.wo, wo)
+            weight = dr.select(hair, value, weight)
+        return wo, dr.select(active, weight, 0)
+
+    def _diffuse(self, hair: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        skin = mi.Color3f(*self.scene.skin)
+        albedo = getattr(self.scene.hair, "albedo", None)
+        return skin if albedo is None else dr.select(hair, mi.Color3f(*albedo), skin)
+
+    def _cosine(self, si: Any, wo: Any, hair: Any) -> Any:
+        """|cos| where both directions are on one side; fibres have an outer side only."""
+        import drjit as dr
+
+        seen = (si.wi.z * wo.z > 0) & (~hair | (wo.z > 0))
+        return dr.select(seen, dr.abs(wo.z), 0)
+
+
+def walk(
+    surface: Surface,
+    ray: Any,
+    rng: Any,
+    gather: Callable[[Any, Any, Any, bool, Any], None],
+    max_depth: int,
+    rr_depth: int,
+) -> None:
+    """Follow one path from each camera `ray` and call `gather` at its vertices.
+
+    `gather(si, throughput, rng, first, active)` is traced once for the camera's own hits (`first`)
+    and once for all later vertices; it adds to its film as a side effect. A path has at most
+    `max_depth` vertices.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    si = surface.interact(ray, mi.Bool(True))
+    active = si.is_valid()
+    throughput = mi.Color3f(1)
+    gather(si, throughput, rng, True, active)
+    if max_depth < 2:
+        return
+
+    def more(si: Any, throughput: Any, depth: Any, rng: Any, active: Any) -> Any:
+        return active
+
+    def body(si: Any, throughput: Any, depth: Any, rng: Any, active: Any) -> Any:
+        ray, throughput, active = continue_path(
+            surface, si, throughput, depth, rng, rr_depth, active
+        )
+        si = surface.interact(ray, active)
+        active = active & si.is_valid()
+        depth = depth + 1
+        gather(si, throughput, rng, False, active)
+        return si, throughput, depth, rng, active & (depth + 1 < max_depth)
+
+    dr.while_loop((si, throughput, mi.UInt32(0), rng, active), more, body, label="path")
+
+
+def continue_path(
+    surface: Surface, si: Any, throughput: Any, depth: Any, rng: Any, rr_depth: int, active: Any
+) -> tuple[Any, Any, Any]:
+    """Next ray, throughput and whether it is alive: BSDF sampling and Russian roulette.
+
+    Roulette starts at vertex `rr_depth`; survival is the largest channel of the throughput, at
+    most 0.95, and survivors are weighted by its inverse, so that the estimate stays unbiased.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    wo, weight = surface.sample(si, u1, u2, active)
+    throughput = throughput * weight
+    strength = dr.max(throughput)
+    alive = active & (strength > 0)
+    survival = dr.select(depth + 1 >= rr_depth, dr.minimum(strength, 0.95), 1)
+    alive &= rng.next_float32() < survival
+    throughput = throughput * dr.select(alive, dr.rcp(survival), 0)
+    return si.spawn_ray(si.to_world(wo)), throughput, alive
+
+
+def pixel_indices(camera: Camera, pixels: ArrayLike) -> NDArray[np.int64]:
+    """`pixels (P,)` as flat indices, row after row; raises `ValueError` outside the image."""
+    index = np.asarray(pixels, np.int64)
+    if index.ndim != 1 or (len(index) and (index.min() < 0 or index.max() >= _size(camera))):
+        raise ValueError(
+            f"{camera.name}: pixels must be a list of flat indices in [0, {_size(camera)}), "
+            f"got shape {index.shape}"
+        )
+    return index
+
+
+def _size(camera: Camera) -> int:
+    return camera.width * camera.height
+
+
+def stream(size: int, *seeds: int) -> Any:
+    """Random streams of `size` lanes that depend on all of `seeds`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
+    return mi.PCG32(size, dr.opaque(mi.UInt64, int(state[0])))
+
+
+def passes(spp: int, per_pass: int) -> Iterator[tuple[int, int]]:
+    """(first sample, count) of the passes that make up `spp` samples, `per_pass` at most each."""
+    for first in range(0, spp, per_pass):
+        yield first, min(per_pass, spp - first)
+
+
+def jittered(camera: Camera, pixel: Any, sample: Any, spp: int, rng: Any) -> Any:
+    """Rays of sample number `sample` of `spp` through `pixel`: jittered on a grid over the pixel.
+
+    Samples beyond the largest square grid fall anywhere in the pixel; a box filter, as the sensor
+    integrates.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    n = opaque_index(int(spp**0.5))
+    on_grid = sample < n * n
+    cell_y = sample // n
+    cell_x = sample - cell_y * n
+    a, b = rng.next_float32(), rng.next_float32()
+    x = dr.select(on_grid, (mi.Float(cell_x) + a) / mi.Float(n), a)
+    y = dr.select(on_grid, (mi.Float(cell_y) + b) / mi.Float(n), b)
+    width = opaque_index(camera.width)
+    row = pixel // width
+    column = pixel - row * width
+    return camera_rays(camera, mi.Float(column) + x, mi.Float(row) + y)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Camera paths in flight: `rays`, their random streams, and the slot in `pixels` of each."""
+
+    rays: Any
+    rng: Any
+    slot: Any
+
+
+def wave(
+    camera: Camera, pixels: Any, slots: int, first: int, count: int, spp: int, *seeds: int
+) -> Wave:
+    """Samples `first` to `first + count` of `spp` of each of the `slots` Dr.Jit `pixels`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    size = opaque_index(slots)
+    lane = dr.arange(mi.UInt32, count * slots)
+    sample = lane // size
+    slot = lane - sample * size
+    rng = stream(count * slots, *seeds, first)
+    pixel = dr.gather(mi.UInt32, pixels, slot)
+    return Wave(jittered(camera, pixel, sample + opaque_index(first), spp, rng), rng, slot)
