@@ -1,0 +1,129 @@
+"""The FastAPI application and the server that runs it on this machine's loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable
+from importlib.metadata import version
+from types import FrameType
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+from fastapi.responses import PlainTextResponse
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from stage_service.api import event_stream, routes
+from stage_service.api.problems import (
+    PAGE,
+    Problem,
+    errors_page,
+    install_problems,
+    problem_response,
+)
+from stage_service.api.stage import Stage
+
+LOOPBACK = "127.0.0.1"
+OWN_NAMES = {"127.0.0.1", "localhost", "[::1]"}
+
+
+class OnlyThisMachine:
+    """Refuses requests to foreign host names.
+
+    The socket takes connections from this machine alone, but a web page from elsewhere, open in a
+    browser here, can point its own host name at 127.0.0.1.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or answer 421."""
+        if scope["type"] == "http":
+            host = Headers(scope=scope).get("host", "")
+            name, _, port = host.rpartition(":")
+            if (name if port.isdigit() else host) not in OWN_NAMES:
+                detail = f"host {host!r} is not this machine's loopback: use http://{LOOPBACK}"
+                refusal = problem_response(scope["path"], "http", detail, status=421)
+                await refusal(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+
+def create_app(stage: Stage) -> FastAPI:
+    """The application over `stage`; starts it, and closes it (lights off) at shutdown."""
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        stage.start()
+        try:
+            yield
+        finally:
+            stage.close()
+
+    app = FastAPI(
+        title="hairstage",
+        version=version("hairstage"),
+        summary="Runs a hair light stage and turns its captures into strands and relit hair.",
+        lifespan=lifespan,
+        responses={
+            "default": {
+                "description": "An error, as a problem document (RFC 9457)",
+                "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
+            }
+        },
+    )
+    app.state.stage = stage
+    install_problems(app)
+    app.include_router(routes.router)
+    app.include_router(event_stream.router)
+
+    @app.get(PAGE, include_in_schema=False)
+    def errors() -> PlainTextResponse:
+        return PlainTextResponse(errors_page(), media_type="text/markdown")
+
+    app.add_middleware(OnlyThisMachine)
+    return app
+
+
+class _Server(uvicorn.Server):
+    """Puts the lights off at the signal itself, not after the last connection has closed."""
+
+    def __init__(self, config: uvicorn.Config, stage: Stage, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._stage, self._ready = stage, ready
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        threading.Thread(target=self._stage.close, name="lights-off").start()
+        super().handle_exit(sig, frame)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        self._ready()
+
+
+def serve(stage: Stage, port: int, ready: Callable[[str], Any] = lambda _url: None) -> None:
+    """Serve `stage` on 127.0.0.1:`port` (0: any free one) until SIGTERM or SIGINT.
+
+    `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((LOOPBACK, port))
+        except OSError as error:
+            raise OSError(
+                f"port {port} on {LOOPBACK} cannot be used ({error.strerror}): is another service "
+                "running? choose another with --port"
+            ) from error
+        url = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
+        config = uvicorn.Config(
+            create_app(stage), log_level="warning", access_log=False, timeout_graceful_shutdown=3
+        )
+        try:
+            _Server(config, stage, lambda: ready(url)).run(sockets=[listener])
+        finally:
+            stage.close()

@@ -1,0 +1,50 @@
+"""Server-sent events: numbered, and replayable from `Last-Event-ID`."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query, Request
+from sse_starlette import EventSourceResponse, ServerSentEvent
+
+from stage_service.events import EventLog
+
+router = APIRouter()
+POLL_S = 0.5
+
+
+@router.get(
+    "/events",
+    response_class=EventSourceResponse,
+    responses={200: {"content": {"text/event-stream": {}}}},
+    tags=["service"],
+)
+async def stream_events(
+    request: Request,
+    last_event_id: Annotated[int | None, Header(ge=0)] = None,
+    after: Annotated[int | None, Query(ge=0, description="as Last-Event-ID")] = None,
+) -> EventSourceResponse:
+    """Events after `Last-Event-ID` (or `after`), then new ones as they come.
+
+    Without either, only new ones; 0 replays all that are kept. Numbers start at 1 with the service:
+    a number that it has not reached yet is from before a restart, and replays everything.
+    """
+    events: EventLog = request.app.state.stage.events
+    asked = last_event_id if last_event_id is not None else after
+    newest = events.last
+    start = newest if asked is None else asked
+    return EventSourceResponse(_follow(request, events, start if start <= newest else 0))
+
+
+async def _follow(
+    request: Request, events: EventLog, number: int
+) -> AsyncIterator[ServerSentEvent]:
+    while not await request.is_disconnected():
+        for event in await asyncio.to_thread(events.wait, number, POLL_S):
+            number = event.number
+            yield ServerSentEvent(
+                id=str(number), event=event.kind, data=json.dumps(event.to_dict())
+            )

@@ -1,0 +1,236 @@
+"""Errors as problem documents (RFC 9457), one table for all of them."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict
+from starlette.exceptions import HTTPException
+
+from reconstruction.capture import CaptureError, MissingFrame
+from stage_service.api.stage import (
+    BadInput,
+    NotFinished,
+    UnknownArtifact,
+    UnknownFrame,
+)
+from stage_service.captures import Busy, UnknownCapture
+from stage_service.jobs.queue import NoSuchJob
+from stage_service.plan import PlanError
+from stage_service.states import WrongState
+
+log = logging.getLogger("hairstage.api")
+PAGE = "/docs/errors.md"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of problem: its anchor in docs/errors.md, its status, and what to do about it."""
+
+    slug: str
+    status: int
+    title: str
+    help: str
+
+
+KINDS = {
+    k.slug: k
+    for k in (
+        Kind(
+            "invalid-request",
+            422,
+            "The request does not fit the schema",
+            "`errors` lists each field that is wrong and why. The schema is in /openapi.json.",
+        ),
+        Kind(
+            "invalid-plan",
+            422,
+            "This rig cannot shoot this plan",
+            "`problems` has one sentence for each reason. No lamp was touched. Correct the plan "
+            "and try it with `POST /plans:validate`.",
+        ),
+        Kind(
+            "bad-input",
+            422,
+            "A file or name in the request cannot be used",
+            "`detail` names it and says what was expected. Paths are those of the service's "
+            "machine.",
+        ),
+        Kind(
+            "busy",
+            409,
+            "Another capture is running",
+            "The stage makes one capture at a time. Wait for `running`, or abort it.",
+        ),
+        Kind(
+            "wrong-state",
+            409,
+            "The capture's state does not allow this",
+            "`detail` lists what is possible now; `state` is where the capture is.",
+        ),
+        Kind(
+            "not-finished",
+            409,
+            "The capture is not finished",
+            "Wait until its state is `done`; an interrupted capture has no manifest and cannot be "
+            "processed.",
+        ),
+        Kind("unknown-capture", 404, "No such capture", "`GET /captures` lists the captures."),
+        Kind(
+            "unknown-frame",
+            404,
+            "No such step or camera",
+            "`detail` says which steps and cameras this capture has.",
+        ),
+        Kind(
+            "missing-frame",
+            404,
+            "The frame is missing",
+            "It was planned and did not come, or has not been shot yet; `detail` says which.",
+        ),
+        Kind("unknown-job", 404, "No such job", "`GET /jobs` lists the jobs."),
+        Kind(
+            "unknown-artifact",
+            404,
+            "No such file in the model folder",
+            "`GET /jobs/{id}/artifacts` lists the files. Paths that lead out of the folder are not "
+            "followed.",
+        ),
+        Kind(
+            "damaged-capture",
+            500,
+            "The capture folder cannot be read",
+            "`detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.",
+        ),
+        Kind(
+            "http",
+            400,
+            "The request cannot be served",
+            "The status says why: no such route, method not allowed, or a host name that is not "
+            "this machine's.",
+        ),
+        Kind(
+            "internal",
+            500,
+            "A fault in the service",
+            "The service's log has the traceback. Lamps go off by themselves if the service dies.",
+        ),
+    )
+}
+
+BY_ERROR: dict[type[Exception], str] = {
+    PlanError: "invalid-plan",
+    BadInput: "bad-input",
+    Busy: "busy",
+    WrongState: "wrong-state",
+    NotFinished: "not-finished",
+    UnknownCapture: "unknown-capture",
+    UnknownFrame: "unknown-frame",
+    MissingFrame: "missing-frame",
+    NoSuchJob: "unknown-job",
+    UnknownArtifact: "unknown-artifact",
+    CaptureError: "damaged-capture",
+}
+"""Which error class becomes which kind; a subclass stands before its base."""
+
+EXTRA = ("problems", "running", "state")
+"""Attributes of an error that its problem document repeats."""
+
+
+class Problem(BaseModel):
+    """An error as RFC 9457 has it; `type` leads to the paragraph of docs/errors.md about it."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": f"{PAGE}#busy",
+                    "title": KINDS["busy"].title,
+                    "status": 409,
+                    "detail": "capture 20261121-093000 is running; wait for it, or abort it first",
+                    "instance": "/captures",
+                    "running": "20261121-093000",
+                }
+            ]
+        },
+    )
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str
+
+
+def problem_response(
+    path: str, slug: str, detail: str, *, status: int | None = None, **extra: Any
+) -> JSONResponse:
+    """The problem document of the kind `slug` as a response."""
+    kind = KINDS[slug]
+    content = {
+        "type": f"{PAGE}#{kind.slug}",
+        "title": kind.title,
+        "status": status or kind.status,
+        "detail": detail,
+        "instance": path,
+        **extra,
+    }
+    return JSONResponse(content, content["status"], media_type="application/problem+json")
+
+
+def errors_page() -> str:
+    """The text of docs/errors.md."""
+    parts = ["# Errors of the HTTP API", ""]
+    parts += [
+        "Every error is a problem document (RFC 9457, `application/problem+json`) with `type`,",
+        "`title`, `status`, `detail` and `instance`; `type` is the path of this page with one of",
+        "the anchors below. The page is written from the table in",
+        "`stage_service/api/problems.py`.",
+    ]
+    for kind in KINDS.values():
+        status = f"{kind.status} {HTTPStatus(kind.status).phrase}"
+        parts += ["", f"## {kind.slug}", "", f"{kind.title} ({status}). {kind.help}"]
+    return "\n".join(parts) + "\n"
+
+
+def install_problems(app: FastAPI) -> None:
+    """Make every error of `app` a problem document."""
+
+    async def known(request: Request, error: Exception) -> JSONResponse:
+        slug = next(s for e, s in BY_ERROR.items() if isinstance(error, e))
+        extra = {k: getattr(error, k) for k in EXTRA if hasattr(error, k)}
+        return problem_response(request.url.path, slug, str(error), **extra)
+
+    async def invalid(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, RequestValidationError)
+        errors = [
+            {"field": ".".join(str(p) for p in e["loc"]), "message": e["msg"]}
+            for e in error.errors()
+        ]
+        detail = "; ".join(f"{e['field']}: {e['message']}" for e in errors)
+        return problem_response(request.url.path, "invalid-request", detail, errors=errors)
+
+    async def http(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, HTTPException)
+        response = problem_response(
+            request.url.path, "http", str(error.detail), status=error.status_code
+        )
+        response.headers.update(error.headers or {})
+        return response
+
+    async def fault(request: Request, error: Exception) -> JSONResponse:
+        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+        return problem_response(request.url.path, "internal", f"{type(error).__name__}: {error}")
+
+    for kind in BY_ERROR:
+        app.add_exception_handler(kind, known)
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(Exception, fault)

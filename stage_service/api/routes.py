@@ -1,0 +1,169 @@
+"""The routes. Each calls one function of `Stage`; errors become problems in `problems`."""
+
+from __future__ import annotations
+
+import mimetypes
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Request, Response, status
+from fastapi.responses import FileResponse
+
+from stage_service.api.frames import png_preview
+from stage_service.api.stage import (
+    Artifact,
+    CaptureRequest,
+    CaptureView,
+    Health,
+    JobRequest,
+    Stage,
+)
+from stage_service.jobs.records import Job
+from stage_service.plan import CapturePlan, PlanCost
+
+router = APIRouter()
+
+
+def _stage(request: Request) -> Stage:
+    stage: Stage = request.app.state.stage
+    return stage
+
+
+OnStage = Annotated[Stage, Depends(_stage)]
+
+
+@router.post("/plans:validate", tags=["captures"])
+def validate_plan(plan: CapturePlan, stage: OnStage) -> PlanCost:
+    """What a plan would take on this rig: frames, bytes, seconds, light dose. Lights nothing."""
+    return stage.validate(plan)
+
+
+@router.post("/captures", status_code=status.HTTP_202_ACCEPTED, tags=["captures"])
+def start_capture(body: CaptureRequest, stage: OnStage, response: Response) -> CaptureView:
+    """Begin a capture. With `pipeline`, its completion enqueues that job by itself."""
+    view = stage.start_capture(body)
+    response.headers["Location"] = f"/captures/{view.id}"
+    return view
+
+
+@router.get("/captures", tags=["captures"])
+def list_captures(stage: OnStage) -> list[CaptureView]:
+    """All captures, oldest first."""
+    return [stage.view(c) for c in stage.captures.list()]
+
+
+@router.get("/captures/{capture}", tags=["captures"])
+def get_capture(capture: str, stage: OnStage) -> CaptureView:
+    """Where a capture is, how it ended, and the job that follows it."""
+    return stage.capture(capture)
+
+
+@router.post("/captures/{capture}/pause", tags=["captures"])
+def pause_capture(capture: str, stage: OnStage) -> CaptureView:
+    """Pause at the next step boundary, lights off."""
+    return stage.view(stage.captures.pause(capture))
+
+
+@router.post("/captures/{capture}/resume", tags=["captures"])
+def resume_capture(capture: str, stage: OnStage) -> CaptureView:
+    """Go on after a pause."""
+    return stage.view(stage.captures.resume(capture))
+
+
+@router.post("/captures/{capture}/abort", tags=["captures"])
+def abort_capture(capture: str, stage: OnStage) -> CaptureView:
+    """Abort at the next step boundary, lights off; finished frames stay."""
+    return stage.view(stage.captures.abort(capture))
+
+
+@router.get(
+    "/captures/{capture}/frames/{step}/{camera}.exr",
+    response_class=FileResponse,
+    responses={200: {"content": {"image/x-exr": {}}}},
+    tags=["captures"],
+)
+def get_frame(capture: str, step: int, camera: str, stage: OnStage) -> Response:
+    """A frame as it was written: scene-linear radiance, W/(sr m²)."""
+    return Response(stage.frame(capture, step, camera).read_bytes(), media_type="image/x-exr")
+
+
+@router.get(
+    "/captures/{capture}/frames/{step}/{camera}.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}}},
+    tags=["captures"],
+)
+def get_preview(
+    capture: str,
+    step: int,
+    camera: str,
+    stage: OnStage,
+    percentile: Annotated[float, Query(ge=50, le=100, description="what becomes white")] = 99.5,
+) -> Response:
+    """A picture of a frame to look at: exposed by a percentile, sRGB."""
+    return Response(
+        png_preview(stage.frame(capture, step, camera), percentile), media_type="image/png"
+    )
+
+
+@router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
+def submit_job(body: JobRequest, stage: OnStage, response: Response) -> Job:
+    """Enqueue a pipeline on a finished capture."""
+    job = stage.submit(body)
+    response.headers["Location"] = f"/jobs/{job.id}"
+    return job
+
+
+@router.get("/jobs", tags=["jobs"])
+def list_jobs(stage: OnStage, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> list[Job]:
+    """The latest jobs, newest first."""
+    return stage.queue.all(limit=limit)
+
+
+@router.get("/jobs/{job}", tags=["jobs"])
+def get_job(job: str, stage: OnStage) -> Job:
+    """A job's state, progress, and outcome."""
+    return stage.queue.get(job)
+
+
+@router.delete("/jobs/{job}", tags=["jobs"])
+def cancel_job(job: str, stage: OnStage) -> Job:
+    """Cancel a job: a queued one at once, a running one at its next progress call."""
+    return stage.queue.cancel(job)
+
+
+@router.get("/jobs/{job}/report", response_class=FileResponse, tags=["jobs"])
+def get_report(job: str, stage: OnStage) -> Response:
+    """The report that the job's stages filled: seconds, error against time, left out, warnings."""
+    return FileResponse(stage.report(job), media_type="application/json")
+
+
+@router.get("/jobs/{job}/artifacts", tags=["jobs"])
+def list_artifacts(job: str, stage: OnStage) -> list[Artifact]:
+    """The files in the job's model folder."""
+    return stage.artifacts(job)
+
+
+@router.get("/jobs/{job}/artifacts/{path:path}", response_class=FileResponse, tags=["jobs"])
+def get_artifact(job: str, path: str, stage: OnStage) -> Response:
+    """One file of the model folder."""
+    file = stage.artifact(job, path)
+    kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+    return FileResponse(file, media_type=kind)
+
+
+@router.get("/devices", tags=["devices"])
+def get_devices(stage: OnStage) -> dict[str, object]:
+    """Each device and whether it answers."""
+    return stage.captures.devices()
+
+
+@router.post("/devices/blackout", tags=["devices"])
+def blackout(stage: OnStage) -> dict[str, object]:
+    """All lamps and projectors off, verified. Aborts a running capture."""
+    return stage.captures.blackout()
+
+
+@router.get("/health", tags=["service"])
+def health(stage: OnStage) -> Health:
+    """Whether the service and its worker run; asks no device."""
+    return stage.health()

@@ -1,0 +1,1 @@
+"""Background work on captures: a durable queue, its pipelines and the worker process."""

@@ -1,0 +1,88 @@
+"""What a job is, as everyone outside the worker sees it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+JobState = Literal["queued", "running", "done"]
+JobOutcome = Literal["succeeded", "failed", "cancelled"]
+
+
+class JobOptions(BaseModel):
+    """What a pipeline may be told; every field has a default that works.
+
+    `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may look at:
+    the images of these are what the result is judged on. `truth` is a strand file to evaluate
+    against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Literal["light_planes"] = "light_planes"
+    compress: bool = True
+    held_out_cameras: tuple[str, ...] = ()
+    held_out_lights: tuple[str, ...] = ()
+    environment: str = "studio"
+    truth: str | None = None
+    seed: int = Field(default=0, ge=0)
+    reconstruct: dict[str, Any] = Field(default_factory=dict)
+
+
+class PipelineRequest(BaseModel):
+    """Which pipeline to run, and with which options."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    options: JobOptions = JobOptions()
+
+    @field_validator("name")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        from stage_service.jobs.pipelines import PIPELINES
+
+        if name not in PIPELINES:
+            raise ValueError(f"there is no pipeline {name!r}; there are {sorted(PIPELINES)}")
+        return name
+
+
+class JobProgress(BaseModel):
+    """How far a job is: `share` of the whole job and `step_share` of this step, 0 to 1."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    step: str
+    steps: tuple[str, ...]
+    what: str
+    share: float
+    step_share: float
+
+
+class JobError(BaseModel):
+    """Why a job failed: the error's class and its message."""
+
+    model_config = ConfigDict(frozen=True)
+
+    type: str
+    detail: str
+
+
+class Job(BaseModel):
+    """One run of a pipeline. `outcome` is set exactly when `state` is `done`; times are UTC."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    pipeline: str
+    state: JobState
+    outcome: JobOutcome | None = None
+    capture: str
+    model: str
+    options: JobOptions
+    progress: JobProgress | None = None
+    error: JobError | None = None
+    created: str
+    started: str | None = None
+    finished: str | None = None

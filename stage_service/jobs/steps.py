@@ -1,0 +1,126 @@
+"""The steps that pipelines are made of.
+
+A step reads its input from the capture and model folders and leaves its results in the model
+folder; what it returns is small and JSON-ready. A step that is run again from its beginning (after
+a crash) writes the same files again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from reconstruction.capture import Capture
+from reconstruction.report import Progress
+from stage_service.jobs.records import JobOptions
+
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class StepContext:
+    """What a step works on; `previous` holds what the job's earlier steps returned, by name."""
+
+    capture: Path
+    model: Path
+    options: JobOptions
+    progress: Progress
+    previous: Mapping[str, Figures] = field(default_factory=dict)
+
+
+def compress(context: StepContext) -> Figures:
+    """Rewrite the capture's frames compressed, losslessly."""
+    if not context.options.compress:
+        return {"left_out": "switched off by the option 'compress'"}
+    from reconstruction.capture_writer import compress as run
+
+    return {"bytes_saved": run(context.capture, context.progress)}
+
+
+def reconstruct(context: StepContext) -> Figures:
+    """Strands from the capture: `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`."""
+    from reconstruction.pipeline import ReconstructOptions
+    from reconstruction.pipeline import reconstruct as run
+
+    options = ReconstructOptions(**context.options.reconstruct)
+    run(
+        Capture(context.capture),
+        context.model,
+        method=context.options.method,
+        options=options,
+        progress=context.progress,
+    )
+    return {"strands": "strands.npz"}
+
+
+def fit(context: StepContext) -> Figures:
+    """Roughness and colour of hair and skin: `appearance.json`."""
+    from appearance.fit import HeldOut
+    from appearance.fit import fit as run
+
+    run(
+        Capture(context.capture),
+        context.model,
+        held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
+        progress=context.progress,
+    )
+    return {"appearance": "appearance.json"}
+
+
+def assess(context: StepContext) -> Figures:
+    """Held-out images beside the captured ones, and a relit picture."""
+    from appearance.assess import assess as run
+    from appearance.fit import HeldOut
+
+    return run(
+        Capture(context.capture),
+        context.model,
+        held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
+        environment=context.options.environment,
+        progress=context.progress,
+    )
+
+
+def evaluate(context: StepContext) -> Figures:
+    """Strands against true ones, beside the two controls that use no method."""
+    if context.options.truth is None:
+        return {"left_out": "no true strands were given"}
+    from stage_service.jobs.geometry import evaluate_geometry
+
+    return evaluate_geometry(
+        Capture(context.capture),
+        context.model,
+        Path(context.options.truth),
+        seed=context.options.seed,
+        progress=context.progress,
+    )
+
+
+def results(context: StepContext) -> Figures:
+    """Gather every figure of the job in `results.json`, and draw the report's plots."""
+    from reconstruction.report import Report
+    from reconstruction.report_plots import plot_report
+
+    figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
+    for step, key in (("assess", "images"), ("evaluate", "geometry")):
+        found = context.previous.get(step, {}).get("figures", {})
+        if found and "left_out" not in found:
+            figures[key] = found
+    part = context.model / "results.part"
+    part.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    part.replace(context.model / "results.json")
+    plot_report(Report.load(context.model / "report.json"), context.model / "plots")
+    return {"results": "results.json"}
+
+
+STEPS: dict[str, Callable[[StepContext], Figures]] = {
+    "compress": compress,
+    "reconstruct": reconstruct,
+    "fit": fit,
+    "assess": assess,
+    "evaluate": evaluate,
+    "results": results,
+}

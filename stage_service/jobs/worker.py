@@ -1,0 +1,132 @@
+"""The worker process: takes jobs off the queue and runs their steps.
+
+DBOS checkpoints every step, so a worker that dies (SIGKILL included) leaves a job that the next
+worker takes up at the step that was under way. Steps keep bulk data in the model folder.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dbos import DBOS, DBOSPortableJSONSerializer
+from dbos import error as dbos_error
+
+from stage_service.jobs.pipelines import PIPELINES, STEPS_VERSION
+from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, WorkerStopping
+from stage_service.jobs.queue import APP, QUEUE, WORKFLOW, JobQueue, database_url
+from stage_service.jobs.records import JobOptions
+from stage_service.jobs.slots import WorkerSlot
+from stage_service.jobs.steps import STEPS, StepContext
+
+log = logging.getLogger("hairstage.worker")
+
+MOST_ATTEMPTS = 5
+"""A job that killed its worker this often is given up."""
+
+
+class Worker:
+    """Runs the steps of jobs, at most `concurrency` at a time, until it is told to stop."""
+
+    def __init__(self, root: Path, concurrency: int) -> None:
+        self.queue = JobQueue(root)
+        self._stopping = threading.Event()
+        # A cancelled job leaves DBOS's count at once, but its thread only at its next progress
+        # call: this keeps the next job from running beside it.
+        self._slots = threading.BoundedSemaphore(concurrency)
+
+    def stop(self) -> None:
+        """Make running steps stop at their next progress call, for another worker to take up."""
+        self._stopping.set()
+
+    def run_job(self, spec: dict[str, Any]) -> dict[str, Any]:
+        """The workflow: every step of the pipeline in order, each a checkpoint."""
+        steps = PIPELINES[spec["pipeline"]]
+        done: dict[str, Any] = {}
+        for step in steps:
+            done[step] = DBOS.run_step({"name": step}, self._run_step, spec, step, dict(done))
+        return {step: result["seconds"] for step, result in done.items()}
+
+    def _run_step(self, spec: dict[str, Any], step: str, previous: dict[str, Any]) -> Any:
+        job = DBOS.workflow_id
+        assert job is not None
+        model = Path(spec["model"])
+        model.mkdir(parents=True, exist_ok=True)
+        progress = StepProgress(
+            model, job, step, PIPELINES[spec["pipeline"]], lambda: self._interrupted(job)
+        )
+        options = JobOptions(**spec["options"])
+        context = StepContext(Path(spec["capture"]), model, options, progress, previous)
+        with self._slots:
+            log.info("%s: %s begins", job, step)
+            start = time.perf_counter()
+            try:
+                progress(step, 0.0)
+                figures = STEPS[step](context)
+                progress(step, 1.0)
+            except JobCancelled as cancelled:
+                log.info("%s: %s stopped, the job was cancelled", job, step)
+                raise dbos_error.DBOSWorkflowCancelledError(
+                    f"job {job} was cancelled"
+                ) from cancelled
+            except Exception:
+                log.exception("%s: %s failed", job, step)
+                raise
+            seconds = time.perf_counter() - start
+        log.info("%s: %s took %.1f s", job, step, seconds)
+        return {"seconds": seconds, "figures": figures}
+
+    def _interrupted(self, job: str) -> JobInterrupted | None:
+        if self._stopping.is_set():
+            return WorkerStopping("the worker was asked to stop")
+        return JobCancelled(job) if self.queue.cancelled(job) else None
+
+
+def run_worker(
+    root: Path, *, concurrency: int = 1, ready: Callable[[str], None] = lambda _name: None
+) -> None:
+    """Serve the queue of `root` until SIGTERM or SIGINT; `ready` is told this worker's name.
+
+    Ends the process: a step under way is left to the next worker.
+    """
+    worker = Worker(root, concurrency)
+    slot = WorkerSlot(root)
+    logging.getLogger("dbos").addFilter(_not_told_twice)
+    DBOS(
+        config={
+            "name": APP,
+            "system_database_url": database_url(root),
+            "serializer": DBOSPortableJSONSerializer(),
+            "application_version": STEPS_VERSION,
+            "executor_id": slot.name,
+            "log_level": "WARNING",
+        }
+    )
+
+    @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=MOST_ATTEMPTS)
+    def job(spec: dict[str, Any]) -> dict[str, Any]:
+        return worker.run_job(spec)
+
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    DBOS.launch()
+    DBOS.register_queue(QUEUE, worker_concurrency=concurrency, polling_interval_sec=0.2)
+    ready(slot.name)
+    stop.wait()
+    worker.stop()
+    DBOS.destroy()
+    # Step threads may be deep in native code; they hold nothing that the next worker needs.
+    logging.shutdown()
+    os._exit(0)
+
+
+def _not_told_twice(record: logging.LogRecord) -> bool:
+    """DBOS logs the end of every failed or cancelled job as an error of its own."""
+    return not record.getMessage().startswith("Exception encountered in background workflow")
