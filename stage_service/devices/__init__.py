@@ -1,0 +1,1 @@
+"""Drivers for the stage's devices; `docs/wire.md` is the protocol."""

@@ -1,0 +1,1 @@
+"""Cameras: the interface and its backends."""

@@ -1,0 +1,83 @@
+"""What the sequencer asks of a camera."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A camera's answer to hello: `gain` is counts per (W/(sr m²) · s), `black` in counts."""
+
+    width: int
+    height: int
+    full_scale: int
+    black: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One exposure as the camera sent it: `counts (H, W, 3) uint16`, RGB."""
+
+    counts: NDArray[np.uint16]
+    block_id: int
+    timestamp: float
+    exposure: float
+
+    def radiance(self, info: CameraInfo) -> NDArray[np.float32]:
+        """Scene-linear radiance `(H, W, 3)`, W/(sr m²); noise may push it below zero."""
+        scale = np.float32(self.count_scale(info))
+        return (self.counts.astype(np.float32) - np.float32(info.black)) * scale
+
+    def count_scale(self, info: CameraInfo) -> float:
+        """Radiance of one count."""
+        return 1.0 / (info.gain * self.exposure)
+
+    def full_scale(self, info: CameraInfo) -> float:
+        """Radiance at which a channel saturates, with the rounding of `radiance`."""
+        scale = np.float32(self.count_scale(info))
+        return float((np.float32(info.full_scale) - np.float32(info.black)) * scale)
+
+
+class Camera(Protocol):
+    """One camera that waits for hardware triggers. Every call raises `DeviceError`.
+
+    `block_wrap` is the last block id before they begin again at 1.
+    """
+
+    name: str
+    block_wrap: int
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the camera said of itself; known after `connect`."""
+        ...
+
+    def connect(self) -> None:
+        """Open the link and check that the camera is the rig file's."""
+        ...
+
+    def close(self) -> None:
+        """Close the link."""
+        ...
+
+    def arm(self, exposure: float) -> None:
+        """Answer the next pulses with `exposure` seconds; frames not read are dropped."""
+        ...
+
+    def disarm(self) -> None:
+        """Answer no more pulses."""
+        ...
+
+    def read(self, cancel: threading.Event) -> Frame | None:
+        """The oldest frame not read, or None when no pulse reached the camera.
+
+        Waits while the camera is busy. Raises `Cancelled` when `cancel` is set meanwhile.
+        """
+        ...

@@ -1,0 +1,255 @@
+"""A camera on the camera link: length-prefixed JSON and counts; see `docs/wire.md`."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from reconstruction.cameras import Camera as CameraGeometry
+from stage_service.config import CamerasConfig
+from stage_service.devices.cameras.interface import CameraInfo, Frame
+from stage_service.devices.errors import (
+    Cancelled,
+    DeviceError,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
+
+LONGEST_HEADER = 1 << 20
+LONGEST_PAYLOAD = 1 << 30
+POLL_S = (0.001, 0.05)
+"""A busy camera is asked again after the first, doubling up to the second."""
+
+
+class LinkCamera:
+    """Implements `Camera` on a TCP connection of its own; see there for the contract."""
+
+    block_wrap = 65535
+
+    def __init__(self, config: CamerasConfig, geometry: CameraGeometry) -> None:
+        self.name = geometry.name
+        self.device = f"camera {geometry.name} ({config.host}:{config.port})"
+        self.config = config
+        self.geometry = geometry
+        self._info: CameraInfo | None = None
+        self._socket: socket.socket | None = None
+        self._armed: float | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the camera said of itself."""
+        if self._info is None:
+            raise RuntimeError(f"{self.device}: not connected")
+        return self._info
+
+    def connect(self) -> None:
+        """Connect and say hello; raises `DeviceError` for a camera of another size."""
+        self.close()
+        try:
+            self._socket = socket.create_connection(
+                (self.config.host, self.config.port), timeout=self.config.timeout_s
+            )
+        except OSError as error:
+            raise DeviceUnreachable(
+                self.device,
+                "connecting",
+                expected="a TCP connection",
+                received=str(error),
+                deadline_s=self.config.timeout_s,
+                todo="Check power, network, and host and port in [devices.cameras].",
+            ) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        answer, _ = self._ask({"op": "hello", "camera": self.name}, "saying hello")
+        fields = ("width", "height", "full_scale", "black", "gain")
+        info = CameraInfo(*(self._number(answer, f, "saying hello") for f in fields))
+        info = CameraInfo(
+            int(info.width), int(info.height), int(info.full_scale), info.black, info.gain
+        )
+        size = (self.geometry.width, self.geometry.height)
+        if (info.width, info.height) != size:
+            raise self._error(
+                "saying hello",
+                f"{size[0]}x{size[1]} pixels as in the rig file",
+                f"{info.width}x{info.height}",
+                "Set the camera's region of interest, or calibrate the rig for this size.",
+            )
+        if info.gain <= 0 or info.full_scale <= info.black:
+            raise self._error(
+                "saying hello",
+                "gain above 0 and full_scale above black",
+                f"gain {info.gain}, full_scale {info.full_scale}, black {info.black}",
+                "Check the camera's configuration.",
+            )
+        self._info = info
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+        self._armed = None
+
+    def arm(self, exposure: float) -> None:
+        """Answer the next pulses with `exposure` seconds; frames not read are dropped."""
+        self._ask({"op": "arm", "exposure": exposure}, f"arming for {exposure:g} s")
+        self._armed = exposure
+
+    def disarm(self) -> None:
+        """Answer no more pulses."""
+        self._ask({"op": "disarm"}, "disarming")
+        self._armed = None
+
+    def read(self, cancel: threading.Event) -> Frame | None:
+        """The oldest frame not read, or None when no pulse reached the camera."""
+        doing = "reading a frame"
+        deadline = time.monotonic() + self.config.busy_s
+        wait = POLL_S[0]
+        while True:
+            answer, payload = self._ask({"op": "read"}, doing)
+            status = answer.get("status")
+            if status == "frame":
+                return self._frame(answer, payload, doing)
+            if status == "empty":
+                return None
+            if status != "busy":
+                raise self._error(
+                    doing,
+                    "the status frame, busy or empty",
+                    repr(status),
+                    "Check that the camera follows docs/wire.md.",
+                )
+            if time.monotonic() > deadline:
+                raise DeviceTimeout(
+                    self.device,
+                    doing,
+                    expected="a frame",
+                    received="busy all the time",
+                    deadline_s=self.config.busy_s,
+                    todo="Check the camera, or raise busy_s in [devices.cameras].",
+                )
+            if cancel.wait(wait):
+                raise Cancelled(f"{self.device}: {doing} was given up")
+            wait = min(2 * wait, POLL_S[1])
+
+    def _frame(self, answer: dict[str, Any], payload: bytes, doing: str) -> Frame:
+        info = self.info
+        expected = info.width * info.height * 3 * 2
+        if len(payload) != expected:
+            raise self._error(
+                doing,
+                f"{expected} bytes of counts",
+                f"{len(payload)}",
+                "Check the camera's pixel format: RGB, 16 bits, little-endian.",
+            )
+        exposure = self._number(answer, "exposure", doing)
+        if self._armed is None or abs(exposure - self._armed) > 1e-3 * self._armed:
+            raise self._error(
+                doing,
+                f"an exposure of {self._armed} s as armed",
+                f"{exposure} s",
+                "A frame from before arming was in the queue, or the camera cannot expose so.",
+            )
+        counts = np.frombuffer(payload, "<u2").reshape(info.height, info.width, 3)
+        return Frame(
+            counts.astype(np.uint16, copy=False),
+            int(self._number(answer, "block_id", doing)),
+            self._number(answer, "timestamp", doing),
+            exposure,
+        )
+
+    def _number(self, answer: dict[str, Any], field: str, doing: str) -> Any:
+        value = answer.get(field)
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise self._error(
+                doing,
+                f"a number {field!r}",
+                repr(value),
+                "Check that the camera follows docs/wire.md.",
+            )
+        return value
+
+    def _ask(self, request: dict[str, Any], doing: str) -> tuple[dict[str, Any], bytes]:
+        """One request, one answer, within `timeout_s`; on trouble the connection is closed."""
+        with self._lock:
+            if self._socket is None:
+                raise DeviceUnreachable(
+                    self.device,
+                    doing,
+                    expected="an open connection",
+                    received="a closed one",
+                    todo="Connect again; what the camera held is lost.",
+                )
+            deadline = time.monotonic() + self.config.timeout_s
+            try:
+                data = json.dumps(request).encode()
+                self._socket.settimeout(self.config.timeout_s)
+                self._socket.sendall(struct.pack(">I", len(data)) + data)
+                (length,) = struct.unpack(">I", self._receive(4, deadline))
+                if length > LONGEST_HEADER:
+                    raise ValueError(f"a message of {length} bytes")
+                answer = json.loads(self._receive(length, deadline))
+                length = int(answer.get("bytes", 0))
+                if not 0 <= length <= LONGEST_PAYLOAD:
+                    raise ValueError(f"a payload of {length} bytes")
+                payload = self._receive(length, deadline)
+            except TimeoutError as error:
+                self.close()
+                raise DeviceTimeout(
+                    self.device,
+                    doing,
+                    expected="an answer",
+                    received="nothing, or not all of it",
+                    deadline_s=self.config.timeout_s,
+                    todo="Check the camera's power and network.",
+                ) from error
+            except (OSError, EOFError) as error:
+                self.close()
+                raise DeviceUnreachable(
+                    self.device,
+                    doing,
+                    expected="an answer",
+                    received=str(error) or "a closed connection",
+                    deadline_s=self.config.timeout_s,
+                    todo="Check the camera's power and network, and start again.",
+                ) from error
+            except (ValueError, AttributeError) as error:
+                self.close()
+                raise self._error(
+                    doing,
+                    "length-prefixed JSON",
+                    str(error),
+                    "Check the port in [devices.cameras]: this is another device.",
+                ) from error
+        if answer.get("ok") is not True:
+            raise self._error(
+                doing,
+                "ok",
+                f"{answer.get('error', answer)}",
+                "Check that the rig file is this stage's.",
+            )
+        return answer, payload
+
+    def _receive(self, count: int, deadline: float) -> bytes:
+        assert self._socket is not None
+        data = bytearray(count)
+        view, got = memoryview(data), 0
+        while got < count:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise TimeoutError
+            self._socket.settimeout(left)
+            n = self._socket.recv_into(view[got:])
+            if n == 0:
+                raise EOFError("the connection was closed by the camera")
+            got += n
+        return bytes(data)
+
+    def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
+        return DeviceError(self.device, doing, expected=expected, received=received, todo=todo)

@@ -1,0 +1,52 @@
+"""What goes wrong on a wire, told so that somebody can act on it."""
+
+from __future__ import annotations
+
+
+class DeviceError(RuntimeError):
+    """A device did not do what it was asked to.
+
+    The message names the device, the operation, the deadline, what was expected and what was
+    received, and what to do next; the same are attributes.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        operation: str,
+        *,
+        expected: str,
+        received: str,
+        todo: str,
+        deadline_s: float | None = None,
+    ) -> None:
+        within = f" within {deadline_s:g} s" if deadline_s is not None else ""
+        super().__init__(
+            f"{device}: {operation}: expected {expected}{within}, received {received}. {todo}"
+        )
+        self.device = device
+        self.operation = operation
+        self.expected = expected
+        self.received = received
+        self.todo = todo
+        self.deadline_s = deadline_s
+
+
+class DeviceTimeout(DeviceError):
+    """Nothing, or not enough, came before the deadline."""
+
+
+class DeviceUnreachable(DeviceError):
+    """There is no connection to the device."""
+
+
+class SafetyRefusal(DeviceError):
+    """An interlock is open or the emergency stop is pressed; only people at the stage clear it."""
+
+
+class IndexShift(DeviceError):
+    """Pulses and frames do not match: frames could stand for the wrong step."""
+
+
+class Cancelled(Exception):
+    """A wait was given up because the capture is being stopped at once."""

@@ -1,0 +1,1 @@
+"""Light banks: the interface and its backends."""

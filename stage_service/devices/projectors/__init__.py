@@ -1,0 +1,1 @@
+"""Projector controllers: the interface and its backends."""

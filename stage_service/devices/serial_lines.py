@@ -1,0 +1,161 @@
+"""Requests and replies as ASCII lines on a serial port."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+
+import serial
+
+from stage_service.config import SerialConfig
+from stage_service.devices.errors import (
+    DeviceError,
+    DeviceTimeout,
+    DeviceUnreachable,
+    SafetyRefusal,
+)
+
+LONGEST_LINE = 4096
+REFUSED_BY_SAFETY = 3
+
+
+class SerialLines:
+    """One request at a time, each with a deadline; safe to call from several threads.
+
+    After a missed deadline the port is closed; the next request opens it, drains what came late
+    and reads on until the device has identified itself, so no late reply answers a later request.
+    """
+
+    def __init__(self, name: str, config: SerialConfig, identity: re.Pattern[str]) -> None:
+        self.name = f"{name} ({config.port})"
+        self.config = config
+        self._identity = identity
+        self._port: serial.Serial | None = None
+        self._lock = threading.RLock()
+
+    def connect(self) -> re.Match[str]:
+        """Open the port and return the match of the device's answer to `ID?`."""
+        with self._lock:
+            self.close()
+            try:
+                port = serial.Serial(
+                    self.config.port,
+                    self.config.baud,
+                    timeout=self.config.timeout_s,
+                    write_timeout=self.config.timeout_s,
+                    exclusive=True,
+                )
+            except (OSError, serial.SerialException) as error:
+                raise DeviceUnreachable(
+                    self.name,
+                    "opening the serial port",
+                    expected="a free serial port",
+                    received=str(error),
+                    todo="Check the cable, the path in the rig file and who else has it open.",
+                ) from error
+            self._port = port
+            port.reset_input_buffer()
+            return self._identify()
+
+    def close(self) -> None:
+        """Close the port."""
+        with self._lock:
+            if self._port is not None:
+                self._port.close()
+            self._port = None
+
+    def ask(self, request: str, reply: str, doing: str) -> re.Match[str]:
+        """Send `request` and return the match of the reply with the pattern `reply`.
+
+        Raises `DeviceError`: `SafetyRefusal` for the device's error 3.
+        """
+        with self._lock:
+            if self._port is None:
+                self.connect()
+            self._send(request, doing)
+            line = self._line(time.monotonic() + self.config.timeout_s, doing)
+        match = re.fullmatch(reply, line)
+        if match is not None:
+            return match
+        error = re.fullmatch(r"ERR (\d+) ?(.*)", line)
+        if error is not None and int(error[1]) == REFUSED_BY_SAFETY:
+            raise SafetyRefusal(
+                self.name,
+                doing,
+                expected=f"an answer to {request!r}",
+                received=f"a refusal: {error[2] or line}",
+                todo="Close the interlock and release the emergency stop at the stage.",
+            )
+        raise DeviceError(
+            self.name,
+            doing,
+            expected=f"an answer to {request!r} like {reply!r}",
+            received=repr(line),
+            todo="Check that the device follows docs/wire.md and that nobody else uses the port.",
+        )
+
+    def _identify(self) -> re.Match[str]:
+        self._send("ID?", "identifying")
+        deadline = time.monotonic() + self.config.timeout_s
+        seen: list[str] = []
+        while True:
+            try:
+                line = self._line(deadline, "identifying")
+            except DeviceTimeout as error:
+                if not seen:
+                    raise
+                raise DeviceError(
+                    self.name,
+                    "identifying",
+                    expected=f"an identity like {self._identity.pattern!r}",
+                    received=repr(seen[-1]),
+                    deadline_s=self.config.timeout_s,
+                    todo="This is another device: check the ports in the rig file.",
+                ) from error
+            match = self._identity.fullmatch(line)
+            if match is not None:
+                return match
+            seen.append(line)
+
+    def _send(self, request: str, doing: str) -> None:
+        assert self._port is not None
+        try:
+            self._port.write(request.encode("ascii") + b"\n")
+        except (OSError, serial.SerialException) as error:
+            raise self._lost(doing, error) from error
+
+    def _line(self, deadline: float, doing: str) -> str:
+        """The next line; garbage bytes are kept, visibly, for the error message."""
+        assert self._port is not None
+        data = b""
+        try:
+            while not data.endswith(b"\n") and len(data) < LONGEST_LINE:
+                self._port.timeout = max(0.0, deadline - time.monotonic())
+                got = self._port.read_until(b"\n", LONGEST_LINE - len(data))
+                data += got
+                if not got and time.monotonic() >= deadline:
+                    break
+        except (OSError, serial.SerialException) as error:
+            raise self._lost(doing, error) from error
+        if not data.endswith(b"\n"):
+            self.close()
+            raise DeviceTimeout(
+                self.name,
+                doing,
+                expected="a line",
+                received=repr(data.decode("ascii", "backslashreplace")) if data else "nothing",
+                deadline_s=self.config.timeout_s,
+                todo="Check power and cable; the port is reopened at the next request.",
+            )
+        return data.decode("ascii", "backslashreplace").strip("\r\n")
+
+    def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
+        self.close()
+        return DeviceUnreachable(
+            self.name,
+            doing,
+            expected="an open serial port",
+            received=str(error),
+            todo="The device was unplugged or its port closed: plug it in and start again.",
+        )

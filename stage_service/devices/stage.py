@@ -1,0 +1,98 @@
+"""All devices of one stage, as the rig file describes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+from reconstruction.rig import RigError
+from stage_service.config import DevicesConfig, RigFile
+from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.cameras.link import LinkCamera
+from stage_service.devices.errors import DeviceError
+from stage_service.devices.lights.interface import LightBank
+from stage_service.devices.lights.modbus_tcp import ModbusLightBank
+from stage_service.devices.projectors.interface import ProjectorController
+from stage_service.devices.projectors.serial_controller import SerialProjectorController
+from stage_service.devices.trigger.interface import TriggerBox
+from stage_service.devices.trigger.serial_box import SerialTriggerBox
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The drivers of a stage; `projectors` is None where it has none."""
+
+    config: DevicesConfig
+    lights: LightBank
+    trigger: TriggerBox
+    projectors: ProjectorController | None
+    cameras: tuple[Camera, ...]
+
+    @classmethod
+    def of(cls, rig_file: RigFile) -> Self:
+        """Make the drivers; connects to nothing. Raises `RigError` without `[devices]`."""
+        config, rig = rig_file.devices, rig_file.rig
+        if config is None:
+            raise RigError(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
+        projectors = None
+        if config.projectors is not None and rig.projectors:
+            names = tuple(p.name for p in rig.projectors)
+            projectors = SerialProjectorController(config.projectors, names)
+        return cls(
+            config,
+            ModbusLightBank(config.lights, len(rig.lights)),
+            SerialTriggerBox(config.trigger),
+            projectors,
+            tuple(LinkCamera(config.cameras, c) for c in rig.cameras),
+        )
+
+    def connect(self) -> None:
+        """Connect to every device, lights first. Raises the first `DeviceError`."""
+        for device in self._all():
+            device.connect()
+
+    def close(self) -> None:
+        """Close every link; lamps and projectors stay as they are."""
+        for device in self._all():
+            device.close()
+
+    def status(self, *, cameras: bool = True) -> dict[str, Any]:
+        """Ask each device how it is: {kind: {"state": "ok" | "unreachable", ...}}.
+
+        `cameras=False` leaves the cameras alone, as during a capture.
+        """
+        out = {
+            "lights": _ask(
+                self.lights.name,
+                lambda: {"count": self.lights.count, **asdict(self.lights.status())},
+            ),
+            "trigger": _ask(
+                self.trigger.name,
+                lambda: {"pulses": self.trigger.count(), **asdict(self.trigger.status())},
+            ),
+        }
+        if self.projectors is not None:
+            projectors = self.projectors
+            out["projectors"] = _ask(
+                projectors.name,
+                lambda: {"dark": projectors.is_dark(), "names": list(projectors.names)},
+            )
+        if cameras:
+            out["cameras"] = {c.name: _ask(c.name, lambda c=c: _hello(c)) for c in self.cameras}
+        return out
+
+    def _all(self) -> tuple[LightBank | TriggerBox | ProjectorController | Camera, ...]:
+        beams = (self.projectors,) if self.projectors is not None else ()
+        return (self.lights, *beams, self.trigger, *self.cameras)
+
+
+def _hello(camera: Camera) -> dict[str, Any]:
+    return asdict(camera.info)
+
+
+def _ask(name: str, question: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return {"name": name, "state": "ok", **question()}
+    except DeviceError as error:
+        return {"name": name, "state": "unreachable", "error": str(error)}

@@ -1,0 +1,1 @@
+"""Trigger boxes: the interface and its backends."""

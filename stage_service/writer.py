@@ -1,0 +1,74 @@
+"""Frames on their way to disk: a bounded queue, so that a slow disk slows the sequence."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from dataclasses import dataclass
+
+from reconstruction.capture import Step
+from reconstruction.capture_writer import CaptureWriter
+from stage_service.devices.cameras.interface import CameraInfo, Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame with what it takes to write it."""
+
+    step: Step
+    camera: str
+    frame: Frame
+    info: CameraInfo
+    pulse: int
+    attempt: int
+
+
+class FrameWriter:
+    """Converts and writes frames on a thread of its own; at most `capacity` wait."""
+
+    def __init__(self, writer: CaptureWriter, capacity: int) -> None:
+        self._writer = writer
+        self._queue: queue.Queue[Shot | None] = queue.Queue(capacity)
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="frame-writer", daemon=True)
+        self._thread.start()
+
+    def put(self, shot: Shot) -> None:
+        """Hand over a frame; waits while the queue is full. Raises what writing raised."""
+        self.check()
+        self._queue.put(shot)
+
+    def check(self) -> None:
+        """Raise what writing raised, if it did."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Write what waits, then stop. Raises what writing raised."""
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+        self.check()
+
+    def _run(self) -> None:
+        while (shot := self._queue.get()) is not None:
+            # After an error the queue is still emptied, or `put` would wait for ever.
+            if self._error is None:
+                try:
+                    self._write(shot)
+                except Exception as error:  # handed to the sequencer by `check`
+                    self._error = error
+
+    def _write(self, shot: Shot) -> None:
+        frame, info = shot.frame, shot.info
+        self._writer.write_frame(
+            shot.step,
+            shot.camera,
+            frame.radiance(info),
+            full_scale=frame.full_scale(info),
+            count_scale=frame.count_scale(info),
+            pulse=shot.pulse,
+            block_id=frame.block_id,
+            timestamp=frame.timestamp,
+            attempt=shot.attempt,
+        )
