@@ -52,7 +52,9 @@ class RigConditioning:
         return asdict(self)
 
 
-def ray_plane_angles(camera: Camera, projector: Projector, points: ArrayLike) -> NDArray[np.float64]:
+def ray_plane_angles(
+    camera: Camera, projector: Projector, points: ArrayLike
+) -> NDArray[np.float64]:
     """Angles `(N,)` in [0, π/2] between the camera's rays to `points (N, 3)` and their light planes.
 
     The plane of a point is that of the (fractional) row that lights it. Near 0 the depth along the

@@ -1,0 +1,86 @@
+"""The subject's rigid motion during the sweep, from its tracking frames (Photobooth §3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+Array = NDArray[np.float64]
+Between = Literal["interpolate", "hold"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Rigid motions `x -> rotation @ x + translation` from the reference pose to each tracking frame.
+
+    steps (T,)            `Step.index` of the tracking frames, ascending
+    rotations (T, 3, 3), translations (T, 3) in metres
+    between               what holds between tracking frames: "interpolate" (rotation on SO(3),
+                          translation linearly) suits people, "hold" a subject that only moves at
+                          tracking frames
+    still                 nothing moved by more than the noise of the measurement
+    determined            directions of motion (of 6) that the cameras determine, the least over frames
+    """
+
+    steps: NDArray[np.int64]
+    rotations: Array
+    translations: Array
+    between: Between = "interpolate"
+    still: bool = False
+    determined: int = 6
+
+    def __post_init__(self) -> None:
+        t = len(self.steps)
+        if np.shape(self.rotations) != (t, 3, 3) or np.shape(self.translations) != (t, 3):
+            raise ValueError(
+                f"motion of {t} tracking frames needs rotations ({t}, 3, 3) and translations "
+                f"({t}, 3), got {np.shape(self.rotations)} and {np.shape(self.translations)}"
+            )
+        if (np.diff(self.steps) <= 0).any():
+            raise ValueError(f"tracking steps must ascend, got {self.steps}")
+
+    @classmethod
+    def none(cls, steps: ArrayLike = ()) -> Motion:
+        """The motion of a subject that kept still."""
+        index = np.asarray(steps, np.int64)
+        n = len(index)
+        return cls(index, np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), still=True)
+
+    def at(self, steps: ArrayLike) -> tuple[Array, Array]:
+        """Rotations `(N, 3, 3)` and translations `(N, 3)` at the steps `(N,)`; ends are held."""
+        index = np.asarray(steps, float).reshape(-1)
+        if self.still or not len(self.steps):
+            return np.tile(np.eye(3), (len(index), 1, 1)), np.zeros((len(index), 3))
+        knots = self.steps.astype(float)
+        if self.between == "hold" or len(knots) == 1:
+            which = np.clip(np.searchsorted(knots, index, side="right") - 1, 0, len(knots) - 1)
+            return self.rotations[which], self.translations[which]
+        time = np.clip(index, knots[0], knots[-1])
+        rotations = Slerp(knots, Rotation.from_matrix(self.rotations))(time).as_matrix()
+        columns = [np.interp(time, knots, self.translations[:, k]) for k in range(3)]
+        return np.asarray(rotations), np.stack(columns, axis=1)
+
+    def undo(
+        self, steps: ArrayLike, points: Array, view: Array, covariance: Array
+    ) -> tuple[Array, Array, Array]:
+        """Bring `points (N, 3)`, directions and covariances measured at `steps (N,)` back."""
+        rotation, translation = self.at(steps)
+        back = rotation.transpose(0, 2, 1)
+        moved = np.einsum("nij,nj->ni", back, points - translation)
+        return moved, np.einsum("nij,nj->ni", back, view), back @ covariance @ rotation
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready: rotations as rotation vectors in radians, translations in metres."""
+        vectors = Rotation.from_matrix(self.rotations).as_rotvec() if len(self.steps) else []
+        return {
+            "steps": self.steps.tolist(),
+            "rotations_rad": np.asarray(vectors).tolist(),
+            "translations_m": self.translations.tolist(),
+            "between": self.between,
+            "still": self.still,
+            "determined": self.determined,
+        }

@@ -1,0 +1,231 @@
+"""Space-time analysis of a scanline sweep (Curless and Levoy 1995; Photobooth §3.1).
+
+A sweep is read from disk one frame at a time. For every pixel the strongest temporal maxima are
+kept with the few frames around them, so memory does not grow with the number of scanlines.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture import Capture, Step
+from reconstruction.projectors import Projector
+from reconstruction.silhouettes import background_noise, dark_frame
+
+REACH = 3  # frames kept before and after a maximum
+WINDOW = 2 * REACH + 1
+CLEAN = 0.03  # rows: what a stripe's centre is off by even without noise
+
+
+@dataclass(frozen=True)
+class PeakOptions:
+    """What counts as a stripe of direct light.
+
+    A maximum must stand `noise_factor` deviations above the dark frame and reach `faintest` of the
+    camera's bright maxima (95th percentile); at least `direct_share` of all the light that the
+    sweep brings to the pixel must be in the stripe (indirect light comes from every row); the
+    stripe must correlate with the projector's line profile by `correlation`. Up to `per_pixel`
+    maxima are kept: hair lets a ray hit several fibres.
+    """
+
+    noise_factor: float = 6.0
+    faintest: float = 0.01
+    direct_share: float = 0.15
+    correlation: float = 0.9
+    per_pixel: int = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Stripes that one camera saw of one projector, one entry for each.
+
+    pixel (N, 2) int (x, y); row (N,) fractional row; deviation (N,) of the row from noise and from
+    depths mixed in the pixel, rows; brightness (N,) of the maximum; step (N,) `Step.index` of the
+    frame with the maximum; saturated (N,) whether a frame at the maximum was at full scale.
+    """
+
+    camera: str
+    projector: str
+    pixel: NDArray[np.int64]
+    row: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    step: NDArray[np.int64]
+    saturated: NDArray[np.bool_]
+    candidates: int = 0
+    missing_rows: tuple[int, ...] = field(default=())
+
+
+def find_peaks(
+    capture: Capture, camera: str, projector: str, options: PeakOptions | None = None
+) -> Peaks:
+    """Read one camera's frames of one projector's sweep in row order and locate its stripes.
+
+    A maximum next to a frame that is missing is not used. `KeyError` for unknown names.
+    """
+    options = options or PeakOptions()
+    device = capture.rig.projector(projector)
+    capture.rig.camera(camera)
+    sweep = {s.row: s for s in capture.of_kind("scanline") if s.projector == projector}
+    scan = _Scan(capture, camera, sweep, device.height, options.per_pixel)
+    for row in range(-REACH, device.height + REACH):
+        scan.push(row)
+    found = scan.value > 0
+    layer, y, x = np.nonzero(found)
+    window = scan.window[layer, :, y, x].astype(np.float64)
+    value, at = scan.value[found].astype(np.float64), scan.at[found]
+    noise = scan.noise()
+    row, deviation, correlation, amplitude = fit_stripes(window, device, noise)
+    share = amplitude / np.maximum(np.maximum(scan.total[y, x], value), amplitude)
+    saturated = scan.clipped[found]
+    deviation[saturated] = np.maximum(deviation[saturated], 0.3)
+    strong = value > max(options.noise_factor * noise, options.faintest * _bright(scan.value[0]))
+    direct = (share >= options.direct_share) & (correlation >= options.correlation)
+    keep = strong & (direct | saturated)
+    steps = np.array([sweep[r].index if r in sweep else -1 for r in range(device.height)])
+    return Peaks(
+        camera,
+        projector,
+        np.stack([x, y], axis=1)[keep],
+        (at + row)[keep],
+        deviation[keep],
+        value[keep],
+        steps[at[keep]] if keep.any() else np.zeros(0, np.int64),
+        saturated[keep],
+        candidates=int(strong.sum()),
+        missing_rows=tuple(scan.missing),
+    )
+
+
+def fit_stripes(
+    window: NDArray[np.float64], projector: Projector, noise: float
+) -> tuple[NDArray[np.float64], ...]:
+    """Fit the projector's line profile on a constant to `window (N, 7)` about each maximum.
+
+    Least squares over the stripe's centre (searched, then refined by a parabola), its extra width
+    (depths mixed in one pixel), its height and the constant. Returns the centre `(N,)` relative to
+    the middle frame in rows, its standard deviation `(N,)`, the correlation of window and profile
+    `(N,)` in [0, 1], and the light `(N,)` of the stripe summed over rows.
+    """
+    centres = np.linspace(-1.25, 1.25, 51)
+    n = len(window)
+    best = np.full(n, -np.inf)
+    centre, extra, slope, light = (np.zeros(n) for _ in range(4))
+    flat = window - window.mean(axis=1, keepdims=True)
+    energy = np.maximum(np.linalg.norm(flat, axis=1), np.finfo(float).tiny)
+    for width in (0.0, 0.5, 0.9, 1.4):
+        profile = _profiles(projector, centres, width)
+        centred = profile - profile.mean(axis=1, keepdims=True)
+        length = np.linalg.norm(centred, axis=1)
+        score = flat @ (centred / length[:, None]).T / energy[:, None]
+        i = np.clip(score.argmax(axis=1), 1, len(centres) - 2)
+        left, mid, right = (score[np.arange(n), i + k] for k in (-1, 0, 1))
+        bend = left - 2 * mid + right
+        shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, 1.0), 0.0)
+        better = mid > best
+        best = np.where(better, mid, best)
+        step = centres[1] - centres[0]
+        centre = np.where(better, centres[i] + np.clip(shift, -1, 1) * step, centre)
+        extra = np.where(better, width, extra)
+        height = mid * energy / length[i]
+        light = np.where(better, height, light)
+        gradient = np.linalg.norm(np.gradient(profile, centres, axis=0), axis=1)
+        slope = np.where(better, height * gradient[i], slope)
+    # a residual that noise does not explain is a profile that was not quite right
+    misfit = energy * np.sqrt(np.maximum(1 - best**2, 0) / (WINDOW - 3))
+    error = np.maximum(noise, 0.5 * misfit)
+    random = np.where(slope > error, error / np.where(slope > 0, slope, 1.0), 1.0)
+    deviation = np.sqrt(random**2 + (0.25 * extra) ** 2 + CLEAN**2)
+    return centre, np.minimum(deviation, 1.0), np.clip(best, 0, 1), np.maximum(light, 0)
+
+
+def _profiles(
+    projector: Projector, centres: NDArray[np.float64], width: float
+) -> NDArray[np.float64]:
+    """Line profiles `(C, 7)` at the window's rows, spread by a Gaussian of `width` rows."""
+    rows = np.arange(-REACH, REACH + 1)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9 if width > 0 else 1)
+    weights = weights / weights.sum()
+    v = centres[:, None, None] + width * nodes
+    return np.asarray((projector.row_weight(rows[None, :, None], v) * weights).sum(axis=-1))
+
+
+def _bright(value: NDArray[np.float32]) -> float:
+    some = value[value > 0]
+    return float(np.percentile(some, 95)) if some.size else 0.0
+
+
+class _Scan:
+    """The running state of one sweep: a ring of frames and each pixel's strongest maxima."""
+
+    def __init__(
+        self, capture: Capture, camera: str, sweep: dict[int | None, Step], rows: int, layers: int
+    ) -> None:
+        c = capture.rig.camera(camera)
+        shape = (c.height, c.width)
+        self.capture, self.camera, self.sweep, self.rows = capture, camera, sweep, rows
+        self.ring: deque[NDArray[np.float32]] = deque(maxlen=WINDOW)
+        self.clip: deque[NDArray[np.bool_]] = deque(maxlen=WINDOW)
+        self.held: deque[bool] = deque(maxlen=WINDOW)
+        self.value = np.zeros((layers, *shape), np.float32)
+        self.at = np.zeros((layers, *shape), np.int64)
+        self.window = np.zeros((layers, WINDOW, *shape), np.float32)
+        self.clipped = np.zeros((layers, *shape), bool)
+        self.total = np.zeros(shape, np.float32)
+        self.missing: list[int] = []
+        self._noises: list[float] = []
+        self._dark: dict[float, NDArray[np.float32]] = {}
+
+    def noise(self) -> float:
+        """Median over frames of the unlit pixels' deviation, in units of the response."""
+        return float(np.median(self._noises)) if self._noises else 0.0
+
+    def push(self, row: int) -> None:
+        """Read the frame of `row` (dark beyond the projector's edge); look at the one behind it."""
+        shape = self.total.shape
+        image, clipped, held = np.zeros(shape, np.float32), np.zeros(shape, bool), True
+        if 0 <= row < self.rows:
+            step = self.sweep.get(row)
+            held = step is not None and self.capture.has(step, self.camera)
+            if step is None or not held:
+                self.missing.append(row)
+            else:
+                image, clipped = self._read(step)
+                self.total += image
+        self.ring.append(image)
+        self.clip.append(clipped)
+        self.held.append(held)
+        middle = row - REACH
+        if len(self.ring) == WINDOW and all(list(self.held)[REACH - 1 : REACH + 2]):
+            self._insert(middle)
+
+    def _read(self, step: Step) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        if step.exposure not in self._dark:
+            self._dark[step.exposure] = dark_frame(self.capture, self.camera, step.exposure)
+        image = self.capture.frame(step, self.camera).mean(axis=-1) - self._dark[step.exposure]
+        image /= np.float32(step.level if step.level > 0 else 1.0)
+        if step.row is not None and step.row % 8 == 0:
+            self._noises.append(background_noise(image))
+        return image, self.capture.saturated(step, self.camera)
+
+    def _insert(self, middle: int) -> None:
+        """Keep the middle frame's maxima where they beat the weakest that a pixel has."""
+        before, now, after = (self.ring[REACH + k] for k in (-1, 0, 1))
+        maximum = (now > before) & (now >= after) & (now > 0)
+        for layer in range(len(self.value)):
+            better = maximum & (now > self.value[layer])
+            if not better.any():
+                continue
+            for store in (self.value, self.at, self.clipped):
+                store[layer + 1 :, better] = store[layer:-1, better]
+            self.window[layer + 1 :, :, better] = self.window[layer:-1, :, better]
+            self.value[layer][better] = now[better]
+            self.at[layer][better] = middle
+            near = self.clip[REACH - 1] | self.clip[REACH] | self.clip[REACH + 1]
+            self.clipped[layer][better] = near[better]
+            self.window[layer][:, better] = np.stack([f[better] for f in self.ring])
+            maximum &= ~better

@@ -1,0 +1,134 @@
+"""Sub-pixel rigid registration of two pictures of one camera (Photobooth Eq. 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A 2D rigid motion: pixel `p` of the reference is at `c + R(angle) (p - c) + shift`.
+
+    `centre (2,)` and `shift (2,)` in pixels, `angle` in radians from +x towards +y. `deviation (3,)`
+    is that of shift x, shift y (pixels) and angle from the residual; `lever` (pixels) is the rms
+    distance of the used pixels from the centre, which turns angles into pixels.
+    """
+
+    centre: Array
+    shift: Array
+    angle: float
+    deviation: Array
+    lever: float
+    converged: bool
+
+    def largest(self) -> float:
+        """The larger of shift and rotation at the lever, pixels."""
+        return float(max(np.linalg.norm(self.shift), abs(self.angle) * self.lever))
+
+    def noise(self) -> float:
+        """Deviation of `largest`, pixels."""
+        return float(max(self.deviation[:2].max(), self.deviation[2] * self.lever))
+
+
+class Template:
+    """A reference picture prepared once, against which many others are registered.
+
+    `image (H, W)` is smoothed by a Gaussian of `sigma` pixels against aliasing; `mask (H, W)` says
+    which pixels count. Raises `ValueError` for an empty mask or a picture without any detail.
+    """
+
+    def __init__(
+        self, image: NDArray[np.floating], mask: NDArray[np.bool_], sigma: float = 1.5
+    ) -> None:
+        if image.shape != mask.shape or image.ndim != 2:
+            raise ValueError(f"image {image.shape} and mask {mask.shape} must be the same (H, W)")
+        if not mask.any():
+            raise ValueError("the registration mask is empty: no pixel of the subject to follow")
+        self.sigma, self.mask = sigma, mask
+        self.raw = np.asarray(image, np.float64)
+        self.image = smooth(image, sigma)
+        self.y, self.x = (v.astype(np.float64) for v in np.nonzero(mask))
+        self.centre = np.array([self.x.mean(), self.y.mean()])
+        dx, dy = self.x - self.centre[0], self.y - self.centre[1]
+        self.lever = float(max(np.sqrt(np.mean(dx**2 + dy**2)), 1.0))
+        gx, gy = (g[mask] for g in gradients(self.image))
+        self.values = self.image[mask]
+        # the last column is the picture's gain: lamps and shading may change a little
+        self.jacobian = np.stack([gx, gy, gy * dx - gx * dy, self.values], axis=1)
+        scale = np.linalg.norm(self.jacobian, axis=0)
+        normal = self.jacobian.T @ self.jacobian
+        if scale.min() <= 0 or np.linalg.cond(normal / np.outer(scale, scale)) > 1e8:
+            raise ValueError("the picture has no detail inside the mask to register by")
+        self.inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+
+    def register(
+        self, image: NDArray[np.floating], *, iterations: int = 30, tolerance: float = 1e-4
+    ) -> Registration:
+        """Register `image (H, W)` by inverse compositional Gauss-Newton (Baker and Matthews 2004).
+
+        `tolerance` in pixels. One iteration gives the linear estimate, which suffices to see that
+        nothing moved.
+        """
+        other = smooth(image, self.sigma)
+        shift, angle, gain, converged = np.zeros(2), 0.0, 1.0, False
+        error = np.zeros_like(self.values)
+        dx, dy = self.x - self.centre[0], self.y - self.centre[1]
+        for _ in range(iterations):
+            c, s = np.cos(angle), np.sin(angle)
+            u = self.centre[0] + c * dx - s * dy + shift[0]
+            v = self.centre[1] + s * dx + c * dy + shift[1]
+            error = sample(other, u, v) / gain - self.values
+            step = self.inverse @ (self.jacobian.T @ error)
+            gain *= 1 + float(np.clip(step[3], -0.5, 0.5))
+            # compose with the inverse of the step that would move the reference onto the picture
+            angle += step[2]
+            c, s = np.cos(angle), np.sin(angle)
+            shift = shift + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])
+            if max(np.abs(step[:2]).max(), abs(step[2]) * self.lever) < tolerance:
+                converged = True
+                break
+        # smoothing correlates neighbours: only one in 4 pi sigma² residuals is independent
+        correlated = max(1.0, 4 * np.pi * self.sigma**2)
+        variance = float(error @ error) / max(len(error) - 4, 1) * correlated
+        deviation = np.sqrt(np.maximum(np.diag(self.inverse)[:3] * variance, 0))
+        return Registration(
+            self.centre.copy(), shift, float(angle), deviation, self.lever, converged
+        )
+
+
+def smooth(image: NDArray[np.floating], sigma: float) -> Array:
+    """`image (H, W)` under a Gaussian of `sigma` pixels, edges repeated."""
+    source = np.ascontiguousarray(image, dtype=np.float64)
+    return np.asarray(cv2.GaussianBlur(source, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))
+
+
+def gradients(image: Array) -> tuple[Array, Array]:
+    """Derivatives by x and y `(H, W)`, fourth-order central differences.
+
+    Second-order differences read a pattern of 6 pixels a sixth too flat.
+    """
+    kernel = np.array([1, -8, 0, 8, -1]) / 12.0
+    gx = cv2.filter2D(image, cv2.CV_64F, kernel[None], borderType=cv2.BORDER_REPLICATE)
+    gy = cv2.filter2D(image, cv2.CV_64F, kernel[:, None], borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(gx), np.asarray(gy)
+
+
+def sample(image: Array, x: Array, y: Array) -> Array:
+    """`image (H, W)` at the pixels `x (N,)`, `y (N,)` by cubic interpolation, edges repeated."""
+    u = np.ascontiguousarray(np.atleast_2d(x), np.float32)
+    v = np.ascontiguousarray(np.atleast_2d(y), np.float32)
+    height = (u.shape[1] + 16383) // 16384  # remap's pictures are limited to 32767 columns
+    pad = height * 16384 - u.shape[1] if height > 1 else 0
+    if pad:
+        u, v = (np.pad(a, ((0, 0), (0, pad))) for a in (u, v))
+    shape = (height, -1)
+    out = cv2.remap(
+        image, u.reshape(shape), v.reshape(shape), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(out.reshape(-1)[: out.size - pad])

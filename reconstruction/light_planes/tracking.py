@@ -1,0 +1,333 @@
+"""The motion solve: tracking frames of all cameras give one rigid motion each.
+
+Two methods share one linear core. "registered" is the paper's: a 2D rigid registration per camera
+(Eq. 1), then the 3D motion that explains them (Eq. 2), here with the 2D rotation as a third
+equation. "direct" aligns the pictures of all cameras at once by warping the triangulated points:
+it starts from the registered motion and uses every pixel instead of three numbers a camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture, Step
+from reconstruction.light_planes.motion import Between, Motion
+from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.light_planes.registration import (
+    Registration,
+    Template,
+    gradients,
+    sample,
+    smooth,
+)
+from reconstruction.report import Progress, Stage, silent
+from reconstruction.silhouettes import dark_frame
+
+Array = NDArray[np.float64]
+LEVER = 0.1  # metres: rotations count by what they move at this distance, so that units agree
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """How the motion is solved.
+
+    `still_px`: motions under this, or under four deviations of the registration, are none.
+    `weakest`: directions whose singular value is below this share of the largest are not
+    determined, and stay at zero. `points`: at most so many points a camera.
+    """
+
+    method: Literal["direct", "registered"] = "direct"
+    between: Between = "interpolate"
+    still_px: float = 0.03
+    weakest: float = 0.02
+    points: int = 3000
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One camera's reference picture, prepared, and the points that it saw."""
+
+    camera: Camera
+    template: Template
+    points: Array
+    pixels: Array
+
+
+def solve_motion(
+    capture: Capture,
+    points: PointCloud,
+    *,
+    options: MotionOptions | None = None,
+    progress: Progress = silent,
+    stage: Stage | None = None,
+) -> Motion:
+    """Rigid motion from the first tracking frame (the reference pose) to each of the others.
+
+    `points` is a cloud made without compensation. A capture without tracking frames, or a subject
+    that kept still, gives `Motion.still`, said in `stage`; where the cameras do not determine all
+    six directions, the rest of the motion stays zero, and the stage has a warning.
+    """
+    options, stage = options or MotionOptions(), stage or Stage("motion")
+    steps = [
+        s for s in capture.of_kind("tracking") if any(capture.has(s, c) for c in points.cameras)
+    ]
+    if len(steps) < 2:
+        stage.leave_out("motion solve", f"{len(steps)} tracking frames", "the whole stage")
+        return Motion.none([s.index for s in steps])
+    views = _views(capture, steps[0], points, options, stage)
+    if not views:
+        stage.warn("no camera could be registered: the subject is taken to have kept still")
+        return Motion.none([s.index for s in steps])
+    screened = [
+        [v.template.register(_picture(capture, s, v.camera.name), iterations=1) for v in views
+         if capture.has(s, v.camera.name)]
+        for s in steps[1:]
+    ]  # fmt: skip
+    largest = max(r.largest() for frame in screened for r in frame)
+    stage.figures["largest_2d_motion_px"] = largest
+    if all(
+        r.largest() <= max(options.still_px, 4 * r.noise()) for frame in screened for r in frame
+    ):
+        stage.leave_out(
+            "motion solve",
+            f"nothing moved: at most {largest:.3f} px in {len(steps)} tracking frames",
+            f"{len(steps) - 1} rigid alignments of {len(views)} cameras",
+        )
+        return Motion.none([s.index for s in steps])
+    return _solve_all(capture, steps, views, options, progress, stage)
+
+
+def _solve_all(
+    capture: Capture,
+    steps: list[Step],
+    views: list[_View],
+    options: MotionOptions,
+    progress: Progress,
+    stage: Stage,
+) -> Motion:
+    pose = (np.eye(3), np.zeros(3))
+    poses, residuals, ranks, pairs = [pose], [], [], 0
+    for i, step in enumerate(steps[1:]):
+        progress("motion", i / (len(steps) - 1))
+        images = {
+            v.camera.name: _picture(capture, step, v.camera.name)
+            for v in views
+            if capture.has(step, v.camera.name)
+        }
+        present = [v for v in views if v.camera.name in images]
+        found = [(v, v.template.register(images[v.camera.name])) for v in present]
+        pairs += len(found)
+        pose, rank, residual = from_registrations(found, options.weakest)
+        if options.method == "direct":
+            pose, rank = align(present, images, pose, options.weakest)
+        poses.append(pose)
+        ranks.append(rank)
+        residuals.append(residual)
+    rank = min(ranks)
+    if rank < 6:
+        stage.warn(
+            f"{len(views)} cameras determine {rank} of 6 directions of motion; the other "
+            f"{6 - rank} are taken as zero. More cameras around the subject would determine them"
+        )
+    distance = [float(np.linalg.norm(t)) for _, t in poses]
+    turn = [float(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())) for R, _ in poses]
+    stage.figures |= {
+        "method": options.method,
+        "tracking_frames": len(steps),
+        "registrations": pairs,
+        "largest_translation_mm": max(distance) * 1e3,
+        "largest_rotation_deg": float(np.degrees(max(turn))),
+        "registration_residual_px": float(np.median(residuals)),
+        "determined_directions": rank,
+    }
+    progress("motion", 1.0)
+    return Motion(
+        np.array([s.index for s in steps]),
+        np.stack([R for R, _ in poses]),
+        np.stack([t for _, t in poses]),
+        between=options.between,
+        determined=rank,
+    )
+
+
+def from_registrations(
+    found: list[tuple[_View, Registration]], weakest: float
+) -> tuple[tuple[Array, Array], int, float]:
+    """The motion that best explains 2D registrations (Photobooth Eq. 2), robustly.
+
+    Three equations a camera: the mean shift of its points in its picture, and their turn at the
+    points' rms distance. Returns the pose, how many directions are determined, and the rms residual
+    in pixels.
+    """
+    target = np.concatenate(
+        [[*_rigid_at(r, v.pixels.mean(axis=0)), r.angle * _spread(v.pixels)] for v, r in found]
+    )
+
+    def residual(pose: tuple[Array, Array]) -> Array:
+        flow = []
+        for view, _ in found:
+            moved, _ = view.camera.project(view.points @ pose[0].T + pose[1])
+            before = view.pixels - view.pixels.mean(axis=0)
+            after = moved - moved.mean(axis=0)
+            cross = (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).sum()
+            angle = np.arctan2(cross, (before * after).sum())
+            shift = moved.mean(axis=0) - view.pixels.mean(axis=0)
+            flow.append([*shift, angle * _spread(view.pixels)])
+        return np.concatenate(flow) - target
+
+    pose, rank = _gauss_newton(lambda p: (residual(p), _numeric(residual, p)), weakest, 12)
+    return pose, rank, float(np.sqrt(np.mean(residual(pose) ** 2)))
+
+
+def align(
+    views: list[_View],
+    images: dict[str, Array],
+    start: tuple[Array, Array],
+    weakest: float,
+    sigmas: tuple[float, ...] = (2.5, 1.2),
+) -> tuple[tuple[Array, Array], int]:
+    """The motion under which every camera's picture at the moved points equals its reference.
+
+    `images[camera] (H, W)`; coarse to fine over Gaussians of `sigmas` pixels. Returns the pose and
+    how many directions are determined.
+    """
+    pose, rank = start, 0
+    for sigma in sigmas:
+        prepared = []
+        for view in views:
+            picture = smooth(images[view.camera.name], sigma)
+            reference = smooth(view.template.raw, sigma)
+            value = sample(reference, *view.pixels.T)
+            prepared.append((view, picture, gradients(picture), value))
+
+        def system(
+            pose: tuple[Array, Array],
+            prepared: list[tuple[_View, Array, tuple[Array, Array], Array]] = prepared,
+        ) -> tuple[Array, Array]:
+            errors, rows = [], []
+            for view, picture, (gx, gy), value in prepared:
+                moved = view.points @ pose[0].T + pose[1]
+                pixels, depth = view.camera.project(moved)
+                u, v = pixels.T
+                now = sample(picture, u, v)
+                gain = float(now @ value) / max(float(value @ value), np.finfo(float).tiny)
+                scale = 1.0 / max(float(np.sqrt(np.mean(value**2))), np.finfo(float).tiny)
+                slope = np.stack([sample(gx, u, v), sample(gy, u, v)], axis=1) * scale
+                inside = view.camera.inside(pixels) & (depth > 0)
+                errors.append((now - gain * value) * scale * inside)
+                rows.append(_flow(slope, view.camera, moved, depth) * inside[:, None])
+            return np.concatenate(errors), np.concatenate(rows)
+
+        pose, rank = _gauss_newton(system, weakest, 15, pose)
+    return pose, rank
+
+
+def _gauss_newton(
+    system: Callable[[tuple[Array, Array]], tuple[Array, Array]],
+    weakest: float,
+    iterations: int,
+    start: tuple[Array, Array] | None = None,
+) -> tuple[tuple[Array, Array], int]:
+    """Minimise Huber's loss over rigid motions; directions that are not determined stay put.
+
+    `system(pose)` gives the residuals (M,) and their derivatives (M, 6) by a turn times `LEVER` and
+    a shift, both applied after the pose.
+    """
+    rotation, translation = start if start is not None else (np.eye(3), np.zeros(3))
+    rank = 0
+    for _ in range(iterations):
+        error, rows = system((rotation, translation))
+        scale = 1.4826 * float(np.median(np.abs(error)))
+        size = np.maximum(np.abs(error), np.finfo(float).tiny)
+        weight = np.minimum(1.0, 1.345 * scale / size) if scale > 0 else np.ones_like(error)
+        values, vectors = np.linalg.eigh(rows.T @ (rows * weight[:, None]))
+        strong = values > weakest**2 * max(float(values[-1]), np.finfo(float).tiny)
+        rank = int(strong.sum())
+        basis = vectors[:, strong]
+        step = -basis @ ((basis.T @ (rows.T @ (weight * error))) / values[strong])
+        turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
+        rotation, translation = turn @ rotation, turn @ translation + step[3:]
+        if np.abs(step).max() < 1e-7:
+            break
+    return (rotation, translation), rank
+
+
+def _numeric(residual: Callable[[tuple[Array, Array]], Array], pose: tuple[Array, Array]) -> Array:
+    columns = []
+    for k in range(6):
+        both = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(6)
+            step[k] = sign * 1e-5
+            turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
+            both.append(residual((turn @ pose[0], turn @ pose[1] + step[3:])))
+        columns.append((both[0] - both[1]) / 2e-5)
+    return np.stack(columns, axis=1)
+
+
+def _flow(slope: Array, camera: Camera, points: Array, depth: Array) -> Array:
+    """Derivatives `(N, 6)` of a picture with `slope (N, 2)` at `points (N, 3)` by a rigid step."""
+    local = points @ camera.R.T + camera.t
+    z = np.where(depth > 0, depth, 1.0)
+    x, y = local[:, 0] / z, local[:, 1] / z
+    a = slope[:, 0] * camera.K[0, 0]
+    b = slope[:, 0] * camera.K[0, 1] + slope[:, 1] * camera.K[1, 1]
+    by_point = np.stack([a / z, b / z, -(a * x + b * y) / z], axis=1) @ camera.R
+    # d(w x p) . g = w . (p x g)
+    return np.concatenate([np.cross(points, by_point) / LEVER, by_point], axis=1)
+
+
+def _views(
+    capture: Capture, reference: Step, points: PointCloud, options: MotionOptions, stage: Stage
+) -> list[_View]:
+    rng = np.random.default_rng(options.seed)
+    views = []
+    for camera in capture.rig.cameras:
+        if not capture.has(reference, camera.name):
+            stage.warn(f"{camera.name} has no reference tracking frame and is not used")
+            continue
+        seen = points.of_camera(camera.name).points
+        pixels, depth = camera.project(seen)
+        seen = seen[(depth > 0) & camera.inside(pixels)]
+        if len(seen) < 30:
+            stage.warn(f"{camera.name} triangulated {len(seen)} points: not used for motion")
+            continue
+        if len(seen) > options.points:
+            seen = seen[np.sort(rng.choice(len(seen), options.points, replace=False))]
+        pixels = camera.project(seen)[0]
+        image = _picture(capture, reference, camera.name)
+        mask = np.zeros(image.shape, bool)
+        mask[tuple(np.rint(pixels[:, ::-1]).astype(int).T)] = True
+        clipped = capture.saturated(reference, camera.name)
+        try:
+            template = Template(image, mask & ~clipped)
+        except ValueError as error:
+            stage.warn(f"{camera.name} is not used for motion: {error}")
+            continue
+        views.append(_View(camera, template, seen, pixels))
+    return views
+
+
+def _picture(capture: Capture, step: Step, camera: str) -> Array:
+    dark = dark_frame(capture, camera, step.exposure)
+    return np.asarray(capture.response(step, camera).mean(axis=-1) - dark, np.float64)
+
+
+def _rigid_at(registration: Registration, pixel: Array) -> Array:
+    """Where a registration moves `pixel (2,)`, as a shift."""
+    c, s = np.cos(registration.angle), np.sin(registration.angle)
+    offset = pixel - registration.centre
+    turned = np.array([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]])
+    return np.asarray(turned - offset + registration.shift)
+
+
+def _spread(pixels: Array) -> float:
+    return float(np.sqrt(((pixels - pixels.mean(axis=0)) ** 2).sum(axis=1).mean()))

@@ -1,0 +1,257 @@
+"""Rays meet planes of light: the points of a sweep (Photobooth §3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.capture import Capture, CaptureError
+from reconstruction.light_planes.conditioning import row_pitch
+from reconstruction.light_planes.motion import Motion
+from reconstruction.light_planes.peaks import CLEAN, PeakOptions, Peaks, find_peaks
+from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.projectors import Projector
+from reconstruction.report import Progress, Stage, silent
+from reconstruction.silhouettes import NoSilhouette, silhouette
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TriangulateOptions:
+    """How points are made and which are kept.
+
+    `min_angle_deg`: rays that meet their plane flatter are not used. `max_deviation` (metres): the
+    largest standard deviation along the ray. `hull_margin` (pixels): how far outside a silhouette a
+    point may project. `neighbours` points must lie within `isolation` (metres), or the point is an
+    outlier. `fuse`: points of one pixel that agree become one.
+    """
+
+    peaks: PeakOptions = field(default_factory=PeakOptions)
+    min_angle_deg: float = 10.0
+    max_deviation: float = 4e-3
+    hull: bool = True
+    hull_margin: float = 1.0
+    neighbours: int = 4
+    isolation: float = 8e-3
+    fuse: bool = True
+
+
+def sweep_peaks(
+    capture: Capture, options: PeakOptions | None = None, progress: Progress = silent
+) -> list[Peaks]:
+    """The stripes of every camera and projector, streamed from disk.
+
+    Raises `CaptureError` for a capture without scanline frames.
+    """
+    swept = {s.projector for s in capture.of_kind("scanline")}
+    names = [p.name for p in capture.rig.projectors if p.name in swept]
+    if not names:
+        raise CaptureError(
+            f"{capture.path}: no scanline frames, so nothing to triangulate; "
+            "shoot a sweep, or use a method that needs none"
+        )
+    pairs = [(c.name, p) for c in capture.rig.cameras for p in names]
+    peaks = []
+    for i, (camera, projector) in enumerate(pairs):
+        progress(f"scanlines of {projector} in {camera}", i / len(pairs))
+        peaks.append(find_peaks(capture, camera, projector, options))
+    progress("scanlines", 1.0)
+    return peaks
+
+
+def triangulate(
+    capture: Capture,
+    *,
+    motion: Motion | None = None,
+    peaks: list[Peaks] | None = None,
+    options: TriangulateOptions | None = None,
+    progress: Progress = silent,
+    stage: Stage | None = None,
+) -> PointCloud:
+    """Points of all cameras and projectors in the reference pose.
+
+    `motion` undoes the subject's motion step by step (None: it did not move); `peaks` are those of
+    `sweep_peaks` where they are already known. Figures and warnings go into `stage`. Raises
+    `CaptureError` for a capture without a sweep; a sweep that lit nothing gives an empty cloud.
+    """
+    options = options or TriangulateOptions()
+    stage = stage or Stage("triangulation")
+    if peaks is None:
+        peaks = sweep_peaks(capture, options.peaks, progress)
+    cameras = tuple(c.name for c in capture.rig.cameras)
+    projectors = tuple(p.name for p in capture.rig.projectors)
+    clouds = [PointCloud.empty(cameras, projectors)]
+    clouds += [intersect(capture, p, motion, options) for p in peaks if len(p.row)]
+    cloud = PointCloud.merged(clouds)
+    counts = {
+        "bright_maxima": sum(p.candidates for p in peaks),
+        "stripes": sum(len(p.row) for p in peaks),
+        "well_conditioned": len(cloud),
+    }
+    for p in peaks:
+        if p.missing_rows:
+            stage.warn(
+                f"{p.camera}: {len(p.missing_rows)} scanlines of {p.projector} are missing "
+                f"(first {p.missing_rows[0]}); the pixels that they lit have no point"
+            )
+        elif not len(p.row):
+            stage.warn(f"{p.camera} saw no stripe of {p.projector}")
+    if options.hull:
+        cloud = cloud.subset(inside_hull(capture, cloud.points, options.hull_margin, stage))
+    counts["inside_hull"] = len(cloud)
+    if options.fuse:
+        cloud = fuse(cloud)
+    counts["after_fusion"] = len(cloud)
+    cloud = cloud.subset(supported(cloud.points, options.neighbours, options.isolation))
+    counts["points"] = len(cloud)
+    stage.figures.update(counts)
+    if len(cloud):
+        stage.figures["deviation_mm"] = {
+            f"p{q}": float(np.percentile(cloud.deviation_along_view(), q) * 1e3)
+            for q in (10, 50, 90)
+        }
+    if len(cameras) == 1:
+        stage.warn("one camera: points only where it alone sees the stripes, none are confirmed")
+    if not len(cloud):
+        stage.warn("no lit pixel gave a point: check exposure, lamp level and the line of sight")
+    return cloud
+
+
+def intersect(
+    capture: Capture, peaks: Peaks, motion: Motion | None, options: TriangulateOptions
+) -> PointCloud:
+    """The points of one camera and projector: each ray cut with its plane, moved to the reference.
+
+    The deviation along the ray is that of the row times the shift per row, which grows with
+    1 / sin(angle between ray and plane); across it is a pixel's footprint. Points with a flat
+    angle, too large a deviation, or behind camera or projector are left out.
+    """
+    camera = capture.rig.camera(peaks.camera)
+    projector = capture.rig.projector(peaks.projector)
+    rays = camera.rays(peaks.pixel)
+    distance, sine = _cut(camera.center, rays, projector, peaks.row)
+    step = 0.25  # rows, for the derivative of the distance by the row
+    ahead = _cut(camera.center, rays, projector, peaks.row + step)[0]
+    behind = _cut(camera.center, rays, projector, peaks.row - step)[0]
+    usable = np.isfinite(distance) & np.isfinite(ahead) & np.isfinite(behind)
+    usable &= (distance > 0) & (sine >= np.sin(np.radians(options.min_angle_deg)))
+    distance, ahead, behind = (np.where(usable, d, 1.0) for d in (distance, ahead, behind))
+    per_row = np.abs(ahead - behind) / (2 * step)
+    along = peaks.deviation * per_row
+    points = camera.center + distance[:, None] * rays
+    across = distance / np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / np.sqrt(12)
+    usable &= (along <= options.max_deviation) & (projector.project(points)[1] > 0)
+    outer = rays[:, :, None] * rays[:, None, :]
+    covariance = (along**2)[:, None, None] * outer
+    covariance += (across**2)[:, None, None] * (np.eye(3) - outer)
+    view = -rays
+    if motion is not None and not motion.still:
+        points, view, covariance = motion.undo(peaks.step, points, view, covariance)
+    n = int(usable.sum())
+    index = {c.name: i for i, c in enumerate(capture.rig.cameras)}
+    beams = {p.name: i for i, p in enumerate(capture.rig.projectors)}
+    # the best there is: a perfectly placed projector and the deviation of a clean stripe
+    best = CLEAN * row_pitch(projector, points[usable])
+    return PointCloud(
+        points=points[usable],
+        covariance=covariance[usable],
+        view=view[usable],
+        pixel=peaks.pixel[usable].astype(np.int32),
+        camera=np.full(n, index[peaks.camera], np.int16),
+        projector=np.full(n, beams[peaks.projector], np.int16),
+        row=peaks.row[usable].astype(np.float32),
+        step=peaks.step[usable].astype(np.int32),
+        brightness=peaks.brightness[usable].astype(np.float32),
+        weight=np.minimum(1.0, (best / along[usable]) ** 2).astype(np.float32),
+        cameras=tuple(index),
+        projectors=tuple(beams),
+    )
+
+
+def inside_hull(
+    capture: Capture, points: Array, margin: float, stage: Stage | None = None
+) -> NDArray[np.bool_]:
+    """Which `points (N, 3)` lie in every camera's silhouette, `margin` pixels of play allowed.
+
+    A camera that does not have the point in its picture, or has no silhouette, says nothing.
+    """
+    keep = np.ones(len(points), bool)
+    for camera in capture.rig.cameras:
+        try:
+            mask = silhouette(capture, camera.name)
+        except NoSilhouette as error:
+            if stage is not None:
+                stage.warn(f"no hull culling by {camera.name}: {error}")
+            continue
+        if not mask.any():
+            continue
+        outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+        pixels, depth = camera.project(points)
+        seen = (depth > 0) & camera.inside(pixels)
+        x, y = np.rint(pixels[seen]).astype(int).T
+        far = outside[np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)] > margin
+        keep[np.flatnonzero(seen)[far]] = False
+    return keep
+
+
+def supported(points: Array, neighbours: int, isolation: float) -> NDArray[np.bool_]:
+    """Which `points (N, 3)` have at least `neighbours` others within `isolation` metres."""
+    if len(points) <= neighbours:
+        return np.zeros(len(points), bool)
+    distance, _ = cKDTree(points).query(points, k=[neighbours + 1])
+    return np.asarray(distance[:, 0] <= isolation)
+
+
+def fuse(cloud: PointCloud) -> PointCloud:
+    """One point for those of one camera pixel that agree along the ray, weighted by information.
+
+    Two points agree within three joint deviations, or 1 mm. Of a chain only neighbours in depth are
+    joined. The result keeps the best point's projector, row and step.
+    """
+    if len(cloud) < 2:
+        return cloud
+    depth = -np.einsum("ni,ni->n", cloud.points, cloud.view)
+    sigma = cloud.deviation_along_view()
+    order = np.lexsort((depth, cloud.pixel[:, 0], cloud.pixel[:, 1], cloud.camera))
+    key = np.stack([cloud.camera, *cloud.pixel.T], axis=1)[order]
+    same = (key[1:] == key[:-1]).all(axis=1)
+    gap = depth[order][1:] - depth[order][:-1]
+    joint = np.maximum(3 * np.hypot(sigma[order][1:], sigma[order][:-1]), 1e-3)
+    group = np.concatenate([[0], np.cumsum(~(same & (gap <= joint)))])
+    count = group[-1] + 1
+    information = 1 / sigma[order] ** 2
+    total = np.bincount(group, information, count)
+    points = np.stack(
+        [np.bincount(group, information * p, count) for p in cloud.points[order].T], axis=1
+    )
+    best = np.lexsort((-information, group))
+    best = best[np.concatenate([[True], np.diff(group[best]) > 0])]
+    kept = cloud.subset(order[best])
+    along = (1 / total)[:, None, None]
+    outer = kept.view[:, :, None] * kept.view[:, None, :]
+    covariance = kept.covariance + (along - 1 / information[best][:, None, None]) * outer
+    weight = np.minimum(1.0, kept.weight * total / information[best]).astype(np.float32)
+    columns = {name: getattr(kept, name) for name in ("view", "pixel", "camera", "projector")}
+    columns |= {name: getattr(kept, name) for name in ("row", "step", "brightness")}
+    return PointCloud(
+        points=points / total[:, None],
+        covariance=covariance,
+        weight=weight,
+        cameras=kept.cameras,
+        projectors=kept.projectors,
+        **columns,
+    )
+
+
+def _cut(origin: Array, rays: Array, projector: Projector, row: Array) -> tuple[Array, Array]:
+    """Distances along `rays (N, 3)` to the planes of `row (N,)`, inf if parallel, and |sin|."""
+    plane = projector.plane(row)
+    sine = (rays * plane[:, :3]).sum(axis=1)
+    height = plane[:, :3] @ origin + plane[:, 3]
+    flat = np.abs(sine) < 1e-9
+    return np.where(flat, np.inf, -height / np.where(flat, 1.0, sine)), np.abs(sine)
