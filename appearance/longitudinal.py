@@ -59,7 +59,7 @@ def variance_of_roughness(beta_m: ArrayLike) -> Array:
     """
     b = np.asarray(beta_m, float)
     if not ((b > 0) & (b <= 1)).all():
-        raise ValueError(f"beta_m must be in (0, 1], got {beta_m}")
+        raise ValueError(f"beta_m must be in (0, 1], got {b}")
     return np.asarray((0.726 * b + 0.812 * b**2 + 3.7 * b**20) ** 2)
 
 
@@ -89,7 +89,7 @@ def absorption_of_colour(colour: ArrayLike, beta_n: float) -> Array:
     """
     c = np.asarray(colour, float)
     if not np.isfinite(c).all():
-        raise ValueError(f"colour must be finite, got {colour}")
+        raise ValueError(f"colour must be finite, got {c}")
     if ((c <= 0) | (c > 1)).any():
         warnings.warn(f"albedo {c} is clamped to (0, 1]", ColourRange, stacklevel=2)
     return np.asarray((np.log(np.clip(c, LEAST_COLOUR, 1.0)) / _bracket(beta_n)) ** 2)
@@ -99,7 +99,7 @@ def colour_of_absorption(sigma_a: ArrayLike, beta_n: float) -> Array:
     """Multiple-scattering albedo of dense hair with absorption `sigma_a` >= 0: Eq. 11 inverted."""
     sigma = np.asarray(sigma_a, float)
     if not (sigma >= 0).all():
-        raise ValueError(f"sigma_a must not be negative, got {sigma_a}")
+        raise ValueError(f"sigma_a must not be negative, got {sigma}")
     return np.exp(-np.sqrt(sigma) * _bracket(beta_n))
 
 

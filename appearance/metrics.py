@@ -103,9 +103,9 @@ def _blur(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _checked(
-    image: Image, truth: Image, mask: Mask | None
+    rendered: Image, captured: Image, mask: Mask | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Mask]:
-    image, truth = np.asarray(image, float), np.asarray(truth, float)
+    image, truth = np.asarray(rendered, np.float64), np.asarray(captured, np.float64)
     if image.shape != truth.shape or image.ndim != 3:
         raise ValueError(f"images must be alike (H, W, C), got {image.shape} and {truth.shape}")
     mask = np.ones(image.shape[:2], bool) if mask is None else np.asarray(mask, bool)

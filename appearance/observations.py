@@ -1,0 +1,122 @@
+"""OLAT frames of a capture, reduced to the pixels that a fit looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture, CaptureError
+from reconstruction.lights import Light
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Cameras and lights that a fit must not see."""
+
+    cameras: tuple[str, ...] = ()
+    lights: tuple[str, ...] = ()
+
+    def check(self, capture: Capture) -> None:
+        """Raise `CaptureError` where a name is not in the capture, or nothing is left to fit."""
+        cameras = [c.name for c in capture.rig.cameras]
+        lights = capture.olat_lights()
+        for kind, names, known in (
+            ("camera", self.cameras, cameras),
+            ("light", self.lights, lights),
+        ):
+            if unknown := sorted(set(names) - set(known)):
+                raise CaptureError(f"held-out {kind}s {unknown} are not in {capture.path}")
+            if not set(known) - set(names):
+                raise CaptureError(f"{capture.path}: every {kind} is held out or none was shot")
+
+    def training_cameras(self, capture: Capture) -> list[str]:
+        """Names of the cameras that may be fitted, in rig order."""
+        return [c.name for c in capture.rig.cameras if c.name not in self.cameras]
+
+    def training_lights(self, capture: Capture) -> list[str]:
+        """Names of the lights that may be fitted, in rig order."""
+        return [name for name in capture.olat_lights() if name not in self.lights]
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """One camera's pixels under single lights.
+
+    `pixels (P,)` are flat indices; `radiance (L, P, 3)` in W/(sr m²) at full lamp level; `valid
+    (L, P)` is false where the frame is missing or saturated.
+    """
+
+    camera: Camera
+    lights: tuple[Light, ...]
+    pixels: NDArray[np.int64]
+    radiance: NDArray[np.float32]
+    valid: Mask
+
+    def where(self, pixels: Mask) -> Observed:
+        """The same lights at some of the pixels, marked by `pixels (P,)`."""
+        return Observed(
+            self.camera,
+            self.lights,
+            self.pixels[pixels],
+            self.radiance[:, pixels],
+            self.valid[:, pixels],
+        )
+
+
+def observe(
+    capture: Capture, camera: str, lights: Sequence[str], pixels: NDArray[np.int64]
+) -> Observed:
+    """Read the frames of `camera` under each of `lights` and keep `pixels (P,)` of them."""
+    steps = {s.light: s for s in capture.of_kind("olat")}
+    radiance = np.zeros((len(lights), len(pixels), 3), np.float32)
+    valid = np.zeros((len(lights), len(pixels)), bool)
+    for i, name in enumerate(lights):
+        if name not in steps or not capture.has(steps[name], camera):
+            continue
+        image, saturated = capture.response_and_saturated(steps[name], camera)
+        radiance[i] = image.reshape(-1, 3)[pixels]
+        valid[i] = ~saturated.ravel()[pixels]
+    return Observed(
+        capture.rig.camera(camera),
+        tuple(capture.rig.light(name) for name in lights),
+        pixels,
+        radiance,
+        valid,
+    )
+
+
+def model_mask(model: Path, camera: str, kind: str, capture: Capture) -> Mask:
+    """The mask `(H, W)` of `kind` "hair" or "skin" that reconstruction left in the model folder.
+
+    A hair mask that is absent falls back to the user's in the capture, an absent skin mask to an
+    empty one. Raises `CaptureError` naming the file where there is no hair mask at all.
+    """
+    path = model / "masks" / f"{camera}_{kind}.png"
+    size = capture.rig.camera(camera)
+    shape = (size.height, size.width)
+    if path.is_file():
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None or image.shape != shape:
+            found = None if image is None else image.shape
+            raise CaptureError(f"{path}: expected a {shape} grey PNG, got {found}")
+        return np.asarray(image >= 128)
+    if kind == "skin":
+        return np.zeros(shape, bool)
+    user = capture.mask(camera)
+    if user is None:
+        raise CaptureError(f"{path} is missing: run 'hairstage reconstruct' into {model} first")
+    return user
+
+
+def chosen(mask: Mask, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Flat indices of `most` pixels of `mask` at random, or of all where there are fewer."""
+    index = np.flatnonzero(mask)
+    return index if len(index) <= most else np.sort(rng.choice(index, most, replace=False))
