@@ -14,10 +14,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from reconstruction.capture import Capture, MissingFrame
 from reconstruction.mesh import read_obj
 from reconstruction.rig import Rig
-from stage_service.captures import CaptureManager, CaptureStatus, UnknownCapture
+from stage_service.capture_status import CaptureStatus
+from stage_service.captures import CaptureManager, UnknownCapture
 from stage_service.config import RigFile
 from stage_service.events import EventLog
-from stage_service.jobs.queue import JobQueue, new_job_id
+from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.jobs.slots import worker_is_alive
 from stage_service.plan import CapturePlan, PlanCost
@@ -181,8 +182,14 @@ class Stage:
 
     def view(self, status: CaptureStatus) -> CaptureView:
         """The status together with the job that follows it."""
-        follows = status.outcome == "completed" and status.request.get("pipeline") is not None
-        return CaptureView(**status.model_dump(), job=job_of(status.id) if follows else None)
+        job = None
+        if status.outcome == "completed" and status.request.get("pipeline") is not None:
+            job = job_of(status.id)
+            try:
+                self.queue.get(job)
+            except NoSuchJob:  # the capture's own thread is just about to enqueue it
+                self._enqueue_pipeline(status)
+        return CaptureView(**status.model_dump(), job=job)
 
     def frame(self, capture_id: str, step: int, camera: str) -> Path:
         """A frame's EXR file. Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`."""

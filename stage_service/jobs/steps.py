@@ -58,14 +58,15 @@ def reconstruct(context: StepContext) -> Figures:
 
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
-    from appearance.fit import HeldOut
     from appearance.fit import fit as run
+    from appearance.observations import HeldOut
 
     run(
         Capture(context.capture),
         context.model,
         held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
         progress=context.progress,
+        seed=context.options.seed,
     )
     return {"appearance": "appearance.json"}
 
@@ -73,7 +74,7 @@ def fit(context: StepContext) -> Figures:
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
     from appearance.assess import assess as run
-    from appearance.fit import HeldOut
+    from appearance.observations import HeldOut
 
     return run(
         Capture(context.capture),

@@ -1,0 +1,67 @@
+"""The command line: `hairstage COMMAND`. Commands import what they need when they run."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from collections.abc import Sequence
+
+from stage_service.cli import (
+    bench,
+    captures,
+    demo_command,
+    evaluate,
+    models,
+    processes,
+    remote,
+    rigs,
+)
+from stage_service.cli.output import BAD_INPUT, EXIT_CODES, FAILED, CommandError, Output
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line, for `main` and for tests."""
+    codes = "\n".join(f"  {code:<4}{meaning}" for code, meaning in EXIT_CODES.items())
+    parser = argparse.ArgumentParser(
+        prog="hairstage",
+        description="Runs a hair light stage and turns its captures into strands and relit hair.",
+        epilog=f"exit codes:\n{codes}\n\nResults go to stdout, progress to stderr.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for group in (demo_command, processes, remote, captures, models, evaluate, bench, rigs):
+        group.add(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code (see `hairstage --help`)."""
+    args = build_parser().parse_args(argv)
+    output = Output(as_json=args.json)
+    try:
+        return args.run(args, output)
+    except KeyboardInterrupt:
+        output.error("Interrupted", "interrupted")
+        return 130
+    except CommandError as error:
+        output.error(error.kind, str(error), **error.more)
+        return error.code
+    except Exception as error:
+        if isinstance(error, OSError | ValueError | LookupError) and _is_ours(error):
+            output.error(type(error).__name__, _message(error))
+            return BAD_INPUT
+        traceback.print_exc(file=sys.stderr)
+        output.error(type(error).__name__, str(error))
+        return FAILED
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether a reader or a check of ours raised it about the user's input, not a library."""
+    ours = {"reconstruction", "appearance", "stage_service", "builtins", "pydantic_core"}
+    return isinstance(error, OSError) or type(error).__module__.split(".")[0] in ours
+
+
+def _message(error: Exception) -> str:
+    """The error's sentence; a `KeyError` quotes it, which nobody wants to read."""
+    return str(error.args[0]) if isinstance(error, LookupError) and error.args else str(error)

@@ -1,0 +1,87 @@
+"""`bench`: error against run time of our methods beside the plain ones."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from stage_service.cli.output import (
+    FAILED,
+    CommandError,
+    Commands,
+    Output,
+    add_command,
+    progress_bar,
+)
+
+NAMES = ("olat",)
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    bench = add_command(
+        commands,
+        "bench",
+        run_bench,
+        "measure error against run time",
+        "olat: our renderer of many lights against Mitsuba's own path integrator, light by light. "
+        "all: every one of them. Results go to OUT/<name>.json.",
+    )
+    bench.add_argument("name", choices=[*NAMES, "all"])
+    bench.add_argument("--out", type=Path, default=Path("runs/bench"))
+    bench.add_argument("--subject", default="wavy", help="wavy, straight, curly or a strand file")
+    bench.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
+    bench.add_argument("--rig", type=Path, default=Path("deploy/rigs/demo.toml"))
+    bench.add_argument("--seed", type=int, default=0)
+
+
+def run_bench(args: argparse.Namespace, output: Output) -> int:
+    """Run one benchmark, or all."""
+    names = NAMES if args.name == "all" else (args.name,)
+    args.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = {}
+    for name in names:
+        results[name] = {"olat": _olat}[name](args)
+        text = json.dumps(results[name], indent=1, allow_nan=False)
+        (args.out / f"{name}.json").write_text(text + "\n")
+    output.result(results)
+    return 0
+
+
+def _olat(args: argparse.Namespace) -> dict[str, Any]:
+    from appearance.bench_olat import run
+    from appearance.hair_appearance import HairAppearance
+    from appearance.scene import build_scene
+    from reconstruction.mesh import read_obj
+    from reconstruction.rig import Rig
+    from reconstruction.strand_files import read_strands
+
+    rig = Rig.load(args.rig)
+    with tempfile.TemporaryDirectory() as folder, progress_bar("bench olat") as progress:
+        truth = Path(folder)
+        progress("making the subject", 0.0)
+        _write_truth(args, truth)
+        appearance = json.loads((truth / "appearance.json").read_text())
+        head = truth / "head.obj"
+        scene = build_scene(
+            read_strands(truth / "strands.npz"),
+            read_obj(head) if head.is_file() else None,
+            hair=HairAppearance.from_dict(appearance["hair"]),
+            skin=appearance["skin"],
+        )
+        return run(scene, rig.cameras[0], rig.lights, progress=progress)
+
+
+def _write_truth(args: argparse.Namespace, folder: Path) -> None:
+    """The subject comes from the simulators, which only they may import."""
+    from stage_service.cli.children import simulator_base
+
+    command = [*simulator_base(args), "--truth-only", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        lines = done.stderr.strip().splitlines()
+        raise CommandError(f"simulators: {lines[-1] if lines else 'failed'}", FAILED)

@@ -1,0 +1,56 @@
+"""`verify` and `import`: capture folders on disk."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from stage_service.cli.output import FAILED, Commands, Output, add_command, progress_bar
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    verify = add_command(
+        commands,
+        "verify",
+        run_verify,
+        "re-read a whole capture and list what is wrong with it",
+        "Re-read every file of a capture against its checksum; exit code 1 when anything is wrong.",
+    )
+    verify.add_argument("capture", type=Path, help="the capture folder")
+
+    imported = add_command(
+        commands,
+        "import",
+        run_import,
+        "turn a folder made elsewhere into a capture",
+        "Read cameras.json, lights.json, images/<camera>/<light>.exr and masks/<camera>.png.",
+    )
+    imported.add_argument("folder", type=Path)
+    imported.add_argument("--out", type=Path, required=True, help="new capture folder")
+
+
+def run_verify(args: argparse.Namespace, output: Output) -> int:
+    """Verify a capture."""
+    from reconstruction.capture_verify import verify
+
+    with progress_bar("verify") as progress:
+        problems = verify(args.capture, progress)
+    text = "\n".join(problems) or f"{args.capture} is sound"
+    output.result({"capture": str(args.capture), "problems": problems}, text)
+    return FAILED if problems else 0
+
+
+def run_import(args: argparse.Namespace, output: Output) -> int:
+    """Import a folder."""
+    from reconstruction.import_folder import import_folder
+
+    capture = import_folder(args.folder, args.out)
+    counts = {
+        "cameras": len(capture.rig.cameras),
+        "lights": len(capture.rig.lights),
+        "frames": sum(r.file is not None for r in capture.records.values()),
+    }
+    text = f"{args.out}: " + ", ".join(f"{n} {what}" for what, n in counts.items())
+    output.result({"capture": str(args.out), **counts}, text)
+    return 0

@@ -1,0 +1,152 @@
+"""Child processes that never outlive the command that started them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import select
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, Self
+
+from stage_service.cli.output import UNREACHABLE, CommandError
+
+GRACE_S = 15.0
+"""How long a child may take to end by itself: the service puts the lights off in that time."""
+
+
+class Children:
+    """Starts processes and ends them on every exit of its with-block, the latest first.
+
+    Each child's output goes to `logs/<name>.log`, unless it is asked for.
+    """
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._running: list[tuple[str, subprocess.Popen[str]]] = []
+
+    def __enter__(self) -> Self:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # A second Ctrl-C must not leave lamps on: the children get their time.
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            for _name, child in reversed(self._running):
+                end(child)
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    def start(
+        self, name: str, command: list[str], *, to_log: bool = True, answers: bool = False
+    ) -> subprocess.Popen[str]:
+        """Start a child in its own process group, so that Ctrl-C reaches it through us, in order.
+
+        With `answers` its stdout is a pipe, for `first_line`.
+        """
+        with contextlib.ExitStack() as stack:
+            log = stack.enter_context(self.log(name).open("a")) if to_log else None
+            child = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE if answers else log,
+                stderr=log,
+                text=True,
+                start_new_session=True,
+            )
+        self._running.append((name, child))
+        return child
+
+    def log(self, name: str) -> Path:
+        """The child's log file."""
+        return self._logs / f"{name}.log"
+
+    def first_line(self, name: str, child: subprocess.Popen[str], seconds: float) -> dict[str, Any]:
+        """The JSON object that the child prints when it is ready."""
+        assert child.stdout is not None
+        readable, _, _ = select.select([child.stdout], [], [], seconds)
+        line = child.stdout.readline() if readable else ""
+        if not line:
+            raise self._not_ready(name, child, seconds)
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def wait_for_file(self, child: subprocess.Popen[str], path: Path, seconds: float) -> None:
+        """Wait until the child has written `path`, as a sign that it is ready."""
+        deadline = time.monotonic() + seconds
+        while not path.is_file():
+            if child.poll() is not None or time.monotonic() > deadline:
+                name = next(n for n, c in self._running if c is child)
+                raise self._not_ready(name, child, seconds)
+            time.sleep(0.05)
+
+    def check(self) -> None:
+        """Raise `CommandError` when a child has ended by itself."""
+        for name, child in self._running:
+            if child.poll() is not None:
+                raise CommandError(
+                    f"{name} ended with exit code {child.returncode}; {self._last_words(name)}",
+                    UNREACHABLE,
+                )
+
+    def peak_memory_gb(self) -> dict[str, float]:
+        """The most memory that each running child has held so far, GB; empty where unknown."""
+        peaks = {}
+        for name, child in self._running:
+            with contextlib.suppress(OSError):
+                lines = Path(f"/proc/{child.pid}/status").read_text().splitlines()
+                found = [line.split() for line in lines if line.startswith("VmHWM")]
+                if found:
+                    peaks[name] = int(found[0][1]) * 1024 / 1e9
+        return peaks
+
+    def _not_ready(self, name: str, child: subprocess.Popen[str], seconds: float) -> CommandError:
+        code = child.poll()
+        what = f"ended with exit code {code}" if code is not None else f"not ready in {seconds} s"
+        return CommandError(f"{name}: {what}; {self._last_words(name)}", UNREACHABLE)
+
+    def _last_words(self, name: str) -> str:
+        log = self.log(name)
+        if not log.is_file():
+            return "see its output above"
+        lines = log.read_text(errors="replace").strip().splitlines()
+        return f"the last line of {log}: {lines[-1] if lines else '(empty)'}"
+
+
+def end(child: subprocess.Popen[str]) -> None:
+    """End a child: SIGTERM, and SIGKILL where that does not help."""
+    if child.poll() is None:
+        child.terminate()
+        try:
+            child.wait(GRACE_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+    if child.stdout is not None:
+        child.stdout.close()
+
+
+def own_command(*arguments: str | Path) -> list[str]:
+    """A command line that runs `hairstage` with this Python."""
+    return [sys.executable, "-m", "stage_service.cli", *map(str, arguments)]
+
+
+def simulator_base(args: argparse.Namespace) -> list[str]:
+    """The simulators' command line as far as it says which subject sits in which rig."""
+    command = [sys.executable, "-m", "simulators", "--rig", args.rig, "--subject", args.subject]
+    command += ["--seed", args.seed, *(["--head", args.head] if args.head is not None else [])]
+    return [str(word) for word in command]
+
+
+def simulator_command(
+    args: argparse.Namespace, state: Path, truth: Path | None, *more: str | Path
+) -> list[str]:
+    """The simulators' command line with their state folder, and where the truth goes."""
+    command = [*simulator_base(args), "--state", state, *more]
+    command += ["--truth", truth] if truth is not None else []
+    return [str(word) for word in command]

@@ -1,0 +1,86 @@
+"""The service's HTTP API from the command line's side."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+
+from reconstruction.report import Progress
+from stage_service.cli.output import BAD_INPUT, FAILED, UNREACHABLE, CommandError
+
+DEFAULT_URL = "http://127.0.0.1:8331"
+
+
+class Service:
+    """A running service. Its problem documents become `CommandError`s."""
+
+    def __init__(self, url: str | None = None) -> None:
+        self.url = url or os.environ.get("HAIRSTAGE_URL") or DEFAULT_URL
+        self._http = httpx.Client(base_url=self.url, timeout=60.0, trust_env=False)
+
+    def get(self, path: str) -> Any:
+        """The JSON at `path`."""
+        return self.ask("GET", path)
+
+    def post(self, path: str, body: Any = None) -> Any:
+        """Post `body` and return the answer's JSON."""
+        return self.ask("POST", path, json=body)
+
+    def ask(self, method: str, path: str, **more: Any) -> Any:
+        """One request. Raises `CommandError`."""
+        try:
+            response = self._http.request(method, path, **more)
+        except httpx.TransportError as error:
+            raise CommandError(
+                f"no service answers at {self.url} ({error}): start one with 'hairstage serve', or "
+                "name its URL with --url or HAIRSTAGE_URL",
+                UNREACHABLE,
+                "Unreachable",
+            ) from error
+        if response.is_success:
+            return response.json()
+        problem = response.json()
+        code = BAD_INPUT if response.status_code in (404, 422) else FAILED
+        raise CommandError(
+            f"{problem['title']}: {problem['detail']}", code, "Problem", problem=problem
+        )
+
+    def follow_capture(
+        self, capture: str, progress: Progress, check: Callable[[], None] = lambda: None
+    ) -> dict[str, Any]:
+        """Poll a capture until it is done; `check` may raise to give up waiting."""
+
+        def show(status: dict[str, Any]) -> None:
+            frames = f"{status['frames_written']} of {status['frames_planned']} frames"
+            progress(f"{status['state']}, {frames}", status["step"] / max(status["steps"], 1))
+
+        return self._follow(f"/captures/{capture}", show, check)
+
+    def follow_job(
+        self, job: str, progress: Progress, check: Callable[[], None] = lambda: None
+    ) -> dict[str, Any]:
+        """Poll a job until it is done; `check` may raise to give up waiting."""
+
+        def show(status: dict[str, Any]) -> None:
+            p = status["progress"]
+            if p is None:
+                progress(status["state"], 0.0)
+            else:
+                progress(f"{p['step']}: {p['what']}", p["share"])
+
+        return self._follow(f"/jobs/{job}", show, check)
+
+    def _follow(
+        self, path: str, show: Callable[[dict[str, Any]], None], check: Callable[[], None]
+    ) -> dict[str, Any]:
+        while True:
+            status: dict[str, Any] = self.get(path)
+            show(status)
+            if status["state"] == "done":
+                return status
+            check()
+            time.sleep(0.3)

@@ -1,0 +1,126 @@
+"""The demo's course: three processes, one capture, one job, one table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from pathlib import Path
+
+from reconstruction.rig import Rig
+from stage_service.cli.children import Children, own_command, simulator_command
+from stage_service.cli.client import Service
+from stage_service.cli.demo_results import figures_table, gather
+from stage_service.cli.output import BAD_INPUT, FAILED, CommandError, Output, progress_bar
+from stage_service.cli.processes import exit_on_sigterm
+
+MARK = ".hairstage-demo"
+EVERY_NTH_LIGHT = 28
+"""Of the lights, so many are held out: a dozen of 331."""
+
+
+def demo(args: argparse.Namespace, output: Output) -> int:
+    """Run the whole product once; returns the exit code."""
+    exit_on_sigterm()
+    begin = time.perf_counter()
+    out: Path = args.out
+    rig = Rig.load(args.rig)
+    held_out = _held_out(rig, args.hold_out_camera)
+    for field in ("subject", "environment"):
+        value = getattr(args, field)
+        if "." in value or "/" in value:
+            setattr(args, field, str(Path(value).resolve()))
+    _prepare(out)
+
+    with Children(out / "logs") as children:
+        output.note(f"starting simulated rig, service and worker; their logs: {out / 'logs'}")
+        service = _start(children, args)
+        cost = service.post("/plans:validate", {})
+        output.note(
+            f"the capture takes {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB and, on real "
+            f"devices, {cost['seconds']:.0f} s; a simulated rig renders each frame"
+        )
+        options = {**held_out, "environment": args.environment, "seed": args.seed}
+        capture = service.post(
+            "/captures",
+            {
+                "plan": {},
+                "head": str((out / "truth" / "head.obj").resolve()),
+                "pipeline": {"name": "light_planes", "options": options},
+            },
+        )
+        with progress_bar("capture") as progress:
+            capture = service.follow_capture(capture["id"], progress, children.check)
+        _link(out / "capture", Path(capture["path"]))
+        if capture["outcome"] != "completed":
+            raise CommandError(f"the capture {capture['outcome']}: {capture['error']}", FAILED)
+        with progress_bar("job") as progress:
+            job = service.follow_job(capture["job"], progress, children.check)
+        _link(out / "model", Path(job["model"]))
+        if job["outcome"] != "succeeded":
+            why = job["error"]["detail"] if job["error"] else job["outcome"]
+            raise CommandError(
+                f"the job failed in its step {job['progress']['step']}: {why}; its log is "
+                f"{children.log('worker')}",
+                FAILED,
+            )
+        memory = children.peak_memory_gb()
+
+    with progress_bar("evaluate") as progress:
+        results = gather(out, capture, job, progress)
+    results = {
+        "seconds": time.perf_counter() - begin,
+        "subject": args.subject,
+        "rig": rig.name,
+        "held_out": held_out,
+        "peak_memory_gb": memory,
+        **results,
+    }
+    (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+    output.result(results, figures_table(results, out))
+    return 0
+
+
+def _start(children: Children, args: argparse.Namespace) -> Service:
+    """Start the three processes as a user would, and wait until each is ready."""
+    out: Path = args.out
+    state = out / "simulated"
+    simulators = children.start(
+        "simulators", simulator_command(args, state, out / "truth", "--ports", "auto")
+    )
+    children.wait_for_file(simulators, state / "devices.toml", seconds=300)
+    serve = own_command(
+        *("serve", "--json", "--rig", args.rig, "--devices", state / "devices.toml"),
+        *("--root", out, "--port", "0"),
+    )
+    service = children.start("service", serve, answers=True)
+    worker = children.start("worker", own_command("worker", "--json", "--root", out), answers=True)
+    url = children.first_line("service", service, 60)["url"]
+    children.first_line("worker", worker, 60)
+    return Service(url)
+
+
+def _held_out(rig: Rig, camera: str | None) -> dict[str, list[str]]:
+    name = rig.cameras[-1].name if camera is None else rig.camera(camera).name
+    lights = [light.name for light in rig.lights[EVERY_NTH_LIGHT // 2 :: EVERY_NTH_LIGHT]]
+    return {"held_out_cameras": [name], "held_out_lights": lights}
+
+
+def _prepare(out: Path) -> None:
+    """Make `out` an empty folder; what an earlier demo left there goes, anything else stays."""
+    if out.is_dir() and any(out.iterdir()):
+        if not (out / MARK).is_file():
+            raise CommandError(
+                f"{out} holds something that no demo wrote: choose another folder with --out",
+                BAD_INPUT,
+                "BadInput",
+            )
+        shutil.rmtree(out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARK).touch()
+
+
+def _link(link: Path, target: Path) -> None:
+    """A name in OUT for the folder that the service chose."""
+    link.symlink_to(target.resolve().relative_to(link.parent.resolve()))

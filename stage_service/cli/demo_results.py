@@ -1,0 +1,127 @@
+"""What the demo found: every figure in one dictionary, and the table of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from appearance.fitted import FittedAppearance
+from appearance.hair_appearance import HairAppearance
+from appearance.longitudinal import colour_of_absorption, variance_of_roughness
+from reconstruction.capture import Capture
+from reconstruction.report import Progress
+from stage_service.jobs.geometry import evaluate_geometry
+
+FILES = {
+    "strands": ("strands.npz", "strands.hair", "strands.usdc"),
+    "appearance": ("appearance.json",),
+    "report": ("report.json",),
+}
+
+
+def gather(
+    out: Path,
+    capture: dict[str, Any],
+    job: dict[str, Any],
+    progress: Progress,
+) -> dict[str, Any]:
+    """Judge the model against the simulated truth and gather the job's own figures."""
+    model = out / "model"
+    geometry = evaluate_geometry(
+        Capture(out / "capture"), model, out / "truth" / "strands.npz", progress=progress
+    )
+    controls = geometry.pop("controls")
+    results = json.loads((model / "results.json").read_text())
+    return {
+        "capture": {
+            key: capture[key]
+            for key in ("id", "seconds", "frames_planned", "frames_written", "frames_missing")
+        },
+        "job": job["id"],
+        "stages": results["stages"],
+        "geometry": geometry,
+        "controls": controls,
+        "images": results["images"],
+        "appearance": _appearance(model, out / "truth" / "appearance.json"),
+        "files": {
+            "capture": "capture",
+            "model": "model",
+            "pictures": sorted(str(p.relative_to(out)) for p in model.glob("*.png")),
+            **{k: [f"model/{n}" for n in names] for k, names in FILES.items()},
+        },
+    }
+
+
+def _appearance(model: Path, truth: Path) -> dict[str, Any]:
+    """Roughness and colour, fitted beside true; colours as dense hair's albedo (Sun Eq. 11).
+
+    Absorptions are compared as albedos because the fit holds beta_n at Sun's value: the same
+    absorption means another colour under another beta_n.
+    """
+    true = json.loads(truth.read_text())
+    fitted = FittedAppearance.load(model)
+    return {
+        "fitted": {**_hair(fitted.hair), "skin": list(fitted.skin)},
+        "true": {**_hair(HairAppearance.from_dict(true["hair"])), "skin": list(true["skin"])},
+    }
+
+
+def _hair(hair: HairAppearance) -> dict[str, Any]:
+    return {
+        "beta_m": hair.beta_m,
+        "v": float(variance_of_roughness(hair.beta_m)),
+        "beta_n": hair.beta_n,
+        "sigma_a": list(hair.sigma_a),
+        "colour": [float(c) for c in colour_of_absorption(hair.sigma_a, hair.beta_n)],
+    }
+
+
+def figures_table(results: dict[str, Any], out: Path) -> Any:
+    """The table of figures, and where the results are."""
+    from rich.console import Group
+    from rich.table import Table
+
+    from stage_service.cli.evaluate import geometry_table
+
+    geometry = geometry_table({"ours": results["geometry"], **results["controls"]})
+    images = Table("pictures (PSNR dB / SSIM)", "held-out lights", "held-out camera")
+    names = {name for group in results["images"].values() for name in _judged(group)}
+    for name in sorted(names, key=lambda n: (n != "ours", n)):
+        cells = [_judged(results["images"].get(g, {})).get(name) for g in GROUPS]
+        images.add_row(
+            name, *("–" if c is None else f"{c['psnr']:.2f} / {c['ssim']:.4f}" for c in cells)
+        )
+    fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]
+    hair = Table("appearance", "fitted", "true")
+    for key, what in (
+        ("beta_m", "longitudinal roughness β_M"),
+        ("v", "longitudinal variance v (Sun's β_l)"),
+        ("colour", "colour of dense hair"),
+        ("skin", "colour of skin"),
+    ):
+        hair.add_row(what, _numbers(fitted[key]), _numbers(true[key]))
+    capture = results["capture"]
+    return Group(
+        geometry,
+        images,
+        hair,
+        f"{results['seconds']:.0f} s in all: capture {capture['seconds']:.0f} s, "
+        + ", ".join(f"{k} {v:.0f} s" for k, v in results["stages"].items()),
+        f"everything is in {out}: results.json, capture/, model/ (strands, appearance, pictures, "
+        "report.json, plots/), truth/, logs/",
+    )
+
+
+GROUPS = ("held_out_lights", "held_out_camera")
+
+
+def _judged(group: Any) -> dict[str, dict[str, float]]:
+    if not isinstance(group, dict):
+        return {}
+    return {k: v for k, v in group.items() if isinstance(v, dict) and {"psnr", "ssim"} <= set(v)}
+
+
+def _numbers(value: Any) -> str:
+    values = value if isinstance(value, list) else [value]
+    return ", ".join(f"{x:.3g}" for x in values)

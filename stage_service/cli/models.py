@@ -1,0 +1,143 @@
+"""`reconstruct`, `fit` and `render`: models on disk, without a service."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from stage_service.cli.output import (
+    BAD_INPUT,
+    CommandError,
+    Commands,
+    Output,
+    add_command,
+    progress_bar,
+)
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    reconstruct = add_command(
+        commands,
+        "reconstruct",
+        run_reconstruct,
+        "strands from a capture",
+        "Write MODEL/strands.npz, .hair and .usdc, and MODEL/report.json.",
+    )
+    reconstruct.add_argument("capture", type=Path)
+    reconstruct.add_argument("--method", choices=["light_planes"], default="light_planes")
+    reconstruct.add_argument("--out", type=Path, required=True, help="model folder")
+    reconstruct.add_argument("--options", help="the method's options as JSON")
+    _held_out(reconstruct)
+
+    fit = add_command(
+        commands,
+        "fit",
+        run_fit,
+        "roughness and colour of hair and skin from a capture and its strands",
+        "Write MODEL/appearance.json; with held-out cameras or lights, judge the fit on them.",
+    )
+    fit.add_argument("capture", type=Path)
+    fit.add_argument("model", type=Path, help="model folder with strands.npz")
+    _held_out(fit)
+    fit.add_argument("--environment", default="studio", help="studio, sky, or an .hdr or .exr file")
+
+    render = add_command(
+        commands,
+        "render",
+        run_render,
+        "a model under an environment map or a lamp",
+        "Render MODEL's strands with its fitted appearance, in the pose of its capture.",
+    )
+    render.add_argument("model", type=Path)
+    render.add_argument("--capture", type=Path, help="the capture that gives rig and head")
+    render.add_argument("--camera", help="a camera of the rig (default: the first)")
+    render.add_argument("--light", help="a light of the rig, instead of the environment")
+    render.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
+    render.add_argument("--out", type=Path, help=".png (exposed, sRGB) or .exr (linear)")
+    render.add_argument("--spp", type=int, default=64, help="samples a pixel")
+    render.add_argument("--seed", type=int, default=0)
+
+
+def run_reconstruct(args: argparse.Namespace, output: Output) -> int:
+    """Reconstruct strands."""
+    from reconstruction.capture import Capture
+    from reconstruction.report import Report
+    from reconstruction.strand_files import read_strands
+    from stage_service.jobs.records import JobOptions
+    from stage_service.jobs.steps import StepContext, reconstruct
+
+    options = JobOptions(
+        method=args.method,
+        held_out_cameras=tuple(args.hold_out_camera),
+        held_out_lights=tuple(args.hold_out_light),
+        reconstruct=_json(args.options),
+    )
+    Capture(args.capture)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with progress_bar("reconstruct") as progress:
+        reconstruct(StepContext(args.capture, args.out, options, progress))
+    strands = read_strands(args.out / "strands.npz")
+    seconds = sum(stage.seconds for stage in Report.load(args.out / "report.json").stages)
+    data = {"model": str(args.out), "strands": len(strands), "points": len(strands.points)}
+    output.result(
+        {**data, "seconds": seconds},
+        f"{len(strands)} strands in {args.out / 'strands.npz'} ({seconds:.0f} s)",
+    )
+    return 0
+
+
+def run_fit(args: argparse.Namespace, output: Output) -> int:
+    """Fit roughness and colour."""
+    from stage_service.jobs.records import JobOptions
+    from stage_service.jobs.steps import StepContext, assess, fit
+
+    options = JobOptions(
+        held_out_cameras=tuple(args.hold_out_camera),
+        held_out_lights=tuple(args.hold_out_light),
+        environment=args.environment,
+    )
+    with progress_bar("fit") as progress:
+        fit(StepContext(args.capture, args.model, options, progress))
+    data: dict[str, Any] = {
+        "model": str(args.model),
+        "appearance": json.loads((args.model / "appearance.json").read_text()),
+    }
+    if options.held_out_cameras or options.held_out_lights:
+        with progress_bar("assess") as progress:
+            data["images"] = assess(StepContext(args.capture, args.model, options, progress))
+    output.result(data)
+    return 0
+
+
+def run_render(args: argparse.Namespace, output: Output) -> int:
+    """Render a model."""
+    from stage_service.cli.rendering import render_model
+
+    with progress_bar("render") as progress:
+        done = render_model(args, progress)
+    output.result(done, f"{done['image']} ({done['camera']}, {done['seconds']:.0f} s)")
+    return 0
+
+
+def _held_out(parser: argparse.ArgumentParser) -> None:
+    for kind in ("camera", "light"):
+        parser.add_argument(
+            f"--hold-out-{kind}",
+            action="append",
+            default=[],
+            metavar=kind.upper(),
+            help=f"a {kind} to leave out, to judge the result on (repeat for more)",
+        )
+
+
+def _json(text: str | None) -> dict[str, Any]:
+    try:
+        value = json.loads(text or "{}")
+    except json.JSONDecodeError as error:
+        raise CommandError(f"--options is not JSON: {error}", BAD_INPUT, "BadInput") from error
+    if not isinstance(value, dict):
+        raise CommandError(f"--options must be a JSON object, got {text}", BAD_INPUT, "BadInput")
+    return value

@@ -1,0 +1,120 @@
+"""What commands print: results on stdout, progress on stderr, exit codes that mean something."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from reconstruction.report import Progress
+
+EXIT_CODES = {
+    0: "done",
+    1: "it ran and failed: a failed job or capture, a damaged capture, a fault of the program",
+    2: "wrong usage",
+    3: "bad input: a file, folder, rig, plan or name that cannot be used",
+    4: "the service, the simulators or a device cannot be reached",
+    130: "interrupted",
+}
+
+FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
+
+Commands = Any  # argparse does not export the type of what add_subparsers returns
+Run = Callable[[argparse.Namespace, "Output"], int]
+
+
+class CommandError(Exception):
+    """Ends a command with `code`; the message is for the user, `more` goes into the JSON."""
+
+    def __init__(self, message: str, code: int = FAILED, kind: str = "Failed", **more: Any) -> None:
+        super().__init__(message)
+        self.code, self.kind, self.more = code, kind, more
+
+
+class Output:
+    """Prints one JSON object on stdout, or text for people."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+
+    def result(self, data: dict[str, Any], text: Any = None) -> None:
+        """Print a command's result: `data` as JSON, or `text` (a string or a rich renderable)."""
+        if self.as_json:
+            print(json.dumps(data, allow_nan=False), flush=True)
+            return
+        from rich.console import Console
+
+        shown = json.dumps(data, indent=1, allow_nan=False) if text is None else text
+        Console(soft_wrap=True, highlight=False).print(shown, markup=False)
+
+    def error(self, kind: str, detail: str, **more: Any) -> None:
+        """Say what went wrong: on stderr, and with --json as the one object on stdout too."""
+        if self.as_json:
+            print(json.dumps({"error": {"type": kind, "detail": detail, **more}}), flush=True)
+        print(f"hairstage: {detail}", file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        """A line for people, on stderr."""
+        print(text, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def progress_bar(title: str) -> Iterator[Progress]:
+    """A `Progress` that draws a bar on stderr; no terminal there: a line per new activity."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(title)
+        return
+    with Bars(
+        TextColumn("{task.fields[title]:<12}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+        console=console,
+    ) as bars:
+        task = bars.add_task("", total=1.0, title=title)
+
+        def show(what: str, share: float) -> None:
+            bars.update(task, description=what, completed=share)
+
+        yield show
+
+
+def _lines(title: str) -> Progress:
+    last = [""]
+
+    def show(what: str, share: float) -> None:
+        if what != last[0]:
+            print(f"{title}: {share:4.0%} {what}", file=sys.stderr, flush=True)
+            last[0] = what
+
+    return show
+
+
+def add_command(
+    commands: Commands, name: str, run: Run, help: str, description: str | None = None
+) -> argparse.ArgumentParser:
+    """Add a command with what every command has: `--json`, help, the function that runs it."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=help,
+        description=description or help[0].upper() + help[1:] + ".",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def add_group(commands: Commands, name: str, help: str) -> Commands:
+    """Add a command that has commands of its own."""
+    parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+    return parser.add_subparsers(dest="action", metavar="ACTION", required=True)

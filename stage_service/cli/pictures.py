@@ -1,0 +1,59 @@
+"""Pictures for `evaluate images`: read, expose, compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.metrics import Exposure, psnr, srgb, ssim
+from reconstruction.exr import read_exr
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+
+
+def pair_up(pred: Path, true: Path) -> list[tuple[str, Path, Path]]:
+    """(name, predicted, true) for two files, or for the names that two folders share."""
+    if pred.is_dir() != true.is_dir():
+        raise ValueError(f"compare two files or two folders, got {pred} and {true}")
+    if not pred.is_dir():
+        return [(pred.name, pred, true)]
+    names = {p.name for p in true.iterdir() if p.suffix.lower() in SUFFIXES}
+    return [(p.name, p, true / p.name) for p in sorted(pred.iterdir()) if p.name in names]
+
+
+def compare_pictures(pred: Path, true: Path, mask: Path | None) -> dict[str, float]:
+    """PSNR in dB and SSIM of one picture against another, over the mask where there is one.
+
+    EXR files are linear: both get the exposure that takes the 99th percentile of the true pixels
+    to 1, then the sRGB curve. Other files are taken as sRGB. Raises `ValueError`.
+    """
+    if (pred.suffix.lower() == ".exr") != (true.suffix.lower() == ".exr"):
+        raise ValueError(f"{pred} and {true}: compare two EXR files or two sRGB pictures")
+    hair = _mask(mask)
+    if pred.suffix.lower() == ".exr":
+        linear_pred, linear_true = read_exr(pred)[0], read_exr(true)[0]
+        values = linear_true if hair is None else linear_true[hair]
+        scale = Exposure.of([values]).scale
+        a, b = srgb(scale * linear_pred), srgb(scale * linear_true)
+    else:
+        a, b = _picture(pred), _picture(true)
+    return {"psnr": psnr(a, b, hair), "ssim": ssim(a, b, hair)}
+
+
+def _picture(path: Path) -> NDArray[np.float64]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image is None:
+        raise ValueError(f"{path}: not a picture that can be read")
+    return np.asarray(image, np.float64) / np.iinfo(image.dtype).max
+
+
+def _mask(path: Path | None) -> NDArray[np.bool_] | None:
+    if path is None:
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ValueError(f"{path}: not a picture that can be read")
+    return np.asarray(image >= 128)

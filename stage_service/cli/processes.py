@@ -1,0 +1,123 @@
+"""`serve`, `worker` and `simulate`: the three processes of a stage."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+from stage_service.cli.output import Commands, Output, add_command
+
+DEFAULT_PORT = 8331
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    serve = add_command(
+        commands,
+        "serve",
+        run_serve,
+        "run the service: devices, captures and the HTTP API",
+        "Run the service for one rig on 127.0.0.1. SIGTERM and Ctrl-C put the lights off first. "
+        "With --json, one object with the URL is printed when requests are answered.",
+    )
+    serve.add_argument("--rig", type=Path, required=True, help="rig file (deploy/rigs/*.toml)")
+    serve.add_argument("--devices", type=Path, help="file whose [devices] wins over the rig file's")
+    serve.add_argument("--root", type=Path, default=Path("runs/stage"), help="captures and models")
+    serve.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 takes any free port")
+
+    worker = add_command(
+        commands,
+        "worker",
+        run_worker,
+        "run a worker: takes jobs off the queue",
+        "Run the jobs of one root folder. A worker that dies leaves its job to the next worker, "
+        "which goes on at the step that was under way.",
+    )
+    worker.add_argument("--root", type=Path, default=Path("runs/stage"), help="as the service's")
+    worker.add_argument("--concurrency", type=int, default=1, help="jobs at the same time")
+
+    simulate = add_command(
+        commands,
+        "simulate",
+        run_simulate,
+        "run a simulated rig behind the same wires as a real one",
+        "Run the device side of every wire. STATE/devices.toml is written when they answer: give "
+        "it to 'hairstage serve --devices'.",
+    )
+    simulate.add_argument("--rig", type=Path, required=True, help="rig file")
+    simulate.add_argument(
+        "--subject", default="wavy", help="wavy, straight, curly or a strand file"
+    )
+    simulate.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
+    simulate.add_argument("--state", type=Path, default=Path("runs/simulated"), help="state folder")
+    simulate.add_argument("--truth", type=Path, help="write the true strands and appearance here")
+    simulate.add_argument("--faults", type=Path, help="faults to inject")
+    simulate.add_argument("--seed", type=int, default=0)
+    simulate.add_argument("--ports", default="auto", help="'auto' or the rig file's with 'rig'")
+
+
+def run_serve(args: argparse.Namespace, output: Output) -> int:
+    """Serve until a signal."""
+    _log_to_stderr()
+    from stage_service.api.app import serve
+    from stage_service.api.stage import Stage
+    from stage_service.config import load_rig_file
+
+    exit_on_sigterm()
+    stage = Stage(load_rig_file(args.rig, args.devices), args.root)
+
+    def ready(url: str) -> None:
+        text = f"serving {stage.rig_file.rig.name} at {url} (API: {url}/docs)"
+        output.result({"url": url, "root": str(args.root), "rig": str(args.rig)}, text)
+
+    serve(stage, args.port, ready)
+    return 0
+
+
+def run_worker(args: argparse.Namespace, output: Output) -> int:
+    """Work until a signal."""
+    _log_to_stderr()
+    from stage_service.jobs.worker import run_worker as work
+
+    args.root.mkdir(parents=True, exist_ok=True)
+    work(
+        args.root,
+        concurrency=args.concurrency,
+        ready=lambda name: output.result(
+            {"worker": name, "root": str(args.root)}, f"{name} works on the jobs of {args.root}"
+        ),
+    )
+    return 0
+
+
+def run_simulate(args: argparse.Namespace, output: Output) -> int:
+    """Spawn the simulators and stay until they end."""
+    from stage_service.cli.children import Children, simulator_command
+
+    more = ["--ports", args.ports]
+    more += ["--faults", args.faults] if args.faults is not None else []
+    with Children(args.state / "logs") as children:
+        command = simulator_command(args, args.state, args.truth, *more)
+        child = children.start("simulators", command, to_log=False)
+        devices = args.state / "devices.toml"
+        children.wait_for_file(child, devices, seconds=600)
+        output.result({"devices": str(devices)}, f"the simulated rig answers; see {devices}")
+        code = child.wait()
+        return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
+
+
+def exit_on_sigterm() -> None:
+    """Make SIGTERM end the process as `sys.exit` does: every `finally` runs."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+
+
+def _log_to_stderr() -> None:
+    import logging
+
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.INFO,
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+    )

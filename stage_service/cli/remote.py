@@ -1,0 +1,197 @@
+"""`capture` and `jobs`: a running service, from the command line."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from stage_service.cli.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    Commands,
+    Output,
+    Run,
+    add_command,
+    add_group,
+    progress_bar,
+)
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    capture = add_group(commands, "capture", "make and steer captures on a running service")
+    check = _remote(capture, "check", run_check, "cost a plan without lighting a lamp")
+    start = _remote(capture, "start", run_start, "begin a capture")
+    for parser in (check, start):
+        parser.add_argument("--plan", type=Path, help="plan as JSON; without it, everything")
+    start.add_argument("--head", type=Path, help="the digitised head (.obj)")
+    start.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
+    _pipeline(start.add_argument("--pipeline", help="job to enqueue when the capture completes"))
+    start.add_argument("--options", help="the pipeline's options: JSON or a JSON file")
+    start.add_argument("--wait", action="store_true", help="wait for capture and job")
+    _remote(capture, "list", run_list_captures, "list captures")
+    for action, what in (
+        ("show", "show a capture"),
+        ("pause", "pause at the next step"),
+        ("resume", "go on after a pause"),
+        ("abort", "abort at the next step, lights off"),
+    ):
+        _remote(capture, action, run_capture_action, what).add_argument("capture", help="its id")
+
+    jobs = add_group(commands, "jobs", "submit, follow and cancel jobs on a running service")
+    submit = _remote(jobs, "submit", run_submit, "enqueue a pipeline on a finished capture")
+    submit.add_argument("capture", help="the capture's id")
+    _pipeline(submit.add_argument("--pipeline", default="light_planes"))
+    submit.add_argument("--options", help="the pipeline's options: JSON or a JSON file")
+    submit.add_argument("--model", help="name of the model folder; without it, a new one")
+    submit.add_argument("--wait", action="store_true", help="wait until the job is done")
+    _remote(jobs, "list", run_list_jobs, "list jobs, newest first")
+    for action, what in (
+        ("show", "show a job"),
+        ("wait", "wait until a job is done"),
+        ("cancel", "cancel a job"),
+        ("report", "print a job's report"),
+        ("artifacts", "list the files of a job's model"),
+    ):
+        _remote(jobs, action, run_job_action, what).add_argument("job", help="its id")
+
+
+def run_check(args: argparse.Namespace, output: Output) -> int:
+    """Cost a plan."""
+    output.result(_service(args).post("/plans:validate", _read_json(args.plan)))
+    return 0
+
+
+def run_start(args: argparse.Namespace, output: Output) -> int:
+    """Begin a capture, and wait for it where asked."""
+    service = _service(args)
+    body: dict[str, Any] = {"plan": _read_json(args.plan)}
+    for field in ("head", "masks"):
+        if getattr(args, field) is not None:
+            body[field] = str(getattr(args, field).resolve())
+    if args.pipeline is not None:
+        body["pipeline"] = {"name": args.pipeline, "options": _options(args.options)}
+    capture = service.post("/captures", body)
+    if not args.wait:
+        output.result(capture, f"capture {capture['id']} runs")
+        return 0
+    with progress_bar("capture") as progress:
+        capture = service.follow_capture(capture["id"], progress)
+    if capture["outcome"] != "completed":
+        output.result({"capture": capture}, f"{capture['outcome']}: {capture['error'] or ''}")
+        return FAILED
+    if capture["job"] is None:
+        output.result({"capture": capture}, f"capture {capture['id']}: {capture['path']}")
+        return 0
+    return _wait(service, capture["job"], output, {"capture": capture})
+
+
+def run_list_captures(args: argparse.Namespace, output: Output) -> int:
+    """List captures."""
+    captures = _service(args).get("/captures")
+    lines = [
+        f"{c['id']}  {c['outcome'] or c['state']}  {c['frames_written']}/{c['frames_planned']} "
+        f"frames  {c['path']}"
+        for c in captures
+    ]
+    output.result({"captures": captures}, "\n".join(lines) or "no captures")
+    return 0
+
+
+def run_capture_action(args: argparse.Namespace, output: Output) -> int:
+    """Show, pause, resume or abort."""
+    service = _service(args)
+    path = f"/captures/{args.capture}"
+    output.result(
+        service.get(path) if args.action == "show" else service.post(f"{path}/{args.action}")
+    )
+    return 0
+
+
+def run_submit(args: argparse.Namespace, output: Output) -> int:
+    """Enqueue a job."""
+    service = _service(args)
+    body = {
+        "capture": args.capture,
+        "pipeline": {"name": args.pipeline, "options": _options(args.options)},
+        "model": args.model,
+    }
+    job = service.post("/jobs", body)
+    if args.wait:
+        return _wait(service, job["id"], output, {})
+    output.result(job, f"job {job['id']} is {job['state']}")
+    return 0
+
+
+def run_list_jobs(args: argparse.Namespace, output: Output) -> int:
+    """List jobs."""
+    jobs = _service(args).get("/jobs")
+    lines = [f"{j['id']}  {j['pipeline']}  {j['outcome'] or j['state']}" for j in jobs]
+    output.result({"jobs": jobs}, "\n".join(lines) or "no jobs")
+    return 0
+
+
+def run_job_action(args: argparse.Namespace, output: Output) -> int:
+    """Show, wait for, cancel, or read what a job left."""
+    service = _service(args)
+    path = f"/jobs/{args.job}"
+    if args.action == "wait":
+        return _wait(service, args.job, output, {})
+    if args.action == "artifacts":
+        files = service.get(f"{path}/artifacts")
+        lines = "\n".join(f"{f['bytes']:>12}  {f['path']}" for f in files)
+        output.result({"artifacts": files}, lines or "no files yet")
+    elif args.action == "report":
+        output.result(service.get(f"{path}/report"))
+    else:
+        output.result(service.ask("DELETE" if args.action == "cancel" else "GET", path))
+    return 0
+
+
+def _wait(service: Any, job: str, output: Output, more: dict[str, Any]) -> int:
+    with progress_bar("job") as progress:
+        done = service.follow_job(job, progress)
+    why = f": {done['error']['detail']}" if done["error"] else ""
+    output.result({**more, "job": done}, f"{job} {done['outcome']}{why}; model: {done['model']}")
+    return 0 if done["outcome"] == "succeeded" else FAILED
+
+
+def _remote(group: Commands, name: str, run: Run, help: str) -> argparse.ArgumentParser:
+    parser = add_command(group, name, run, help)
+    parser.add_argument("--url", help="the service's URL (also: HAIRSTAGE_URL)")
+    return parser
+
+
+def _pipeline(action: argparse.Action) -> None:
+    from stage_service.jobs.pipelines import PIPELINES
+
+    action.choices = sorted(PIPELINES)
+
+
+def _service(args: argparse.Namespace) -> Any:
+    from stage_service.cli.client import Service
+
+    return Service(args.url)
+
+
+def _read_json(path: Path | None) -> Any:
+    if path is None:
+        return {}
+    try:
+        return json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise CommandError(f"{path} is not JSON: {error}", BAD_INPUT, "BadInput") from error
+
+
+def _options(text: str | None) -> Any:
+    if text is None:
+        return {}
+    if not text.lstrip().startswith("{"):
+        return _read_json(Path(text))
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise CommandError(f"--options is not JSON: {error}", BAD_INPUT, "BadInput") from error

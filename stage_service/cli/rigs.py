@@ -1,0 +1,95 @@
+"""`rig check`: what a rig file describes, and how well it can triangulate."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from stage_service.cli.output import Commands, Output, add_command, add_group
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    group = add_group(commands, "rig", "look at rig files")
+    check = add_command(
+        group,
+        "check",
+        run_check,
+        "check a rig file and report the angles between camera rays and planes of light",
+        "Read a rig file, count what it holds, cost its full capture, and report for each camera "
+        "and projector the angle between camera rays and planes of light on a head-sized sphere: "
+        "near 0 the depth is worthless.",
+    )
+    check.add_argument("file", type=Path, help="rig file (.toml or .json)")
+    check.add_argument("--radius", type=float, default=0.12, help="of the sphere, metres")
+
+
+def run_check(args: argparse.Namespace, output: Output) -> int:
+    """Check a rig file."""
+    from reconstruction.light_planes.conditioning import condition
+    from stage_service.config import load_rig_file
+    from stage_service.plan import CapturePlan
+
+    rig_file = load_rig_file(args.file)
+    rig = rig_file.rig
+    data: dict[str, Any] = {
+        "rig": rig.name,
+        "cameras": len(rig.cameras),
+        "lights": len(rig.lights),
+        "projectors": len(rig.projectors),
+        "lights_beside_cameras": sum(light.beside is not None for light in rig.lights),
+        "cost": CapturePlan().cost(rig_file).model_dump(mode="json"),
+        "warnings": [],
+        "triangulation": None,
+    }
+    if rig.projectors:
+        found = condition(rig, radius=args.radius)
+        data["triangulation"] = found.to_dict()
+        if found.triangulated < 0.5:
+            data["warnings"].append(
+                f"only {found.triangulated:.0%} of what the cameras see is triangulated at "
+                f"{found.well_deg:g}° or more: turn or move projectors"
+            )
+    else:
+        data["warnings"].append("no projectors: nothing to triangulate")
+    alone = {c.name for c in rig.cameras} - {light.beside for light in rig.lights}
+    if alone:
+        data["warnings"].append(
+            f"no light beside {sorted(alone)}: visibility is less certain there"
+        )
+    output.result(data, _table(data))
+    return 0
+
+
+def _table(data: dict[str, Any]) -> Any:
+    from rich.console import Group
+    from rich.table import Table
+
+    cost = data["cost"]
+    head = (
+        f"{data['rig']}: {data['cameras']} cameras, {data['lights']} lights "
+        f"({data['lights_beside_cameras']} beside cameras), {data['projectors']} projectors; a "
+        f"full capture is {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB, "
+        f"{cost['seconds']:.0f} s"
+    )
+    parts: list[Any] = [head]
+    found = data["triangulation"]
+    if found is not None:
+        table = Table("camera", "projector", "shared", "median angle", "5 % below", "mm per row")
+        for pair in found["pairs"]:
+            angles = [pair["median_angle_deg"], pair["low_angle_deg"]]
+            row = pair["metres_per_row"]
+            table.add_row(
+                pair["camera"],
+                pair["projector"],
+                f"{pair['shared']:.0%}",
+                *("–" if a is None else f"{a:.0f}°" for a in angles),
+                "–" if row is None else f"{1000 * row:.1f}",
+            )
+        parts += [
+            table,
+            f"{found['seen']:.0%} of the sphere is seen, {found['triangulated']:.0%} of that "
+            f"triangulated at {found['well_deg']:g}° or more",
+        ]
+    return Group(*parts, *(f"warning: {w}" for w in data["warnings"]))
