@@ -106,6 +106,12 @@ class CaptureWriter:
         """The frames (step, camera) that are not there yet, in the plan's order."""
         return [(s, c.name) for s in self.steps for c in self.rig.cameras if not self._has(s, c)]
 
+    def counts(self) -> tuple[int, int]:
+        """Frames written, and frames recorded as missing, so far."""
+        with self._lock:
+            written = sum(r.file is not None for r in self.records.values())
+            return written, len(self.records) - written
+
     def write_frame(
         self,
         step: Step,
@@ -200,7 +206,7 @@ class CaptureWriter:
             "finished": utc_now(),
             "frames": {
                 "planned": len(self.steps) * len(self.rig.cameras),
-                "written": sum(r.file is not None for r in self.records.values()),
+                "written": self.counts()[0],
                 "missing": len(self.missing()),
             },
             **_checksums(self.path),
@@ -305,7 +311,10 @@ def _checksums(path: Path) -> dict[str, Any]:
 
 
 def _mask(rig: Rig, camera: str, mask: NDArray[Any]) -> NDArray[np.uint8]:
-    c = rig.camera(camera)
+    try:
+        c = rig.camera(camera)
+    except KeyError as error:
+        raise CaptureError(f"masks: {error.args[0]}") from error
     if mask.shape != (c.height, c.width):
         raise CaptureError(
             f"mask of {camera}: expected shape {(c.height, c.width)}, got {mask.shape}"

@@ -47,29 +47,39 @@ class FrameAccount:
 
     def arrived(self, block_id: int) -> None:
         """The frame of the newest pulse. Raises `IndexShift` when its number does not fit."""
-        before = 0 if self.last is None else self.last
-        advance = (block_id - before) % self.wrap
-        most = 1 + self.unanswered
-        if not 1 <= block_id <= self.wrap or not 1 <= advance <= most:
-            ids = [(before + k - 1) % self.wrap + 1 for k in range(1, most + 1)]
-            raise IndexShift(
-                self.device,
-                "matching frames to pulses",
-                expected=f"block id {ids[0]}" + (f" to {ids[-1]}" if most > 1 else ""),
-                received=f"block id {block_id}",
-                todo="Frames and pulses are out of step; check the trigger cable for doubled "
-                "pulses and start again.",
-            )
-        self.last = block_id
+        self._advance(block_id, 1 + self.unanswered)
         self.unanswered = 0
 
-    def surplus(self, block_id: int) -> IndexShift:
-        """The error for a frame that no pulse of ours asked for."""
+    def late(self, block_id: int) -> None:
+        """A frame of a pulse that counted as unanswered. Raises `IndexShift` when it cannot be."""
+        if self.unanswered == 0:
+            raise self._shift(
+                "no frame beside those of our pulses",
+                block_id,
+                "The camera was triggered by something else: frames since the last check may "
+                "belong to other steps. Check the trigger cable and start again.",
+            )
+        self._advance(block_id, self.unanswered)
+        self.unanswered -= 1
+
+    def _advance(self, block_id: int, most: int) -> None:
+        before = 0 if self.last is None else self.last
+        advance = (block_id - before) % self.wrap
+        if not 1 <= block_id <= self.wrap or not 1 <= advance <= most:
+            ids = [(before + k - 1) % self.wrap + 1 for k in (1, most)]
+            raise self._shift(
+                f"block id {ids[0]}" + (f" to {ids[1]}" if most > 1 else ""),
+                block_id,
+                "Frames and pulses are out of step. Check the trigger cable for doubled pulses "
+                "and start again.",
+            )
+        self.last = block_id
+
+    def _shift(self, expected: str, block_id: int, todo: str) -> IndexShift:
         return IndexShift(
             self.device,
-            "emptying the frame queue",
-            expected="no frame beside those of our pulses",
+            "matching frames to pulses",
+            expected=expected,
             received=f"block id {block_id}",
-            todo="The camera was triggered by something else: frames since the last check may "
-            "belong to other steps. Check the trigger cable and start again.",
+            todo=todo,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Self
 
 from reconstruction.rig import RigError
@@ -17,6 +18,8 @@ from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.interface import TriggerBox
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
+
+Device = LightBank | TriggerBox | ProjectorController | Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,42 +60,44 @@ class Stage:
         for device in self._all():
             device.close()
 
-    def status(self, *, cameras: bool = True) -> dict[str, Any]:
+    def status(self, *, connect: bool) -> dict[str, Any]:
         """Ask each device how it is: {kind: {"state": "ok" | "unreachable", ...}}.
 
-        `cameras=False` leaves the cameras alone, as during a capture.
+        With `connect` each device is connected first. Without it, as during a capture, only
+        devices that are connected are asked, and the cameras are left alone.
         """
+        lights, trigger, beams = self.lights, self.trigger, self.projectors
         out = {
             "lights": _ask(
-                self.lights.name,
-                lambda: {"count": self.lights.count, **asdict(self.lights.status())},
+                lights, connect, lambda: {"count": lights.count, **asdict(lights.status())}
             ),
             "trigger": _ask(
-                self.trigger.name,
-                lambda: {"pulses": self.trigger.count(), **asdict(self.trigger.status())},
+                trigger, connect, lambda: {"pulses": trigger.count(), **asdict(trigger.status())}
             ),
         }
-        if self.projectors is not None:
-            projectors = self.projectors
+        if beams is not None:
             out["projectors"] = _ask(
-                projectors.name,
-                lambda: {"dark": projectors.is_dark(), "names": list(projectors.names)},
+                beams, connect, lambda: {"dark": beams.is_dark(), "names": list(beams.names)}
             )
-        if cameras:
-            out["cameras"] = {c.name: _ask(c.name, lambda c=c: _hello(c)) for c in self.cameras}
+        out["cameras"] = {
+            c.name: _ask(c, connect, partial(_info, c)) if connect else {"state": "in use"}
+            for c in self.cameras
+        }
         return out
 
-    def _all(self) -> tuple[LightBank | TriggerBox | ProjectorController | Camera, ...]:
+    def _all(self) -> tuple[Device, ...]:
         beams = (self.projectors,) if self.projectors is not None else ()
         return (self.lights, *beams, self.trigger, *self.cameras)
 
 
-def _hello(camera: Camera) -> dict[str, Any]:
+def _info(camera: Camera) -> dict[str, Any]:
     return asdict(camera.info)
 
 
-def _ask(name: str, question: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _ask(device: Device, connect: bool, question: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     try:
-        return {"name": name, "state": "ok", **question()}
+        if connect:
+            device.connect()
+        return {"name": device.name, "state": "ok", **question()}
     except DeviceError as error:
-        return {"name": name, "state": "unreachable", "error": str(error)}
+        return {"name": device.name, "state": "unreachable", "error": str(error)}

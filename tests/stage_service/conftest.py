@@ -1,0 +1,303 @@
+"""A tiny stage on real wires: the device side of docs/wire.md, with faults to script."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import socketserver
+import struct
+import threading
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stage_service.config import RigFile, load_rig_file
+
+LAMPS, CAMERAS, ROWS = 200, 3, 12
+WIDTH, HEIGHT = 8, 6
+FULL_SCALE, BLACK, GAIN = 4095, 64, 10000.0
+
+
+class World:
+    """What is lit, and what the pulses made of it. `faults` are consumed as they strike."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.lit: set[int] = set()
+        self.levels = [65535] * LAMPS
+        self.show = "OFF"
+        self.pulses = 0
+        self.heartbeats = 0
+        self.watchdog_ms = 2000
+        self.interlock = self.estop = False
+        self.cameras: dict[str, dict[str, Any]] = {}
+        self.requests: list[str] = []  # serial lines as they came
+        self.drop: set[tuple[str, int]] = set()  # (camera, pulse): trigger missed
+        self.lose: set[tuple[str, int]] = set()  # (camera, pulse): frame made, lost on the way
+        self.double: set[int] = set()  # pulses that fire the cameras twice
+        self.mute: set[str] = set()  # cameras that do not answer `read`
+        self.busy: dict[str, int] = {}  # camera: answers `busy` this often
+        self.dead_lamps = False  # lamps cannot be lit
+        self.stuck_lamps = False  # lamps cannot be put off
+        self.late: list[str] = []  # serial requests answered together with the next one
+        self.garbage = b""  # sent before the next serial reply
+
+    def signal(self) -> int:
+        """Counts above black per 10 ms of exposure, telling the light that was on."""
+        if self.show.startswith("LINE"):
+            return 1000 + int(self.show.split()[2])
+        if self.show.startswith("ON"):
+            return 900
+        if len(self.lit) == 1:
+            (lamp,) = self.lit
+            return round((lamp + 1) * self.levels[lamp] / 65535)
+        return 700 if self.lit else 0
+
+    def pulse(self) -> None:
+        self.pulses += 1
+        for name, camera in self.cameras.items():
+            if camera["exposure"] is None or (name, self.pulses) in self.drop:
+                continue
+            for _ in range(2 if self.pulses in self.double else 1):
+                block = camera["block"]
+                camera["block"] = block % 65535 + 1
+                value = BLACK + self.signal() * camera["exposure"] / 0.01
+                if (name, self.pulses) not in self.lose:
+                    camera["queue"].append((block, min(round(value), FULL_SCALE)))
+
+
+class Lights(socketserver.BaseRequestHandler):
+    """Modbus TCP by hand: functions 3, 4, 6 and 16."""
+
+    def handle(self) -> None:
+        world: World = self.server.world  # type: ignore[attr-defined]
+        while header := self.request.recv(7, 0x100):  # MSG_WAITALL
+            tid, _, length, unit = struct.unpack(">HHHB", header)
+            pdu = self.request.recv(length - 1, 0x100)
+            with world.lock:
+                answer = self.answer(world, pdu)
+            self.request.sendall(struct.pack(">HHHB", tid, 0, len(answer) + 1, unit) + answer)
+
+    def answer(self, world: World, pdu: bytes) -> bytes:
+        function, address, value = struct.unpack(">BHH", pdu[:5])
+        if function == 4:
+            bits = 2 * world.interlock | 4 * world.estop | 8 * bool(world.lit)
+            registers = [bits, len(world.lit), LAMPS, 0x4853][address : address + value]
+            return struct.pack(f">BB{value}H", 4, 2 * value, *registers)
+        if function == 16:
+            if value > 123:
+                return struct.pack(">BB", 0x90, 3)
+            values = struct.unpack(f">{value}H", pdu[6:])
+            world.levels[address : address + value] = values
+            return struct.pack(">BHH", 16, address, value)
+        if address == 1000:
+            if not (value == 0 and world.stuck_lamps):
+                world.lit = set() if value == 0 or world.dead_lamps else {value - 1}
+            if value == 65535:
+                world.lit = set(range(LAMPS))
+        elif address == 1001:
+            world.heartbeats += 1
+        elif address == 1002:
+            if not 100 <= value <= 60000:
+                return struct.pack(">BB", 0x86, 3)
+            world.watchdog_ms = value
+        return pdu
+
+
+class Cameras(socketserver.BaseRequestHandler):
+    def handle(self) -> None:
+        world: World = self.server.world  # type: ignore[attr-defined]
+        name = ""
+        while header := self.request.recv(4, 0x100):
+            (length,) = struct.unpack(">I", header)
+            request = json.loads(self.request.recv(length, 0x100))
+            name = request.get("camera", name)
+            if request["op"] == "read" and name in world.mute:
+                continue
+            with world.lock:
+                answer, payload = self.answer(world, name, request)
+            data = json.dumps(answer).encode()
+            self.request.sendall(struct.pack(">I", len(data)) + data + payload)
+
+    def answer(
+        self, world: World, name: str, request: dict[str, Any]
+    ) -> tuple[dict[str, Any], bytes]:
+        op = request["op"]
+        if op == "hello":
+            if name not in {f"cam_{i}" for i in range(CAMERAS)}:
+                return {"ok": False, "error": f"no camera {name}"}, b""
+            world.cameras[name] = {"block": 1, "queue": [], "exposure": None}
+            info = {"width": WIDTH, "height": HEIGHT, "full_scale": FULL_SCALE}
+            return {"ok": True, **info, "black": BLACK, "gain": GAIN}, b""
+        camera = world.cameras[name]
+        if op == "arm":
+            camera.update(exposure=request["exposure"], queue=[])
+        elif op == "disarm":
+            camera["exposure"] = None
+        elif world.busy.get(name, 0) > 0:
+            world.busy[name] -= 1
+            return {"ok": True, "status": "busy"}, b""
+        elif not camera["queue"]:
+            return {"ok": True, "status": "empty"}, b""
+        else:
+            block, value = camera["queue"].pop(0)
+            payload = np.full((HEIGHT, WIDTH, 3), value, "<u2").tobytes()
+            frame = {"block_id": block, "timestamp": 0.0, "exposure": camera["exposure"]}
+            return {"ok": True, "status": "frame", **frame, "bytes": len(payload)}, payload
+        return {"ok": True}, b""
+
+
+def trigger(world: World, line: str) -> str:
+    if line == "ID?":
+        return "HAIRSTAGE-TRIGGER 1"
+    if line.startswith("PULSE"):
+        if world.interlock or world.estop:
+            return "ERR 3 interlock or emergency stop"
+        world.pulse()
+        return f"OK {world.pulses}"
+    if line == "COUNT?":
+        return f"COUNT {world.pulses}"
+    if line == "RESET":
+        world.pulses = 0
+        return "OK 0"
+    if line == "STATUS?":
+        return f"STATUS interlock={world.interlock:d} estop={world.estop:d}"
+    return "ERR 1 unknown command"
+
+
+def projectors(world: World, line: str) -> str:
+    if line == "ID?":
+        return "HAIRSTAGE-PROJECTORS left,right"
+    if line == "SHOW?":
+        return f"SHOW {world.show}"
+    if line.startswith("LINE") and line.split()[1] not in ("left", "right"):
+        return "ERR 2 unknown projector"
+    world.show = line
+    return f"OK {line}"
+
+
+class SerialPeer:
+    """Answers lines on a pseudo-terminal; keeps the far end open, as a cable does."""
+
+    def __init__(self, world: World, answer: Any) -> None:
+        self.master, self.far = pty.openpty()
+        tty.setraw(self.far)
+        self.path = os.ttyname(self.far)
+        self.world, self.answer = world, answer
+        self.thread = threading.Thread(target=self.run, daemon=True)
+        self.thread.start()
+
+    def run(self) -> None:
+        data, held = b"", b""
+        while True:
+            try:
+                data += os.read(self.master, 1024)
+            except OSError:
+                return
+            while b"\n" in data:
+                line, data = data.split(b"\n", 1)
+                text = line.decode()
+                with self.world.lock:
+                    self.world.requests.append(text)
+                    reply = self.answer(self.world, text).encode() + b"\n"
+                    if text in self.world.late:
+                        self.world.late.remove(text)
+                        held += reply
+                        continue
+                    garbage, self.world.garbage = self.world.garbage, b""
+                os.write(self.master, held + garbage + reply)
+                held = b""
+
+    def close(self) -> None:
+        # The reader leaves when the last far end is closed (EIO), not by closing under it.
+        os.close(self.far)
+        self.thread.join(5)
+        os.close(self.master)
+
+
+class Server(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+    allow_reuse_address = True
+    block_on_close = False
+
+
+@pytest.fixture
+def world() -> World:
+    """The state behind the wires of `rig_file`; script faults here."""
+    return World()
+
+
+@pytest.fixture
+def rig_file(world: World, tmp_path: Path) -> Iterator[RigFile]:
+    """A rig of 200 lamps, 3 small cameras and 2 projectors whose devices answer on real wires."""
+    servers = []
+    for handler in (Lights, Cameras):
+        server = Server(("127.0.0.1", 0), handler)
+        server.world = world  # type: ignore[attr-defined]
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        servers.append(server)
+    serial = [SerialPeer(world, answer) for answer in (trigger, projectors)]
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG + devices([s.server_address[1] for s in servers], [s.path for s in serial]))
+    yield load_rig_file(path)
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+    for peer in serial:
+        peer.close()
+
+
+def devices(ports: list[int], paths: list[str]) -> str:
+    return f"""
+[devices]
+heartbeat_s = 0.05
+watchdog_s = 0.5
+[devices.lights]
+port = {ports[0]}
+timeout_s = 0.3
+[devices.trigger]
+port = "{paths[0]}"
+timeout_s = 0.3
+[devices.projectors]
+port = "{paths[1]}"
+timeout_s = 0.3
+[devices.cameras]
+port = {ports[1]}
+timeout_s = 0.3
+busy_s = 5.0
+[capture.exposure]
+dark = 0.002
+all_on = 0.001
+olat = 0.002
+scanline = 0.002
+tracking = 0.001
+"""
+
+
+RIG = f"""
+name = "tiny"
+[dome]
+lights = {LAMPS}
+radius = 1.0
+intensity = [1.0, 1.0, 1.0]
+""" + "".join(
+    f"""
+[[{kind}]]
+name = "{name}"
+position = [{i - 0.9}, -1.0, 0.2]
+target = [0.0, 0.0, 0.0]
+fov_deg = 20.0
+width = {WIDTH}
+height = {height}
+"""
+    for kind, height, names in (
+        ("cameras", HEIGHT, [f"cam_{i}" for i in range(CAMERAS)]),
+        ("projectors", ROWS, ["left", "right"]),
+    )
+    for i, name in enumerate(names)
+)

@@ -1,0 +1,77 @@
+"""Rig files, read strictly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from reconstruction.rig import RigError
+from stage_service.config import load_rig_file
+
+RIGS = Path(__file__).resolve().parents[2] / "deploy" / "rigs"
+
+
+@pytest.mark.parametrize("path", sorted(RIGS.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_shipped_rig_loads(path):
+    rig_file = load_rig_file(path)
+    assert rig_file.devices is not None
+    assert len(rig_file.rig.lights) == 331
+    beside = [light.beside for light in rig_file.rig.lights if light.beside is not None]
+    assert sorted(beside) == sorted(c.name for c in rig_file.rig.cameras)
+
+
+def test_stage331_is_the_stage_of_the_issue():
+    rig = load_rig_file(RIGS / "stage331.toml").rig
+    assert {(c.width, c.height) for c in rig.cameras} == {(1300, 1030)}
+    assert len(rig.cameras) == 50
+    assert [(p.width, p.height) for p in rig.projectors] == [(1024, 768)] * 3
+
+
+def changed(tmp_path: Path, old: str, new: str) -> Path:
+    text = (RIGS / "demo.toml").read_text()
+    assert old in text
+    path = tmp_path / "rig.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "names"),
+    [
+        ("busy_s = 900.0", "buzy_s = 900.0", "devices.cameras.buzy_s"),
+        ("port = 15020", "port = 150200", "devices.lights.port"),
+        ("[devices.trigger]", "[devices.triger]", "devices.triger"),
+        ("watchdog_s = 2.0", "watchdog_s = 0.6", "at most half of watchdog_s"),
+        ("olat = 0.02", "olat = 0.0", "capture.exposure.olat"),
+        ("[capture]", "[captures]", "captures"),
+    ],
+)
+def test_errors_name_file_and_field(tmp_path, old, new, names):
+    path = changed(tmp_path, old, new)
+    with pytest.raises(RigError) as error:
+        load_rig_file(path)
+    assert str(path) in str(error.value)
+    assert names in str(error.value)
+
+
+def test_a_devices_file_wins_field_by_field(tmp_path):
+    devices = tmp_path / "devices.toml"
+    devices.write_text('[devices.lights]\nport = 4321\n[devices.trigger]\nport = "/dev/pts/9"\n')
+    rig_file = load_rig_file(RIGS / "demo.toml", devices)
+    assert rig_file.devices is not None
+    assert rig_file.devices.lights.port == 4321
+    assert rig_file.devices.trigger.port == "/dev/pts/9"
+    assert rig_file.devices.cameras.busy_s == 900.0
+
+
+def test_a_devices_file_holds_devices_alone(tmp_path):
+    devices = tmp_path / "devices.toml"
+    devices.write_text("[capture]\nretries = 1\n")
+    with pytest.raises(RigError, match=r"expected one table \[devices\]"):
+        load_rig_file(RIGS / "demo.toml", devices)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(RigError, match="no such rig file"):
+        load_rig_file(tmp_path / "none.toml")
