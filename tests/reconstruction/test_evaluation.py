@@ -1,0 +1,169 @@
+"""Strands scored against true ones, and what counts as visible."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reconstruction.cameras import Camera
+from reconstruction.evaluation import compare_strands
+from reconstruction.mesh import Mesh
+from reconstruction.strands import Strands
+from reconstruction.visibility import Visibility, surface_samples
+
+NAMES = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
+
+
+def curtain(depth: float = 0.0, tilt_deg: float = 0.0, spacing: float = 4e-3) -> Strands:
+    """Parallel lines 60 mm long in the plane y = depth, turned by `tilt_deg` within it."""
+    c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    along = np.array([s, 0, -c])
+    return Strands.from_list(
+        [
+            np.array([[x, depth, 0.03], np.array([x, depth, 0.03]) + 0.06 * along])
+            for x in np.arange(-0.05, 0.05, spacing)
+        ],
+        radius=3e-4,
+    )
+
+
+def moved(strands: Strands, offset: tuple[float, float, float]) -> Strands:
+    return strands.transformed(np.eye(3), offset)
+
+
+@pytest.fixture
+def front() -> Camera:
+    return Camera.look_at("front", 120, 100, [0, -1, 0], [0, 0, 0], 12)
+
+
+def test_a_set_matches_itself(front: Camera) -> None:
+    scores = compare_strands(curtain(), curtain(), cameras=[front])
+    for part in ("visible", "all"):
+        for name in NAMES:
+            assert scores[part][name]["f"] == 1.0
+            assert scores[part][name]["recall_error"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("offset", "expected"),
+    [(0.0009, (1, 1, 1)), (0.0015, (0, 1, 1)), (0.0025, (0, 0, 1)), (0.0031, (0, 0, 0))],
+)
+def test_distances(offset: float, expected: tuple[int, int, int]) -> None:
+    scores = compare_strands(moved(curtain(), (0, offset, 0)), curtain())["all"]
+    assert tuple(scores[n]["f"] for n in NAMES) == expected
+    assert set(scores) == set(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("angle", "expected"), [(9, (1, 1, 1)), (11, (0, 1, 1)), (21, (0, 0, 1)), (31, (0, 0, 0))]
+)
+def test_angles(angle: float, expected: tuple[int, int, int]) -> None:
+    """Short, turned pieces on a true line: every point is near enough, only the angle counts."""
+    true = Strands.from_list([np.array([[0, 0, -0.1], [0, 0, 0.1]])])
+    half = 3e-4 * np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+    centers = [np.array([0, 0, z]) for z in np.arange(-0.09, 0.09, 1e-3)]
+    pred = Strands.from_list([np.stack([c - half, c + half]) for c in centers])
+    scores = compare_strands(pred, true)["all"]
+    assert tuple(scores[n]["precision"] for n in NAMES) == expected
+
+
+def test_direction_of_travel_does_not_count() -> None:
+    true = curtain()
+    flipped = Strands.from_list([true[i][::-1] for i in range(len(true))])
+    assert compare_strands(flipped, true)["all"]["1mm_10deg"]["f"] == 1.0
+
+
+def test_any_point_within_reach_may_match() -> None:
+    """A nearer strand of the wrong direction does not take the match away."""
+    true = Strands.from_list([np.array([[0, 0, -0.02], [0, 0, 0.02]])])
+    across = Strands.from_list([np.array([[-0.02, 1e-4, z], [0.02, 1e-4, z]]) for z in (-0.01, 0)])
+    both = Strands.from_list([*(across[i] for i in range(2)), true[0] + np.array([5e-4, 0, 0])])
+    assert compare_strands(both, true)["all"]["1mm_10deg"]["recall"] == 1.0
+
+
+def test_half_of_the_truth() -> None:
+    true = curtain()
+    half = true.subset(np.arange(0, len(true), 2))
+    scores = compare_strands(half, true)["all"]["1mm_10deg"]
+    assert scores["precision"] == 1.0
+    assert scores["recall"] == pytest.approx(0.52, abs=1e-9)  # 13 of 25 lines
+    assert scores["f"] == pytest.approx(2 * 0.52 / 1.52)
+
+
+def test_no_prediction_scores_nothing(front: Camera) -> None:
+    scores = compare_strands(Strands.from_list([]), curtain(), cameras=[front])
+    assert scores["visible"]["3mm_30deg"] == dict.fromkeys(
+        ("precision", "recall", "f", "precision_error", "recall_error"), 0.0
+    )
+
+
+def test_no_truth_is_an_error(front: Camera) -> None:
+    with pytest.raises(ValueError, match="no true strands"):
+        compare_strands(curtain(), Strands.from_list([]))
+    with pytest.raises(ValueError, match="no camera sees any"):
+        compare_strands(curtain(), moved(curtain(), (5, 0, 0)), cameras=[front])
+
+
+def test_sampling_is_within_its_error_and_repeats() -> None:
+    true = curtain(spacing=5e-4)
+    pred = Strands.from_list(
+        [true[i] + np.array([0, 2e-3 * (i % 3 == 0), 0]) for i in range(len(true))]
+    )
+    pred = pred.subset(np.arange(0, len(pred), 5))
+    exact = compare_strands(pred, true, samples=None)["all"]["1mm_10deg"]
+    some = compare_strands(pred, true, samples=500, seed=3)["all"]["1mm_10deg"]
+    assert 0.3 < exact["precision"] < 0.9
+    assert 0.005 < some["precision_error"] < 0.025
+    assert exact["precision_error"] == 0.0
+    for key in ("precision", "recall"):
+        assert abs(some[key] - exact[key]) < 4 * some[f"{key}_error"] + 1e-12
+    assert compare_strands(pred, true, samples=500, seed=3)["all"]["1mm_10deg"] == some
+
+
+def test_what_hangs_behind_strands_is_hidden(front: Camera) -> None:
+    dense = curtain(spacing=2.5e-4)
+    visible = Visibility([front], dense)
+    inner = dense.subset(np.arange(40, len(dense) - 40)).resampled(1e-3).points
+    inner = inner[np.abs(inner[:, 2]) < 0.02]
+    assert visible(inner).all()
+    assert visible(inner + np.array([0, 0.9e-3, 0], np.float32)).all()
+    assert not visible(inner + np.array([0, 1.2e-3, 0], np.float32)).any()
+    back = Camera.look_at("back", 120, 100, [0, 1, 0], [0, 0, 0], 12)
+    assert Visibility([front, back], dense)(inner + np.array([0, 1.2e-3, 0], np.float32)).all()
+
+
+def test_gaps_between_strands_are_open(front: Camera) -> None:
+    visible = Visibility([front], curtain(spacing=4e-3))
+    rng = np.random.default_rng(0)
+    points = np.column_stack(
+        [rng.uniform(-0.045, 0.045, 4000), np.full(4000, 0.01), rng.uniform(-0.02, 0.02, 4000)]
+    )
+    # lines of 0.6 mm every 4 mm, a pixel of 0.6 mm: between 0.6 and 1.2 of 4 mm are covered
+    assert 0.70 < visible(points).mean() < 0.86
+
+
+def test_the_head_hides_and_the_image_ends(front: Camera) -> None:
+    plate = Mesh(
+        np.array([[-0.1, 0, -0.1], [0.1, 0, -0.1], [0.1, 0, 0], [-0.1, 0, 0.0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    behind = curtain(depth=5e-3)
+    points = behind.resampled(1e-3).points
+    seen = Visibility([front], behind, plate)(points)
+    below = points[:, 2] < -1.5e-3
+    assert not seen[below].any()
+    assert seen[points[:, 2] > 1.5e-3].all()
+    assert not Visibility([front], behind)(points + np.float32(0.2)).any()
+
+
+def test_surface_samples_leave_no_gap() -> None:
+    mesh = Mesh(
+        np.array([[0, 0, 0], [0.03, 0, 0], [0, 0.02, 0.01], [0.05, 0.05, 0]]),
+        np.array([[0, 1, 2], [1, 3, 2]]),
+    )
+    samples = np.concatenate(list(surface_samples(mesh, 1e-3)))
+    rng = np.random.default_rng(0)
+    for face in mesh.faces:
+        inside = rng.dirichlet(np.ones(3), 300) @ mesh.vertices[face]
+        gap = np.linalg.norm(inside[:, None] - samples[None], axis=2).min(axis=1)
+        assert gap.max() < 1e-3 / np.sqrt(3) + 1e-6
