@@ -18,7 +18,7 @@ from reconstruction.silhouettes import background_noise, dark_frame
 
 REACH = 3  # frames kept before and after a maximum
 WINDOW = 2 * REACH + 1
-CLEAN = 0.03  # rows: what a stripe's centre is off by even without noise
+CLEAN = 0.1  # rows: what a stripe's centre is off by even without noise, on fibres of many depths
 
 
 @dataclass(frozen=True)

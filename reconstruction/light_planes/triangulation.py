@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from reconstruction.capture import Capture, CaptureError
 from reconstruction.light_planes.conditioning import row_pitch
+from reconstruction.light_planes.consensus import flatten, support, supported
 from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.peaks import CLEAN, PeakOptions, Peaks, find_peaks
 from reconstruction.light_planes.point_cloud import PointCloud
@@ -27,18 +27,22 @@ class TriangulateOptions:
 
     `min_angle_deg`: rays that meet their plane flatter are not used. `max_deviation` (metres): the
     largest standard deviation along the ray. `hull_margin` (pixels): how far outside a silhouette a
-    point may project. `neighbours` points must lie within `isolation` (metres), or the point is an
-    outlier. `fuse`: points of one pixel that agree become one.
+    point may project. `neighbours`, `isolation`: see `consensus.supported`. `fuse`: points of one
+    pixel that agree become one. `flatten`: use each neighbourhood's plane, see
+    `consensus.flatten`; `radius` (metres) is its size, `roughness` (metres) how far fibres lie off it.
     """
 
     peaks: PeakOptions = field(default_factory=PeakOptions)
     min_angle_deg: float = 10.0
-    max_deviation: float = 4e-3
+    max_deviation: float = 2.5e-3
     hull: bool = True
     hull_margin: float = 1.0
-    neighbours: int = 4
-    isolation: float = 8e-3
+    neighbours: int = 8
+    isolation: float = 1.6
     fuse: bool = True
+    flatten: bool = True
+    radius: float = 2.5e-3
+    roughness: float = 3e-4
 
 
 def sweep_peaks(
@@ -108,6 +112,10 @@ def triangulate(
         cloud = fuse(cloud)
     counts["after_fusion"] = len(cloud)
     cloud = cloud.subset(supported(cloud.points, options.neighbours, options.isolation))
+    backing = support(cloud.points, options.radius)
+    cloud = replace(cloud, weight=(cloud.weight * backing).astype(np.float32))
+    if options.flatten:
+        cloud = flatten(cloud, options.radius, options.roughness)
     counts["points"] = len(cloud)
     stage.figures.update(counts)
     if len(cloud):
@@ -197,14 +205,6 @@ def inside_hull(
         far = outside[np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)] > margin
         keep[np.flatnonzero(seen)[far]] = False
     return keep
-
-
-def supported(points: Array, neighbours: int, isolation: float) -> NDArray[np.bool_]:
-    """Which `points (N, 3)` have at least `neighbours` others within `isolation` metres."""
-    if len(points) <= neighbours:
-        return np.zeros(len(points), bool)
-    distance, _ = cKDTree(points).query(points, k=[neighbours + 1])
-    return np.asarray(distance[:, 0] <= isolation)
 
 
 def fuse(cloud: PointCloud) -> PointCloud:
