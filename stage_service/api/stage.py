@@ -239,8 +239,12 @@ class Stage:
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
-        model = Path(self.queue.get(job_id).model)
-        files = sorted(p for p in model.rglob("*") if p.is_file() and not p.name.endswith(".part"))
+        model = Path(self.queue.get(job_id).model).resolve()
+        files = (
+            p
+            for p in sorted(model.rglob("*"))
+            if p.is_file() and p.suffix != ".part" and p.resolve().is_relative_to(model)
+        )
         return [Artifact(path=str(p.relative_to(model)), bytes=p.stat().st_size) for p in files]
 
     def artifact(self, job_id: str, path: str) -> Path:

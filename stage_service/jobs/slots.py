@@ -25,6 +25,10 @@ class WorkerSlot:
         self._file = file
         self.name = f"worker-{number}"
 
+    def release(self) -> None:
+        """Give the name up before the process ends."""
+        self._file.close()
+
 
 def worker_is_alive(root: Path) -> bool:
     """Whether any worker of this root runs."""

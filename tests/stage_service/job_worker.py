@@ -1,0 +1,45 @@
+"""A worker whose steps are quick stand-ins: `python job_worker.py ROOT`. Run by test_jobs."""
+
+import sys
+import time
+from pathlib import Path
+
+from stage_service.jobs import steps
+from stage_service.jobs.worker import run_worker
+
+
+def _log(context: steps.StepContext, line: str) -> None:
+    with (context.model / "log.txt").open("a") as file:
+        file.write(line + "\n")
+
+
+def first(context: steps.StepContext) -> steps.Figures:
+    _log(context, "first")
+    return {"answer": 42}
+
+
+def slow(context: steps.StepContext) -> steps.Figures:
+    """Goes on until the file `go` is there; tells its progress as real steps do."""
+    _log(context, "slow begins")
+    while not (context.model / "go").exists():
+        time.sleep(0.02)
+        try:
+            context.progress("waiting", 0.5)
+        except Exception:
+            _log(context, "swallowed")
+    _log(context, f"slow ends, first said {context.previous['reconstruct']['figures']['answer']}")
+    return {}
+
+
+def last(context: steps.StepContext) -> steps.Figures:
+    _log(context, "last")
+    return {}
+
+
+def bad(context: steps.StepContext) -> steps.Figures:
+    raise ValueError("this capture has no frames")
+
+
+if __name__ == "__main__":
+    steps.STEPS.update(reconstruct=first, evaluate=slow, results=last, fit=bad)
+    run_worker(Path(sys.argv[1]), ready=lambda name: print(name, flush=True))

@@ -1,0 +1,174 @@
+"""Jobs: states, cancellation, and what is left when a worker dies."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, read_progress
+from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
+from stage_service.jobs.records import Job, JobOptions, PipelineRequest
+from stage_service.jobs.slots import WorkerSlot, worker_is_alive
+
+WORKER = Path(__file__).with_name("job_worker.py")
+
+
+def wait_until(what: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def start_worker(root: Path) -> subprocess.Popen[str]:
+    worker = subprocess.Popen(
+        [sys.executable, str(WORKER), str(root)], stdout=subprocess.PIPE, text=True
+    )
+    assert worker.stdout is not None
+    assert worker.stdout.readline() == "worker-0\n"
+    return worker
+
+
+def end(worker: subprocess.Popen[str]) -> None:
+    worker.kill()
+    worker.wait()
+    assert worker.stdout is not None
+    worker.stdout.close()
+
+
+@pytest.fixture
+def queue(tmp_path: Path) -> Iterator[JobQueue]:
+    queue = JobQueue(tmp_path)
+    yield queue
+    queue.close()
+
+
+def submit(queue: JobQueue, root: Path, pipeline: str = "reconstruct") -> Job:
+    job = new_job_id()
+    return queue.submit(pipeline, root / "capture", root / job, JobOptions(), job=job)
+
+
+def test_a_job_without_a_worker_waits_and_can_be_cancelled(queue: JobQueue, tmp_path: Path) -> None:
+    job = submit(queue, tmp_path)
+    assert (job.state, job.outcome, job.progress) == ("queued", None, None)
+    assert queue.all() == [job]
+    done = queue.cancel(job.id)
+    assert (done.state, done.outcome) == ("done", "cancelled")
+    assert queue.cancel(job.id) == done
+    with pytest.raises(NoSuchJob, match="nope"):
+        queue.get("nope")
+
+
+def test_submitting_an_id_twice_is_one_job(queue: JobQueue, tmp_path: Path) -> None:
+    for _ in range(2):
+        queue.submit("fit", tmp_path / "c", tmp_path / "m", JobOptions(), job="job-of-capture-1")
+    assert [j.id for j in queue.all()] == ["job-of-capture-1"]
+
+
+def test_unknown_pipelines_and_options_are_refused_by_name(queue: JobQueue, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"no pipeline 'lightplanes'.*'light_planes'"):
+        submit(queue, tmp_path, "lightplanes")
+    with pytest.raises(ValueError, match="no pipeline 'x'"):
+        PipelineRequest(name="x")
+    with pytest.raises(ValueError, match="held_out"):
+        PipelineRequest.model_validate({"name": "fit", "options": {"held_out": []}})
+
+
+def test_a_killed_workers_job_goes_on_at_the_step_that_was_under_way(
+    queue: JobQueue, tmp_path: Path
+) -> None:
+    job = submit(queue, tmp_path)
+    log = Path(job.model) / "log.txt"
+    worker = start_worker(tmp_path)
+    try:
+        wait_until(lambda: log.is_file() and "slow begins" in log.read_text())
+        wait_until(lambda: queue.get(job.id).progress is not None)
+        running = queue.get(job.id)
+        assert (running.state, running.outcome) == ("running", None)
+        assert worker_is_alive(tmp_path)
+    finally:
+        end(worker)
+    assert not worker_is_alive(tmp_path)
+    worker = start_worker(tmp_path)
+    try:
+        wait_until(lambda: log.read_text().count("slow begins") == 2)
+        (Path(job.model) / "go").touch()
+        wait_until(lambda: queue.get(job.id).state == "done")
+    finally:
+        end(worker)
+    done = queue.get(job.id)
+    assert done.outcome == "succeeded"
+    assert done.progress is not None
+    assert done.progress.share == 1.0
+    assert log.read_text().splitlines() == [
+        "first",
+        "slow begins",
+        "slow begins",
+        "slow ends, first said 42",
+        "last",
+    ]
+
+
+def test_cancelling_stops_the_step_and_failures_carry_their_reason(
+    queue: JobQueue, tmp_path: Path
+) -> None:
+    job, after = submit(queue, tmp_path), submit(queue, tmp_path, "fit")
+    log = Path(job.model) / "log.txt"
+    worker = start_worker(tmp_path)
+    try:
+        wait_until(lambda: log.is_file() and "slow begins" in log.read_text())
+        assert queue.cancel(job.id).outcome == "cancelled"
+        wait_until(lambda: queue.get(after.id).state == "done")
+        worker.terminate()
+        assert worker.wait(10) == 0
+    finally:
+        end(worker)
+    # The step catches Exception: cancellation must not be one.
+    assert log.read_text().splitlines() == ["first", "slow begins"]
+    failed = queue.get(after.id)
+    assert failed.outcome == "failed"
+    assert failed.error is not None
+    assert (failed.error.type, failed.error.detail) == ("ValueError", "this capture has no frames")
+
+
+def test_progress_is_throttled_but_never_late_at_the_end(tmp_path: Path) -> None:
+    now, asked = [0.0], [0]
+
+    def interrupted() -> JobInterrupted | None:
+        asked[0] += 1
+        return JobCancelled("stop") if now[0] > 100 else None
+
+    progress = StepProgress(
+        tmp_path, "job-1", "b", ("a", "b"), interrupted, every=0.2, clock=lambda: now[0]
+    )
+    progress("early", 0.1)
+    now[0] = 0.1
+    progress("too soon", 0.2)
+    told = read_progress(tmp_path, "job-1")
+    assert told is not None
+    assert (told.what, told.step_share, asked[0]) == ("early", 0.1, 1)
+    assert told.share == pytest.approx(0.55)
+    progress("end", 1.0)
+    told = read_progress(tmp_path, "job-1")
+    assert told is not None
+    assert (told.what, told.share) == ("end", 1.0)
+    assert read_progress(tmp_path, "another job") is None
+    now[0] = 101.0
+    with pytest.raises(JobCancelled):
+        progress("more", 0.3)
+
+
+def test_workers_of_one_root_have_names_of_their_own(tmp_path: Path) -> None:
+    assert not worker_is_alive(tmp_path)
+    first, second = WorkerSlot(tmp_path), WorkerSlot(tmp_path)
+    assert (first.name, second.name) == ("worker-0", "worker-1")
+    first.release()
+    third = WorkerSlot(tmp_path)
+    assert third.name == "worker-0"
+    for slot in (second, third):
+        slot.release()
