@@ -55,7 +55,7 @@ class RigConditioning:
 def ray_plane_angles(
     camera: Camera, projector: Projector, points: ArrayLike
 ) -> NDArray[np.float64]:
-    """Angles `(N,)` in [0, π/2] between the camera's rays to `points (N, 3)` and their light planes.
+    """Angles `(N,)` in [0, π/2] between the camera's rays to `points (N, 3)` and the planes.
 
     The plane of a point is that of the (fractional) row that lights it. Near 0 the depth along the
     ray is worthless: its deviation grows with 1 / sin(angle).
@@ -68,7 +68,7 @@ def ray_plane_angles(
 
 
 def row_pitch(projector: Projector, points: ArrayLike) -> NDArray[np.float64]:
-    """Distance `(N,)` across the light plane from one row to the next at `points (N, 3)`, metres."""
+    """Distance `(N,)` across the light plane between rows at `points (N, 3)`, metres."""
     points = np.asarray(points, float).reshape(-1, 3)
     y = (points @ projector.R.T + projector.t)[:, 1:]
     # the plane turns by d(atan y/z) per row about the projector's x axis
@@ -77,7 +77,7 @@ def row_pitch(projector: Projector, points: ArrayLike) -> NDArray[np.float64]:
 
 
 def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigConditioning:
-    """Conditioning of every camera with every projector on a sphere of `radius` metres at the origin.
+    """Conditioning of every camera with every projector on a sphere of `radius` metres.
 
     Self-shadowing is the sphere's own: a point counts where it faces both devices and lies in both
     pictures. Raises `ValueError` for a rig without projectors, which has nothing to triangulate.

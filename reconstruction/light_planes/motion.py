@@ -15,15 +15,15 @@ Between = Literal["interpolate", "hold"]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Rigid motions `x -> rotation @ x + translation` from the reference pose to each tracking frame.
+    """Rigid motions `x -> rotation @ x + translation` from the reference pose.
 
-    steps (T,)            `Step.index` of the tracking frames, ascending
+    steps (T,)            `Step.index` of the tracking frames at whose time they hold, ascending
     rotations (T, 3, 3), translations (T, 3) in metres
     between               what holds between tracking frames: "interpolate" (rotation on SO(3),
                           translation linearly) suits people, "hold" a subject that only moves at
                           tracking frames
     still                 nothing moved by more than the noise of the measurement
-    determined            directions of motion (of 6) that the cameras determine, the least over frames
+    determined            directions of motion, of 6, that the cameras determine: the least over frames
     """
 
     steps: NDArray[np.int64]

@@ -79,7 +79,7 @@ def find_peaks(
     window = scan.window[layer, :, y, x].astype(np.float64)
     value, at = scan.value[found].astype(np.float64), scan.at[found]
     noise = scan.noise()
-    row, deviation, correlation, amplitude = fit_stripes(window, device, noise)
+    offset, deviation, correlation, amplitude = fit_stripes(window, device, noise)
     share = amplitude / np.maximum(np.maximum(scan.total[y, x], value), amplitude)
     saturated = scan.clipped[found]
     deviation[saturated] = np.maximum(deviation[saturated], 0.3)
@@ -91,7 +91,7 @@ def find_peaks(
         camera,
         projector,
         np.stack([x, y], axis=1)[keep],
-        (at + row)[keep],
+        (at + offset)[keep],
         deviation[keep],
         value[keep],
         steps[at[keep]] if keep.any() else np.zeros(0, np.int64),

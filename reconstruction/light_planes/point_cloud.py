@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,7 +47,7 @@ class PointCloud:
     def __post_init__(self) -> None:
         n = len(self.points)
         for name, (shape, kind) in _COLUMNS.items():
-            value = np.ascontiguousarray(getattr(self, name), dtype=kind)
+            value: NDArray[Any] = np.ascontiguousarray(getattr(self, name), dtype=kind)
             if value.shape != (n, *shape):
                 raise ValueError(f"point cloud: {name} must be {(n, *shape)}, got {value.shape}")
             if not np.isfinite(value).all():
@@ -59,7 +60,9 @@ class PointCloud:
     @classmethod
     def empty(cls, cameras: tuple[str, ...], projectors: tuple[str, ...]) -> PointCloud:
         """A cloud without points."""
-        columns = {k: np.zeros((0, *shape), kind) for k, (shape, kind) in _COLUMNS.items()}
+        columns: dict[str, NDArray[Any]] = {
+            k: np.zeros((0, *shape), kind) for k, (shape, kind) in _COLUMNS.items()
+        }
         return cls(**columns, cameras=cameras, projectors=projectors)
 
     @classmethod
@@ -105,8 +108,10 @@ class PointCloud:
             if missing:
                 raise ValueError(f"{path}: not a point cloud, {missing} are missing")
             columns = {k: data[k] for k in _COLUMNS}
-            names = {k: tuple(str(n) for n in data[k]) for k in ("cameras", "projectors")}
-        return cls(**columns, **names)
+            cameras, projectors = (
+                tuple(str(n) for n in data[k]) for k in ("cameras", "projectors")
+            )
+        return cls(**columns, cameras=cameras, projectors=projectors)
 
 
 _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {

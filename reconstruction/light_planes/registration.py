@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 class Registration:
     """A 2D rigid motion: pixel `p` of the reference is at `c + R(angle) (p - c) + shift`.
 
-    `centre (2,)` and `shift (2,)` in pixels, `angle` in radians from +x towards +y. `deviation (3,)`
-    is that of shift x, shift y (pixels) and angle from the residual; `lever` (pixels) is the rms
+    `centre (2,)` and `shift (2,)` in pixels, `angle` in radians from +x towards +y. `deviation
+    (3,)` is that of shift x, shift y (pixels) and angle from the residual; `lever` (pixels) is the rms
     distance of the used pixels from the centre, which turns angles into pixels.
     """
 
@@ -33,7 +33,8 @@ class Registration:
 
     def noise(self) -> float:
         """Deviation of `largest`, pixels."""
-        return float(max(self.deviation[:2].max(), self.deviation[2] * self.lever))
+        x, y, angle = (float(v) for v in self.deviation)
+        return max(x, y, angle * self.lever)
 
 
 class Template:

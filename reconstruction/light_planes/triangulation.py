@@ -29,7 +29,7 @@ class TriangulateOptions:
     largest standard deviation along the ray. `hull_margin` (pixels): how far outside a silhouette a
     point may project. `neighbours`, `isolation`: see `consensus.supported`. `fuse`: points of one
     pixel that agree become one. `flatten`: use each neighbourhood's plane, see
-    `consensus.flatten`; `radius` (metres) is its size, `roughness` (metres) how far fibres lie off it.
+    `consensus.flatten`; `radius` (metres) is its size, `roughness` (metres) how far fibres lie off.
     """
 
     peaks: PeakOptions = field(default_factory=PeakOptions)
