@@ -4,10 +4,11 @@ capture/
   rig.json        calibrated geometry (`Rig.to_dict`)
   plan.json       {"steps": [Step, ...], ...}: the commanded sequence
   journal.jsonl   append-only, fsynced: one line per frame, shot or missing
-  frames/00012/cam_00.exr
+  frames/00012/cam_00.exr    (cam_00.zip.exr once compressed)
   masks/cam_00.png    hair masks from the user, optional
   head.obj            the digitised head, optional
-  manifest.json   written last: state, counts and a checksum for every file
+  manifest.json   written last: state, outcome, counts, checksums of the small files and of the
+                  journal, whose lines hold the frames' checksums
 """
 
 from __future__ import annotations

@@ -95,11 +95,20 @@ def off_on_exit(close: Callable[[], None]) -> Callable[[], None]:
     SIGTERM is turned into `SystemExit` where nobody else handles it; a server that does handle
     it ends in `atexit` as well.
     """
-    atexit.register(close)
-    if (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    ):
-        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
 
-    return lambda: atexit.unregister(close)
+    def terminate(number: int, _frame: object) -> None:
+        sys.exit(128 + number)
+
+    atexit.register(close)
+    main = threading.current_thread() is threading.main_thread()
+    mine = main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if mine:
+        signal.signal(signal.SIGTERM, terminate)
+
+    def undo() -> None:
+        atexit.unregister(close)
+        still_main = threading.current_thread() is threading.main_thread()
+        if mine and still_main and signal.getsignal(signal.SIGTERM) is terminate:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    return undo
