@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import httpx
 
@@ -16,11 +16,17 @@ DEFAULT_URL = "http://127.0.0.1:8331"
 
 
 class Service:
-    """A running service. Its problem documents become `CommandError`s."""
+    """A running service, for the length of a with-block. Its problems become `CommandError`s."""
 
     def __init__(self, url: str | None = None) -> None:
         self.url = url or os.environ.get("HAIRSTAGE_URL") or DEFAULT_URL
         self._http = httpx.Client(base_url=self.url, timeout=60.0, trust_env=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._http.close()
 
     def get(self, path: str) -> Any:
         """The JSON at `path`."""

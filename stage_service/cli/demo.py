@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 from reconstruction.rig import Rig
 from stage_service.cli.children import Children, own_command, simulator_command
@@ -35,36 +36,9 @@ def demo(args: argparse.Namespace, output: Output) -> int:
 
     with Children(out / "logs") as children:
         output.note(f"starting simulated rig, service and worker; their logs: {out / 'logs'}")
-        service = _start(children, args)
-        cost = service.post("/plans:validate", {})
-        output.note(
-            f"the capture takes {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB and, on real "
-            f"devices, {cost['seconds']:.0f} s; a simulated rig renders each frame"
-        )
-        options = {**held_out, "environment": args.environment, "seed": args.seed}
-        capture = service.post(
-            "/captures",
-            {
-                "plan": {},
-                "head": str((out / "truth" / "head.obj").resolve()),
-                "pipeline": {"name": "light_planes", "options": options},
-            },
-        )
-        with progress_bar("capture") as progress:
-            capture = service.follow_capture(capture["id"], progress, children.check)
-        _link(out / "capture", Path(capture["path"]))
-        if capture["outcome"] != "completed":
-            raise CommandError(f"the capture {capture['outcome']}: {capture['error']}", FAILED)
-        with progress_bar("job") as progress:
-            job = service.follow_job(capture["job"], progress, children.check)
-        _link(out / "model", Path(job["model"]))
-        if job["outcome"] != "succeeded":
-            why = job["error"]["detail"] if job["error"] else job["outcome"]
-            raise CommandError(
-                f"the job failed in its step {job['progress']['step']}: {why}; its log is "
-                f"{children.log('worker')}",
-                FAILED,
-            )
+        with Service(_start(children, args)) as service:
+            capture = _capture(children, service, args, held_out, output)
+            job = _job(children, service, capture["job"], out)
         memory = children.peak_memory_gb()
 
     with progress_bar("evaluate") as progress:
@@ -82,8 +56,49 @@ def demo(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def _start(children: Children, args: argparse.Namespace) -> Service:
-    """Start the three processes as a user would, and wait until each is ready."""
+def _capture(
+    children: Children,
+    service: Service,
+    args: argparse.Namespace,
+    held_out: dict[str, list[str]],
+    output: Output,
+) -> dict[str, Any]:
+    """Make the capture; its completion enqueues the job."""
+    cost = service.post("/plans:validate", {})
+    output.note(
+        f"the capture takes {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB and, on real "
+        f"devices, {cost['seconds']:.0f} s; a simulated rig renders each frame"
+    )
+    options = {**held_out, "environment": args.environment, "seed": args.seed}
+    body: dict[str, Any] = {"plan": {}, "pipeline": {"name": "light_planes", "options": options}}
+    head: Path = args.out / "truth" / "head.obj"
+    if head.is_file():
+        body["head"] = str(head.resolve())
+    capture = service.post("/captures", body)
+    with progress_bar("capture") as progress:
+        capture = service.follow_capture(capture["id"], progress, children.check)
+    _link(args.out / "capture", Path(capture["path"]))
+    if capture["outcome"] != "completed":
+        raise CommandError(f"the capture {capture['outcome']}: {capture['error']}", FAILED)
+    return capture
+
+
+def _job(children: Children, service: Service, job_id: str, out: Path) -> dict[str, Any]:
+    """Follow the job to its end."""
+    with progress_bar("job") as progress:
+        job = service.follow_job(job_id, progress, children.check)
+    _link(out / "model", Path(job["model"]))
+    if job["outcome"] != "succeeded":
+        step = job["progress"]["step"] if job["progress"] else "first"
+        why = job["error"]["detail"] if job["error"] else job["outcome"]
+        raise CommandError(
+            f"the job failed in its {step} step: {why}; its log is {children.log('worker')}", FAILED
+        )
+    return job
+
+
+def _start(children: Children, args: argparse.Namespace) -> str:
+    """Start the three processes as a user would; returns the URL when all are ready."""
     out: Path = args.out
     state = out / "simulated"
     simulators = children.start(
@@ -96,9 +111,9 @@ def _start(children: Children, args: argparse.Namespace) -> Service:
     )
     service = children.start("service", serve, answers=True)
     worker = children.start("worker", own_command("worker", "--json", "--root", out), answers=True)
-    url = children.first_line("service", service, 60)["url"]
+    url: str = children.first_line("service", service, 60)["url"]
     children.first_line("worker", worker, 60)
-    return Service(url)
+    return url
 
 
 def _held_out(rig: Rig, camera: str | None) -> dict[str, list[str]]:

@@ -13,6 +13,8 @@ from reconstruction.capture import Capture
 from reconstruction.report import Progress
 from stage_service.jobs.geometry import evaluate_geometry
 
+GROUPS = ("held_out_lights", "held_out_camera")
+
 FILES = {
     "strands": ("strands.npz", "strands.hair", "strands.usdc"),
     "appearance": ("appearance.json",),
@@ -29,7 +31,11 @@ def gather(
     """Judge the model against the simulated truth and gather the job's own figures."""
     model = out / "model"
     geometry = evaluate_geometry(
-        Capture(out / "capture"), model, out / "truth" / "strands.npz", progress=progress
+        Capture(out / "capture"),
+        model,
+        out / "truth" / "strands.npz",
+        held_out_cameras=job["options"]["held_out_cameras"],
+        progress=progress,
     )
     controls = geometry.pop("controls")
     results = json.loads((model / "results.json").read_text())
@@ -42,7 +48,7 @@ def gather(
         "stages": results["stages"],
         "geometry": geometry,
         "controls": controls,
-        "images": results["images"],
+        "images": {k: v for k, v in results["images"].items() if k in GROUPS},
         "appearance": _appearance(model, out / "truth" / "appearance.json"),
         "files": {
             "capture": "capture",
@@ -86,12 +92,9 @@ def figures_table(results: dict[str, Any], out: Path) -> Any:
 
     geometry = geometry_table({"ours": results["geometry"], **results["controls"]})
     images = Table("pictures (PSNR dB / SSIM)", "held-out lights", "held-out camera")
-    names = {name for group in results["images"].values() for name in _judged(group)}
-    for name in sorted(names, key=lambda n: (n != "ours", n)):
-        cells = [_judged(results["images"].get(g, {})).get(name) for g in GROUPS]
-        images.add_row(
-            name, *("–" if c is None else f"{c['psnr']:.2f} / {c['ssim']:.4f}" for c in cells)
-        )
+    for name in results["images"][GROUPS[0]]:
+        scores = [results["images"][group][name] for group in GROUPS]
+        images.add_row(name, *(f"{s['psnr']:.2f} / {s['ssim']:.4f}" for s in scores))
     fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]
     hair = Table("appearance", "fitted", "true")
     for key, what in (
@@ -111,15 +114,6 @@ def figures_table(results: dict[str, Any], out: Path) -> Any:
         f"everything is in {out}: results.json, capture/, model/ (strands, appearance, pictures, "
         "report.json, plots/), truth/, logs/",
     )
-
-
-GROUPS = ("held_out_lights", "held_out_camera")
-
-
-def _judged(group: Any) -> dict[str, dict[str, float]]:
-    if not isinstance(group, dict):
-        return {}
-    return {k: v for k, v in group.items() if isinstance(v, dict) and {"psnr", "ssim"} <= set(v)}
 
 
 def _numbers(value: Any) -> str:

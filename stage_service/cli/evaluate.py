@@ -88,7 +88,8 @@ def geometry_table(rows: dict[str, dict[str, Any]]) -> Any:
 
     thresholds = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
     heads = [t.replace("mm_", " mm/").replace("deg", "°") for t in thresholds]
-    table = Table("strands against the true ones (%)", "over", *(f"{h}  P / R / F" for h in heads))
+    title = "Strands against the true ones: precision / recall / F, %"
+    table = Table("strands", "over", *heads, title=title)
     for name, figures in rows.items():
         for over in ("visible", "all"):
             if over in figures:

@@ -48,7 +48,9 @@ class Output:
         from rich.console import Console
 
         shown = json.dumps(data, indent=1, allow_nan=False) if text is None else text
-        Console(soft_wrap=True, highlight=False).print(shown, markup=False)
+        # A table in a file or a log has no window to fit.
+        width = None if sys.stdout.isatty() else 120
+        Console(width=width, highlight=False).print(shown, markup=False, soft_wrap=True)
 
     def error(self, kind: str, detail: str, **more: Any) -> None:
         """Say what went wrong: on stderr, and with --json as the one object on stdout too."""

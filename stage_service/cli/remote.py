@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.output import (
     BAD_INPUT,
@@ -13,11 +14,15 @@ from stage_service.cli.output import (
     CommandError,
     Commands,
     Output,
-    Run,
     add_command,
     add_group,
     progress_bar,
 )
+
+if TYPE_CHECKING:
+    from stage_service.cli.client import Service
+
+RemoteRun = Callable[[argparse.Namespace, Output, "Service"], int]
 
 
 def add(commands: Commands) -> None:
@@ -32,9 +37,9 @@ def add(commands: Commands) -> None:
     _pipeline(start.add_argument("--pipeline", help="job to enqueue when the capture completes"))
     start.add_argument("--options", help="the pipeline's options: JSON or a JSON file")
     start.add_argument("--wait", action="store_true", help="wait for capture and job")
-    _remote(capture, "list", run_list_captures, "list captures")
+    _remote(capture, "list", run_list_captures, "list captures, oldest first")
     for action, what in (
-        ("show", "show a capture"),
+        ("show", "show where a capture is"),
         ("pause", "pause at the next step"),
         ("resume", "go on after a pause"),
         ("abort", "abort at the next step, lights off"),
@@ -50,7 +55,7 @@ def add(commands: Commands) -> None:
     submit.add_argument("--wait", action="store_true", help="wait until the job is done")
     _remote(jobs, "list", run_list_jobs, "list jobs, newest first")
     for action, what in (
-        ("show", "show a job"),
+        ("show", "show where a job is"),
         ("wait", "wait until a job is done"),
         ("cancel", "cancel a job"),
         ("report", "print a job's report"),
@@ -59,15 +64,14 @@ def add(commands: Commands) -> None:
         _remote(jobs, action, run_job_action, what).add_argument("job", help="its id")
 
 
-def run_check(args: argparse.Namespace, output: Output) -> int:
+def run_check(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Cost a plan."""
-    output.result(_service(args).post("/plans:validate", _read_json(args.plan)))
+    output.result(service.post("/plans:validate", _read_json(args.plan)))
     return 0
 
 
-def run_start(args: argparse.Namespace, output: Output) -> int:
+def run_start(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Begin a capture, and wait for it where asked."""
-    service = _service(args)
     body: dict[str, Any] = {"plan": _read_json(args.plan)}
     for field in ("head", "masks"):
         if getattr(args, field) is not None:
@@ -89,9 +93,9 @@ def run_start(args: argparse.Namespace, output: Output) -> int:
     return _wait(service, capture["job"], output, {"capture": capture})
 
 
-def run_list_captures(args: argparse.Namespace, output: Output) -> int:
+def run_list_captures(args: argparse.Namespace, output: Output, service: Service) -> int:
     """List captures."""
-    captures = _service(args).get("/captures")
+    captures = service.get("/captures")
     lines = [
         f"{c['id']}  {c['outcome'] or c['state']}  {c['frames_written']}/{c['frames_planned']} "
         f"frames  {c['path']}"
@@ -101,9 +105,8 @@ def run_list_captures(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def run_capture_action(args: argparse.Namespace, output: Output) -> int:
+def run_capture_action(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Show, pause, resume or abort."""
-    service = _service(args)
     path = f"/captures/{args.capture}"
     output.result(
         service.get(path) if args.action == "show" else service.post(f"{path}/{args.action}")
@@ -111,9 +114,8 @@ def run_capture_action(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def run_submit(args: argparse.Namespace, output: Output) -> int:
+def run_submit(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Enqueue a job."""
-    service = _service(args)
     body = {
         "capture": args.capture,
         "pipeline": {"name": args.pipeline, "options": _options(args.options)},
@@ -126,17 +128,16 @@ def run_submit(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def run_list_jobs(args: argparse.Namespace, output: Output) -> int:
+def run_list_jobs(args: argparse.Namespace, output: Output, service: Service) -> int:
     """List jobs."""
-    jobs = _service(args).get("/jobs")
+    jobs = service.get("/jobs")
     lines = [f"{j['id']}  {j['pipeline']}  {j['outcome'] or j['state']}" for j in jobs]
     output.result({"jobs": jobs}, "\n".join(lines) or "no jobs")
     return 0
 
 
-def run_job_action(args: argparse.Namespace, output: Output) -> int:
+def run_job_action(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Show, wait for, cancel, or read what a job left."""
-    service = _service(args)
     path = f"/jobs/{args.job}"
     if args.action == "wait":
         return _wait(service, args.job, output, {})
@@ -151,7 +152,7 @@ def run_job_action(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def _wait(service: Any, job: str, output: Output, more: dict[str, Any]) -> int:
+def _wait(service: Service, job: str, output: Output, more: dict[str, Any]) -> int:
     with progress_bar("job") as progress:
         done = service.follow_job(job, progress)
     why = f": {done['error']['detail']}" if done["error"] else ""
@@ -159,8 +160,14 @@ def _wait(service: Any, job: str, output: Output, more: dict[str, Any]) -> int:
     return 0 if done["outcome"] == "succeeded" else FAILED
 
 
-def _remote(group: Commands, name: str, run: Run, help: str) -> argparse.ArgumentParser:
-    parser = add_command(group, name, run, help)
+def _remote(group: Commands, name: str, run: RemoteRun, help: str) -> argparse.ArgumentParser:
+    def connected(args: argparse.Namespace, output: Output) -> int:
+        from stage_service.cli.client import Service
+
+        with Service(args.url) as service:
+            return run(args, output, service)
+
+    parser = add_command(group, name, connected, help)
     parser.add_argument("--url", help="the service's URL (also: HAIRSTAGE_URL)")
     return parser
 
@@ -169,12 +176,6 @@ def _pipeline(action: argparse.Action) -> None:
     from stage_service.jobs.pipelines import PIPELINES
 
     action.choices = sorted(PIPELINES)
-
-
-def _service(args: argparse.Namespace) -> Any:
-    from stage_service.cli.client import Service
-
-    return Service(args.url)
 
 
 def _read_json(path: Path | None) -> Any:

@@ -2,36 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from reconstruction.capture import Capture
 from reconstruction.report import Progress, silent
+from reconstruction.strands import Strands
 
 
 def evaluate_geometry(
-    capture: Capture, model: Path, truth: Path, *, seed: int = 0, progress: Progress = silent
+    capture: Capture,
+    model: Path,
+    truth: Path,
+    *,
+    held_out_cameras: Sequence[str] = (),
+    seed: int = 0,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Score `model`'s strands and both hull controls against the strand file `truth`.
 
     Returns `{visible, all}` of ours and `controls.{hull_vertical, hull_smooth_field}` with the same
-    two. The true strands stand where the subject stood during the OLAT pass.
+    two. The true strands stand where the subject stood during the OLAT pass. The controls get the
+    masks that the reconstruction had: those of the cameras that are not held out.
     """
-    from reconstruction.controls import hull_smooth_field, hull_vertical
+    from appearance.observations import model_mask
+    from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
     from reconstruction.evaluation import compare_strands
     from reconstruction.strand_files import read_strands
 
     true = read_strands(truth)
     cameras, head = capture.rig.cameras, capture.head
 
-    def score(strands: Any) -> dict[str, Any]:
+    def score(strands: Strands) -> dict[str, Any]:
         return compare_strands(strands, true, cameras=cameras, head=head, seed=seed)
 
     progress("our strands against the true ones", 0.0)
     figures = score(read_strands(model / "strands.npz"))
-    controls = {}
-    for i, control in enumerate((hull_vertical, hull_smooth_field)):
-        name = control.__name__
-        progress(f"control: {name}", (i + 1) / 3)
-        controls[name] = score(control(capture, model))
+    progress("control: the hull filled with vertical lines", 0.3)
+    used = [c for c in cameras if c.name not in held_out_cameras]
+    masks = {c.name: model_mask(model, c.name, "hair", capture) for c in used}
+    hull = control_hull(used, masks, head)
+    controls = {"hull_vertical": score(hull_vertical(hull))}
+    progress("control: the hull filled with the smooth field of its surface", 0.6)
+    controls["hull_smooth_field"] = score(hull_smooth_field(hull, head))
+    progress("judged", 1.0)
     return {**figures, "controls": controls}

@@ -81,6 +81,7 @@ def assess(context: StepContext) -> Figures:
         context.model,
         held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
         environment=context.options.environment,
+        seed=context.options.seed,
         progress=context.progress,
     )
 
@@ -95,6 +96,7 @@ def evaluate(context: StepContext) -> Figures:
         Capture(context.capture),
         context.model,
         Path(context.options.truth),
+        held_out_cameras=context.options.held_out_cameras,
         seed=context.options.seed,
         progress=context.progress,
     )
