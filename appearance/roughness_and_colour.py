@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar, nnls
 
-from appearance.hair_appearance import HairAppearance
+from appearance.hair_appearance import DiffuseHair, HairAppearance
 from appearance.longitudinal import (
     absorption_of_colour,
     roughness_of_variance,
@@ -172,6 +172,23 @@ def fit_colour(
         colour = next_colour(pairs, target)
     best = _with_colour(scene.hair, colour, beta_n)
     return Colours(_rgb(colour), best, _rgb(albedo), _rgb(pairs[0][0]), errors)
+
+
+def fit_diffuse(
+    scene: HairScene, hair: Sequence[Observed], *, iterations: int = 3, spp: int = 16, seed: int = 0
+) -> tuple[float, float, float]:
+    """The albedo of Lambertian fibres on the same strands that gives the captured mean colour.
+
+    Algorithm 1 with the albedo in the place of C: the baseline that a hair BSDF has to beat.
+    """
+    target = _mean_colour(hair)
+    albedo = np.clip(_as_albedo(hair), 0.02, 0.98)
+    pairs: list[tuple[Array, Array]] = []
+    for _ in range(iterations):
+        lit = scene.with_hair(DiffuseHair(_rgb(albedo)))
+        pairs.append((albedo, _mean_colour([_rendered(lit, o, spp, 16, seed) for o in hair])))
+        albedo = next_colour(pairs, target)
+    return _rgb(albedo)
 
 
 def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:

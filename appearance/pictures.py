@@ -1,0 +1,53 @@
+"""Pictures for people: captured beside rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Row = tuple[str, Mapping[str, NDArray[np.floating]], Mapping[str, str]]
+
+
+def comparison_picture(
+    path: Path, rows: Sequence[Row], columns: Sequence[str], *, height: float = 2.6
+) -> None:
+    """Write a PNG of `rows` (label, picture values `(H, W, 3)` by column, captions by column)."""
+    # the object interface: pyplot keeps figures alive and wants a display
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not rows:
+        raise ValueError(f"{path}: nothing to compare: no camera and no light is held out")
+    figure = Figure(
+        figsize=(height * len(columns) + 1.2, (height + 0.25) * len(rows) + 0.3),
+        layout="constrained",
+        facecolor="white",
+    )
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(rows), len(columns), squeeze=False)
+    for i, (label, pictures, captions) in enumerate(rows):
+        for j, column in enumerate(columns):
+            axis = axes[i][j]
+            axis.imshow(np.clip(pictures[column], 0, 1), interpolation="bicubic")
+            axis.set_xticks([])
+            axis.set_yticks([])
+            for spine in axis.spines.values():
+                spine.set_visible(False)
+            if i == 0:
+                axis.set_title(column.replace("_", " "), fontsize=11)
+            if j == 0:
+                axis.set_ylabel(label, fontsize=9)
+            if column in captions:
+                axis.set_xlabel(captions[column], fontsize=8, labelpad=2)
+    figure.savefig(path, dpi=110)
+
+
+def write_png(path: Path, picture: NDArray[np.floating]) -> None:
+    """Write picture values `(H, W, 3)` in [0, 1] as an 8-bit PNG."""
+    values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    if not cv2.imwrite(str(path), values[..., ::-1]):
+        raise OSError(f"{path} cannot be written")
