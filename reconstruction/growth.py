@@ -1,0 +1,188 @@
+"""Strands that follow an orientation field (Photobooth §3.4), and more where it left gaps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.field import OrientationField
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Method = Literal["euler", "midpoint", "rk4"]
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Traced polylines as columns: `points (T, N, 3) float32`, of which path i has `counts[i]`."""
+
+    points: NDArray[np.float32]
+    counts: NDArray[np.int64]
+
+
+def trace(
+    field: OrientationField,
+    starts: NDArray[np.floating],
+    along: NDArray[np.floating],
+    *,
+    step: float = 5e-4,
+    max_length: float = 0.3,
+    method: Method = "midpoint",
+) -> Paths:
+    """Follow the field from `starts (N, 3)`, setting out on the side of `along (N, 3)`.
+
+    Every `step` metres the line's sign is the one that turns least. A path ends where it leaves
+    the envelope or the field has no orientation, and at `max_length` metres. `euler` samples the
+    field once a step, `midpoint` twice, `rk4` four times.
+    """
+    if not step > 0 or not max_length >= step:
+        raise ValueError(f"need 0 < step <= max_length, got {step} and {max_length}")
+    p = np.asarray(starts, float).copy()
+    d, alive = field.sample(p, np.asarray(along, float))
+    alive &= field.voxel(p) >= 0
+    steps = int(np.ceil(max_length / step))
+    rows = [p.astype(np.float32)]
+    counts = np.ones(len(p), np.int64)
+    active = np.flatnonzero(alive)
+    p, d = p[active], d[active]
+    for _ in range(steps):
+        if not len(active):
+            break
+        move, good = _advance(field, p, d, step, method)
+        q = p + step * move
+        d, there = field.sample(q, move)
+        good &= there & (field.voxel(q) >= 0)
+        active, p, d = active[good], q[good], d[good]
+        row = np.zeros((len(starts), 3), np.float32)
+        row[active] = p
+        rows.append(row)
+        counts[active] += 1
+    return Paths(np.stack(rows), counts)
+
+
+def _advance(
+    field: OrientationField, p: Array, d: Array, step: float, method: Method
+) -> tuple[Array, Bools]:
+    """The mean direction `(N, 3)` over one step from `p` where the field points along `d`."""
+    if method == "euler":
+        return d, np.ones(len(p), bool)
+    k2, good = field.sample(p + 0.5 * step * d, d)
+    if method == "midpoint":
+        return np.where(good[:, None], k2, d), np.ones(len(p), bool)
+    k2 = np.where(good[:, None], k2, d)
+    k3, good = field.sample(p + 0.5 * step * k2, d)
+    k3 = np.where(good[:, None], k3, d)
+    k4, good = field.sample(p + step * k3, d)
+    k4 = np.where(good[:, None], k4, d)
+    return (d + 2 * k2 + 2 * k3 + k4) / 6, np.ones(len(p), bool)
+
+
+def to_polylines(paths: Paths) -> list[NDArray[np.float32]]:
+    """The paths as a list of `(n_i, 3)` arrays."""
+    columns = np.ascontiguousarray(paths.points.transpose(1, 0, 2))
+    return [columns[i, :n] for i, n in enumerate(paths.counts)]
+
+
+def grow_from_roots(
+    field: OrientationField,
+    roots: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    *,
+    step: float = 5e-4,
+    max_length: float = 0.3,
+    lift: float = 12e-3,
+    shortest: float = 5e-3,
+    method: Method = "midpoint",
+) -> list[NDArray[np.float32]]:
+    """Strands from `roots (N, 3)`, setting out along the scalp's `normals (N, 3)`.
+
+    A root whose envelope stays clear of the skin is led to it along the normal, by at most `lift`
+    metres. As in Photobooth §3.4 a strand ends at the last measured voxel that it passed; one that
+    stays inside keeps its length instead of being deleted, since what it passes is hair as well.
+    Those shorter than `shortest` metres are not kept.
+    """
+    roots = np.asarray(roots, float)
+    starts, found = roots.copy(), np.zeros(len(roots), bool)
+    for height in np.arange(0, lift, step):
+        p = roots + height * np.asarray(normals)
+        new = ~found & (field.voxel(p) >= 0) & field.sample(p, np.asarray(normals, float))[1]
+        starts[new] = p[new]
+        found |= new
+    which = np.flatnonzero(found)
+    paths = to_polylines(
+        trace(
+            field,
+            starts[which],
+            np.asarray(normals, float)[which],
+            step=step,
+            max_length=max_length,
+            method=method,
+        )
+    )
+    out = []
+    for i, path in zip(which, paths, strict=True):
+        if (len(path) - 1) * step < shortest:
+            continue
+        root = roots[i].astype(np.float32)
+        out.append(path if np.linalg.norm(root - path[0]) < step else np.vstack([root[None], path]))
+    return out
+
+
+class Coverage:
+    """Which voxels of a field's envelope already hold a strand."""
+
+    def __init__(self, field: OrientationField) -> None:
+        self.field = field
+        self.covered = np.zeros(len(field.directions), bool)
+
+    def add(self, points: NDArray[np.floating]) -> None:
+        """Mark the voxels that `points (N, 3)` lie in."""
+        n = self.field.voxel(points)
+        self.covered[n[n >= 0]] = True
+
+    def gaps(self) -> NDArray[np.int64]:
+        """Numbers of the voxels with an orientation and no strand."""
+        return np.flatnonzero(self.field.valid & ~self.covered)
+
+
+def fill_gaps(
+    field: OrientationField,
+    coverage: Coverage,
+    *,
+    seed: int,
+    step: float = 5e-4,
+    max_length: float = 0.3,
+    shortest: float = 0.01,
+    batch: int = 1500,
+    rounds: int = 60,
+) -> list[NDArray[np.float32]]:
+    """Strands through the voxels that no strand passes, traced both ways from random ones.
+
+    Each round starts from at most `batch` of the remaining gaps, so that strands of one round
+    cover the seeds of the next. Paths shorter than `shortest` metres are not kept.
+    """
+    rng = np.random.default_rng(seed)
+    out: list[NDArray[np.float32]] = []
+    spent = np.zeros(len(field.directions), bool)
+    centers = field.grid.centers()
+    for _ in range(rounds):
+        gaps = coverage.gaps()
+        gaps = gaps[~spent[gaps]]
+        if not len(gaps):
+            break
+        chosen = rng.choice(gaps, min(batch, len(gaps)), replace=False)
+        spent[chosen] = True
+        starts = centers[chosen] + field.grid.spacing * rng.uniform(-0.4, 0.4, (len(chosen), 3))
+        d = field.directions[chosen]
+        options = {"step": step, "max_length": max_length}
+        ahead = to_polylines(trace(field, starts, d, **options))
+        behind = to_polylines(trace(field, starts, -d, **options))
+        for a, b in zip(ahead, behind, strict=True):
+            path = np.concatenate([b[:0:-1], a])
+            if (len(path) - 1) * step >= shortest:
+                out.append(path)
+                coverage.add(path)
+    return out

@@ -1,0 +1,317 @@
+"""From a capture folder to strands: every stage of the light-plane method, with its report."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture import Capture, CaptureError
+from reconstruction.envelope import carve, depth_map, inside_mesh, mesh_depth
+from reconstruction.field import FieldOptions, OrientationField, solve_field
+from reconstruction.growth import Coverage, fill_gaps, grow_from_roots
+from reconstruction.light_planes import (
+    Motion,
+    PointCloud,
+    solve_motion,
+    sweep_peaks,
+    triangulate,
+)
+from reconstruction.masks import HairMask, hair_masks
+from reconstruction.measure import MeasureOptions, Measured, measure_tangents
+from reconstruction.mesh import Mesh
+from reconstruction.report import Progress, Report, Stage, silent
+from reconstruction.rig import Rig
+from reconstruction.rooting import root_all
+from reconstruction.scalp import Scalp, find_scalp, sample_roots
+from reconstruction.strand_files import write_strands
+from reconstruction.strands import Strands
+from reconstruction.visual_hull import VoxelGrid, visual_hull
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+HEAD_OF_HAIR = 100_000 * 40e-6
+"""Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """What the reconstruction is asked for.
+
+    `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both
+    in metres; `roots` strands are grown from the scalp, and gaps are filled at `fill` metres.
+    `max_length` (metres) is the hair's, which the user knows. `margin` (metres) is how far in
+    front of the seen surface the envelope reaches. `scalp_normals` holds the field to the scalp's
+    normals as the paper does; hair that lies flat on the head is bent wrongly by that. `radius` of
+    the strands in metres; None takes the one that keeps a head of hair's coverage.
+    `explicit_seconds` of explicit diffusion are run beside the solver for the report.
+    """
+
+    held_out: tuple[str, ...] = ()
+    grid: float = 2e-3
+    step: float = 5e-4
+    roots: int = 8000
+    max_length: float = 0.3
+    margin: float = 2e-3
+    least_confidence: float = 0.1
+    scalp_normals: bool = False
+    spacing: float = 2e-3
+    radius: float | None = None
+    seed: int = 0
+    explicit_seconds: float = 1.0
+    measure: MeasureOptions = MeasureOptions()  # noqa: RUF009  frozen
+
+
+def reconstruct(
+    capture: Capture,
+    model: Path,
+    *,
+    method: Literal["light_planes"] = "light_planes",
+    options: ReconstructOptions = ReconstructOptions(),  # noqa: B008  frozen
+    progress: Progress = silent,
+) -> Report:
+    """Reconstruct the strands of `capture` into the folder `model`.
+
+    Writes `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`, `masks/*.png` and
+    `report.json`, whose stages of the same name are replaced. Raises `CaptureError` where the
+    capture lacks what the method cannot do without: OLAT frames, a head, two cameras.
+    """
+    if method != "light_planes":
+        raise ValueError(f"unknown method {method!r}; there is 'light_planes'")
+    capture = _without(capture, options.held_out)
+    head = capture.head
+    if head is None:
+        raise CaptureError(f"{capture.path}: no head.obj: strands need a scalp to be rooted on")
+    model = Path(model)
+    (model / "masks").mkdir(parents=True, exist_ok=True)
+    report = Report.load(model / "report.json")
+
+    with report.stage("triangulation") as stage:
+        cloud = _points(capture, report, stage, progress)
+        cloud.save(model / "points.npz")
+    with report.stage("masks") as stage:
+        masks = hair_masks(capture, cloud if len(cloud) else None, head)
+        for name, mask in masks.items():
+            cv2.imwrite(str(model / "masks" / f"{name}.png"), mask.hair.astype(np.uint8) * 255)
+        stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
+    with report.stage("envelope") as stage:
+        envelope, depths = build_envelope(capture, cloud, masks, head, options, stage)
+    with report.stage("orientation") as stage:
+        measured = measure_tangents(
+            capture, cloud.points, masks, depths, envelope, options.measure, stage, progress
+        )
+    with report.stage("field") as stage:
+        scalp = find_scalp(head, envelope)
+        field = _field(envelope, measured, scalp, options, stage)
+    with report.stage("strands") as stage:
+        strands = grow(field, scalp, options, stage, progress)
+        for suffix in ("npz", "hair", "usdc"):
+            write_strands(model / f"strands.{suffix}", strands)
+    report.save(model / "report.json")
+    return report
+
+
+def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
+    """The capture as if it had never had these cameras."""
+    for name in cameras:
+        capture.rig.camera(name)
+    out = copy.copy(capture)
+    rig = capture.rig
+    left = tuple(c for c in rig.cameras if c.name not in cameras)
+    if len(left) < 2:
+        raise CaptureError(f"{capture.path}: {len(left)} cameras are left, at least 2 are needed")
+    out.rig = Rig(rig.name, left, rig.lights, rig.projectors)
+    return out
+
+
+def _points(capture: Capture, report: Report, stage: Stage, progress: Progress) -> PointCloud:
+    """Triangulated points in the reference pose; none where there was no sweep."""
+    names = tuple(c.name for c in capture.rig.cameras)
+    if not capture.of_kind("scanline"):
+        why = "the rig has no projector" if not capture.rig.projectors else "no sweep was shot"
+        stage.leave_out("triangulation and motion", why, "the scanline sweep and its solve")
+        return PointCloud.empty(names, tuple(p.name for p in capture.rig.projectors))
+    peaks = sweep_peaks(capture, progress=progress)
+    first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
+    with report.stage("motion") as motion_stage:
+        motion: Motion = solve_motion(capture, first, progress=progress, stage=motion_stage)
+    return triangulate(
+        capture,
+        motion=None if motion.still else motion,
+        peaks=peaks,
+        progress=progress,
+        stage=stage,
+    )
+
+
+def build_envelope(
+    capture: Capture,
+    cloud: PointCloud,
+    masks: Mapping[str, HairMask],
+    head: Mesh,
+    options: ReconstructOptions,
+    stage: Stage,
+) -> tuple[VoxelGrid, dict[str, Array]]:
+    """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels.
+
+    The visual hull of everything that is not background, less the head's inside, less what a
+    camera saw through: voxels in front of a triangulated hair pixel, or of the head where the
+    pixel shows skin. Without a sweep, hair pixels carve nothing, and their depth is where the
+    ray enters the envelope.
+    """
+    cameras = [c for c in capture.rig.cameras if c.name in masks]
+    bounds = _bounds(cloud, head)
+    hull = visual_hull(
+        cameras, {k: m.silhouette for k, m in masks.items()}, spacing=options.grid, bounds=bounds
+    )
+    surfaces, depths = {}, {}
+    for camera in cameras:
+        mask = masks[camera.name]
+        skin = mesh_depth(camera, head)
+        own = cloud.of_camera(camera.name).points if len(cloud) else cloud.points
+        depth = np.where(mask.hair, depth_map(camera, own), 0.0)
+        first = np.where(mask.hair, depth, np.where(np.isfinite(skin), skin, 0.0))
+        surfaces[camera.name], depths[camera.name] = first, depth
+    carved = carve(hull, cameras, surfaces, options.margin)
+    inside = carved.inside & ~inside_mesh(hull, head)
+    envelope = replace(carved, inside=inside)
+    for camera in cameras:
+        depth, mask = depths[camera.name], masks[camera.name].hair
+        entry = depth_map_first(camera, envelope)
+        depths[camera.name] = np.where(mask & (depth == 0), entry, depth)
+    litres = 1e3 * options.grid**3
+    stage.figures.update(
+        hull_litres=float(hull.inside.sum() * litres),
+        carved_litres=float(carved.inside.sum() * litres),
+        envelope_litres=float(inside.sum() * litres),
+        voxels=int(inside.sum()),
+        shape=list(inside.shape),
+    )
+    stage.leave_out(
+        "voxels outside the envelope",
+        "no hair can be there",
+        f"{inside.size - int(inside.sum())} of {inside.size} unknowns",
+    )
+    if not inside.any():
+        raise CaptureError(
+            f"{capture.path}: no volume is left for hair: check masks, head.obj and poses"
+        )
+    return envelope, depths
+
+
+def depth_map_first(camera: object, envelope: VoxelGrid) -> Array:
+    """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
+    from reconstruction.cameras import Camera
+
+    assert isinstance(camera, Camera)
+    pixels, depth = camera.project(envelope.centers())
+    ok = (depth > 0) & camera.inside(pixels)
+    x, y = np.rint(pixels[ok]).astype(int).T
+    out = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(out, (y, x), depth[ok])
+    return np.where(np.isfinite(out), out, 0.0)
+
+
+def _bounds(cloud: PointCloud, head: Mesh) -> Array:
+    """A box `(2, 3)` that holds the hair: the points', or 12 cm about the head's upper part."""
+    if len(cloud) >= 100:
+        low, high = np.percentile(cloud.points, [0.1, 99.9], axis=0)
+        return np.stack([low - 0.015, high + 0.015])
+    top = head.vertices[:, 2].max()
+    upper = head.vertices[head.vertices[:, 2] > top - 0.25]
+    return np.stack([upper.min(axis=0) - 0.12, upper.max(axis=0) + 0.12])
+
+
+def _field(
+    envelope: VoxelGrid,
+    measured: Measured,
+    scalp: Scalp,
+    options: ReconstructOptions,
+    stage: Stage,
+) -> OrientationField:
+    keep = measured.confidence >= options.least_confidence
+    if not keep.any():
+        raise CaptureError("no hair pixel has a direction: are the OLAT frames in focus and lit?")
+    field, series = solve_field(
+        envelope,
+        measured.points[keep],
+        measured.directions[keep],
+        measured.confidence[keep],
+        (scalp.points, scalp.normals) if options.scalp_normals else None,
+        FieldOptions(explicit_seconds=options.explicit_seconds),
+    )
+    stage.series += series
+    stage.figures.update(
+        unknowns=int((~field.measured).sum()),
+        measured_voxels=int(field.measured.sum()),
+        empty_voxels=int(field.empty.sum()),
+        degenerate_voxels=int(field.degenerate.sum()),
+        scalp_cm2=scalp.area * 1e4,
+        scalp_marked=scalp.marked,
+    )
+    if not options.scalp_normals:
+        stage.leave_out(
+            "scalp normals as boundary data",
+            "hair that lies on the head leaves the scalp almost flat: on Sintel's groom the "
+            "normals raise the inner error from 7 to 12 degrees",
+            "nothing in time",
+        )
+    if field.empty.any():
+        stage.warn(f"{int(field.empty.sum())} voxels hang together with no measurement: left empty")
+    return field
+
+
+def grow(
+    field: OrientationField,
+    scalp: Scalp,
+    options: ReconstructOptions,
+    stage: Stage,
+    progress: Progress = silent,
+) -> Strands:
+    """Strands from the scalp, then through the gaps that those leave, all of them rooted."""
+    roots, normals = sample_roots(scalp, options.roots, options.seed)
+    progress("growing strands", 0.1)
+    rooted = grow_from_roots(
+        field, roots, normals, step=options.step, max_length=options.max_length
+    )
+    coverage = Coverage(field)
+    for path in rooted:
+        coverage.add(path)
+    share = float(coverage.covered[field.valid].mean())
+    progress("filling gaps", 0.4)
+    loose = fill_gaps(
+        field, coverage, seed=options.seed, step=options.step, max_length=options.max_length
+    )
+    filled = float(coverage.covered[field.valid].mean())
+    progress("rooting strands", 0.7)
+    result = root_all(rooted, loose, scalp)
+    if not result.strands:
+        raise CaptureError("no strand could be grown: the envelope does not reach the scalp")
+    radius = options.radius
+    if radius is None:
+        radius = float(np.clip(HEAD_OF_HAIR / len(result.strands), 4e-5, 4e-4))
+    strands = Strands.from_list(result.strands, radius).resampled(options.spacing)
+    stage.figures.update(
+        strands=len(strands),
+        from_roots=len(rooted),
+        roots_without_strand=options.roots - len(rooted),
+        through_gaps=len(loose),
+        gaps_led_to_scalp=result.to_scalp,
+        gaps_joined_to_strand=result.joined,
+        gaps_dropped=result.dropped,
+        covered_by_roots=share,
+        covered=filled,
+        metres=float(strands.lengths().sum()),
+        radius=radius,
+        options=asdict(options) | {"measure": asdict(options.measure)},
+    )
+    if result.dropped:
+        stage.warn(f"{result.dropped} strands through gaps reached no root and were dropped")
+    return strands

@@ -1,0 +1,121 @@
+"""Strands that reach the scalp: loose ones join their neighbours on the way to the roots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.scalp import Scalp
+
+Polyline = NDArray[np.float32]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rooted:
+    """Strands that start on the scalp, and how loose ones got there.
+
+    `to_scalp` ended beside it, `joined` follow a rooted neighbour to its root, `dropped` found
+    neither.
+    """
+
+    strands: list[Polyline]
+    to_scalp: int
+    joined: int
+    dropped: int
+
+
+def root_all(
+    rooted: list[Polyline],
+    loose: list[Polyline],
+    scalp: Scalp,
+    *,
+    near_scalp: float = 8e-3,
+    reaches: tuple[float, ...] = (3e-3, 5e-3, 8e-3, 8e-3, 12e-3, 12e-3, 20e-3),
+    turn_deg: float = 45.0,
+) -> Rooted:
+    """Give every loose polyline a root; its direction in space is not changed.
+
+    An end within `near_scalp` metres of the scalp is led to it. Any other goes on beside the nearest
+    rooted strand that continues it within `turn_deg`, keeping a distance that fades towards that
+    strand's root; strands that were joined carry others in the next round. `reaches` are the
+    distances, metres, within which a neighbour is looked for, round by round.
+    """
+    strands = list(rooted)
+    tree = cKDTree(scalp.points)
+    waiting: list[Polyline] = []
+    for path in loose:
+        distance, _ = tree.query(path[[0, -1]])
+        if distance.min() > near_scalp:
+            waiting.append(path)
+            continue
+        path = path if distance[0] <= distance[1] else path[::-1]
+        strands.append(_lead_to_scalp(path, scalp, tree))
+    to_scalp = len(strands) - len(rooted)
+    joined = 0
+    for reach in reaches:
+        if not waiting or not strands:
+            break
+        attached, waiting = _join_round(strands, waiting, reach, np.cos(np.radians(turn_deg)))
+        joined += len(attached)
+        strands += attached
+    return Rooted(strands, to_scalp, joined, len(waiting))
+
+
+def _lead_to_scalp(path: Polyline, scalp: Scalp, tree: cKDTree) -> Polyline:
+    root = scalp.points[tree.query(path[0])[1]].astype(np.float32)
+    if np.linalg.norm(root - path[0]) < 5e-4:
+        return path
+    return np.concatenate([root[None], path])
+
+
+def _join_round(
+    strands: list[Polyline], loose: list[Polyline], reach: float, least_cosine: float
+) -> tuple[list[Polyline], list[Polyline]]:
+    """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
+    points = np.concatenate(strands).astype(float)
+    counts = np.array([len(s) for s in strands])
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    owner = np.repeat(np.arange(len(strands)), counts)
+    rootward = np.zeros_like(points)
+    rootward[1:] = points[:-1] - points[1:]
+    rootward[first] = 0  # nothing can go on below a root
+    norm = np.linalg.norm(rootward, axis=1, keepdims=True)
+    rootward /= np.maximum(norm, 1e-12)
+    ends = np.concatenate([[p[0], p[-1]] for p in loose]).astype(float)
+    out = np.concatenate(
+        [[p[0] - p[min(4, len(p) - 1)], p[-1] - p[-min(5, len(p))]] for p in loose]
+    )
+    out = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
+    distance, index = cKDTree(points).query(ends, k=np.arange(1, 17), distance_upper_bound=reach)
+    found = np.isfinite(distance)
+    index = np.where(found, index, 0)
+    cosine = np.einsum("nkd,nd->nk", rootward[index], out)
+    cost = np.where(found & (cosine >= least_cosine), distance + reach * (1 - cosine), np.inf)
+    pick = cost.argmin(axis=1)
+    cost = cost[np.arange(len(ends)), pick].reshape(-1, 2)
+    target = index[np.arange(len(ends)), pick].reshape(-1, 2)
+    attached, left = [], []
+    for path, c, t in zip(loose, cost, target, strict=True):
+        if not np.isfinite(c.min()):
+            left.append(path)
+            continue
+        end = int(c.argmin())
+        path = path if end == 0 else path[::-1]
+        guide = points[first[owner[t[end]]] : t[end] + 1]
+        attached.append(_beside(guide, path))
+    return attached, left
+
+
+def _beside(guide: Array, path: Polyline) -> Polyline:
+    """The path with a way to the guide's root before it, parallel to the guide where they meet."""
+    offset = path[0] - guide[-1]
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1))])
+    share = arc / max(arc[-1], 1e-12)
+    fade = share * share * (3 - 2 * share)
+    way = guide + fade[:, None] * offset
+    # the guide's last point falls on the path's first by construction
+    return np.concatenate([way[:-1].astype(np.float32), path])
