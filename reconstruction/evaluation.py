@@ -24,6 +24,9 @@ STEP = 1e-3
 MOST_PAIRS = 4_000_000
 """Neighbour pairs that are looked at together: bounds the memory, not the answer."""
 
+OVERSAMPLING = 5
+"""Points that are tested for visibility, for each visible one that is wanted."""
+
 
 @dataclass(frozen=True)
 class Threshold:
@@ -50,6 +53,7 @@ def compare_strands(
     head: Mesh | None = None,
     seed: int = 0,
     samples: int | None = 40_000,
+    visibility: Visibility | None = None,
 ) -> dict[str, Any]:
     """Score predicted strands against the true ones.
 
@@ -66,7 +70,8 @@ def compare_strands(
 
     At most `samples` points of each set are scored (all of them for None), drawn by `seed`, always
     against the whole other set; the `_error`s are the standard errors that this leaves. Without
-    predicted points to score, precision is 0.
+    predicted points to score, precision is 0. To score several predictions of one truth, make its
+    `Visibility` once and hand it over.
 
     Raises `ValueError` when there is no true strand, or no camera sees a true point.
     """
@@ -76,40 +81,46 @@ def compare_strands(
     predicted, truth = _Oriented(pred), _Oriented(true)
     out: dict[str, Any] = {}
     if cameras is not None:
-        visible = Visibility(cameras, true, head)
-        seen_truth = visible(truth.points)
-        if not seen_truth.any():
+        sees = visibility if visibility is not None else Visibility(cameras, true, head)
+        seen_truth = truth.draw(samples, rng, sees)
+        if not seen_truth.chosen.size:
             raise ValueError("no camera sees any of the true strands: are they in one frame?")
-        seen_prediction = visible(predicted.points)
         out["visible"] = _scores(
-            predicted.match(truth, np.flatnonzero(seen_prediction), samples, rng),
-            truth.match(predicted, np.flatnonzero(seen_truth), samples, rng),
+            predicted.match(truth, predicted.draw(samples, rng, sees)),
+            truth.match(predicted, seen_truth),
         )
     out["all"] = _scores(
-        predicted.match(truth, np.arange(len(predicted.points)), samples, rng),
-        truth.match(predicted, np.arange(len(truth.points)), samples, rng),
+        predicted.match(truth, predicted.draw(samples, rng)),
+        truth.match(predicted, truth.draw(samples, rng)),
     )
     return out
 
 
 @dataclass(frozen=True)
+class _Draw:
+    """Points to score: indices `chosen (n,)`, and whether they are all that there are to score."""
+
+    chosen: NDArray[np.int64]
+    complete: bool
+
+
+@dataclass(frozen=True)
 class _Matches:
-    """For each threshold, which of the scored points match `(T, n)`; out of `population` points."""
+    """For each threshold, which of the scored points match `(T, n)`."""
 
     found: Bool
-    population: int
+    complete: bool
 
     def share(self) -> list[float]:
         n = self.found.shape[1]
         return [float(row.mean()) if n else 0.0 for row in self.found]
 
     def error(self) -> list[float]:
-        """Standard error of `share`: simple random sampling without replacement."""
-        n, everything = self.found.shape[1], self.population
-        if n < 2 or n == everything:
+        """Standard error of `share` by sampling; 0 where all points were scored."""
+        n = self.found.shape[1]
+        if self.complete or n < 2:
             return [0.0] * len(self.found)
-        left = (everything - n) / (everything - 1)
-        return [float(np.sqrt(p * (1 - p) / (n - 1) * left)) for p in self.share()]
+        return [float(np.sqrt(p * (1 - p) / (n - 1))) for p in self.share()]
 
 
 class _Oriented:
@@ -120,26 +131,40 @@ class _Oriented:
         self.points, self.tangents = strands.points, strands.tangents()
         self.tree = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
-    def match(
-        self, other: _Oriented, which: NDArray[np.int64], samples: int | None, rng: Any
-    ) -> _Matches:
-        """Match the points `which`, or `samples` of them, with `other`."""
-        population = len(which)
-        if samples is not None and population > samples:
-            which = np.sort(rng.choice(which, samples, replace=False))
+    def draw(
+        self, samples: int | None, rng: np.random.Generator, sees: Visibility | None = None
+    ) -> _Draw:
+        """At most `samples` of the points, or of those that `sees` says are visible."""
+        count = len(self.points)
+        if samples is None:
+            samples = count
+        tried = count if sees is None else min(count, OVERSAMPLING * samples)
+        chosen = np.arange(count)
+        if tried < count:
+            chosen = rng.choice(count, tried, replace=False)
+        if sees is not None:
+            chosen = chosen[sees(self.points[chosen])]
+        complete = tried == count and len(chosen) <= samples
+        if len(chosen) > samples:
+            chosen = rng.choice(chosen, samples, replace=False)
+        return _Draw(np.sort(chosen), complete)
+
+    def match(self, other: _Oriented, draw: _Draw) -> _Matches:
+        """Match the drawn points with `other`."""
+        which = draw.chosen
         found = np.zeros((len(THRESHOLDS), len(which)), bool)
-        if len(which) == 0 or len(other.points) == 0:
-            return _Matches(found, population)
-        todo = np.arange(len(which))
+        todo = np.arange(len(which) if len(other.points) else 0)
         for k, threshold in enumerate(THRESHOLDS):
             hit = self._near(other, which[todo], threshold)
             found[k:, todo[hit]] = True  # what matches narrowly matches widely
             todo = todo[~hit]
-        return _Matches(found, population)
+        return _Matches(found, draw.complete)
 
     def _near(self, other: _Oriented, which: NDArray[np.int64], threshold: Threshold) -> Bool:
         """Which of the points `which` have a match in `other`."""
         out = np.zeros(len(which), bool)
+        if len(which) == 0:
+            return out
         points, reach = self.points[which], threshold.distance
         near = other.tree.query_ball_point(points, reach, return_length=True, workers=-1)
         part = np.cumsum(near) // MOST_PAIRS

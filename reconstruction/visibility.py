@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.cameras import Camera
+from reconstruction.envelope import surface_samples
 from reconstruction.mesh import Mesh
 from reconstruction.strands import Strands
 
@@ -41,8 +42,10 @@ class Visibility:
         if head is None or not self._buffers:
             return
         covering = np.any([b.over(head) for b in self._buffers], axis=0)
-        spacing = 0.7 * min(b.span for b in self._buffers)  # under sqrt(3)/2: no pixel is missed
-        for samples in surface_samples(Mesh(head.vertices, head.faces[covering]), spacing):
+        if covering.any():
+            spacing = 0.7 * min(b.span for b in self._buffers)  # under √3/2: no pixel is missed
+            part = Mesh(head.vertices, head.faces[covering])
+            samples = surface_samples(part, spacing)[0].astype(np.float32)
             for buffer in self._buffers:
                 buffer.splat(samples)
 
@@ -126,20 +129,3 @@ class _DepthBuffer:
         size = np.array(self.shape[::-1])
         over = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) < size).all(axis=1)
         return np.asarray(front & over)
-
-
-def surface_samples(mesh: Mesh, spacing: float) -> Iterator[Single]:
-    """Points `(M, 3)`, chunk by chunk, that cover a mesh: no gap is wider than `spacing` metres.
-
-    Every triangle gets a grid in barycentric coordinates, as fine as its longest edge needs.
-    """
-    corners = mesh.vertices[mesh.faces].astype(np.float32)
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0)
-    steps = np.maximum(np.ceil(edges / spacing).astype(int), 1)
-    for n in np.unique(steps):
-        i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
-        keep = i + j <= n
-        weights = np.stack([i[keep], j[keep], n - i[keep] - j[keep]], axis=1) / np.float32(n)
-        triangles = corners[steps == n]
-        for part in np.array_split(triangles, len(triangles) * len(weights) // CHUNK + 1):
-            yield (weights.astype(np.float32) @ part).reshape(-1, 3)

@@ -81,9 +81,9 @@ def visual_hull(
 
     A voxel belongs to the hull if its centre falls on the mask of every camera whose image it falls
     on, and it falls on at least `least_views` images (or all, if there are fewer). An image that a
-    voxel misses carves it only if its mask stays off the image's edge: then the subject is wholly
-    in that image. A camera without a mask takes no part. The masks are of everything that the hull
-    shall hold: where a head hides hair, give hair and head together (see `silhouette`).
+    voxel misses carves it too, except past an edge that the mask touches: there the image may cut
+    the subject off. A camera without a mask takes no part. The masks are of everything that the
+    hull shall hold: where a head hides hair, give both together (see `mesh_silhouette`).
 
     `spacing` is in metres; `bounds (2, 3)` gives the lowest and highest corner, by default the
     hull's own box is found.
@@ -123,8 +123,10 @@ class _View:
             raise ValueError(f"{camera.name}: its mask is empty; leave the camera out instead")
         self.camera, self.mask = camera, mask
         self.focal = max(camera.K[0, 0], camera.K[1, 1])
-        edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-        self.cropped = bool(edge.any())
+        # where the mask touches an edge of the image, the subject may go on beyond that edge
+        sides = mask[:, 0].any(), mask[0].any(), mask[:, -1].any(), mask[-1].any()
+        self.left, self.top, self.right, self.bottom = (np.inf if s else 0.5 for s in sides)
+        self.cropped = any(sides)
         framed = np.pad(mask, 1)  # beyond the image nothing is surely inside
         self.within = cv2.distanceTransform(framed.astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
         if mask.all():  # OpenCV has no distance to a background that is not there
@@ -132,10 +134,18 @@ class _View:
         else:
             self.outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
 
-    def seen(self, points: Array) -> Bool:
-        """Whether `points (M, 3)` fall on the image."""
+    def cut_off(self, points: Array, radius: float = 0.0) -> Bool:
+        """Whether balls about `points (M, 3)` reach past an edge where the subject may go on."""
         pixels, depth = self.camera.project(points)
-        return np.asarray((depth > 0) & self.camera.inside(pixels))
+        front = depth > 1e-6
+        reach = 1.5 * self.focal * radius / np.maximum(depth - radius, 1e-9)
+        x, y = pixels.T
+        width, height = self.camera.width, self.camera.height
+        allowed = (x >= -self.left - reach) & (x < width - 1 + self.right + reach)
+        allowed &= (y >= -self.top - reach) & (y < height - 1 + self.bottom + reach)
+        off = (x < -0.5 + reach) | (x >= width - 0.5 - reach)
+        off |= (y < -0.5 + reach) | (y >= height - 0.5 - reach)
+        return np.asarray(front & allowed & off)
 
     def on_mask(self, points: Array) -> Bool:
         """Whether `points (M, 3)` fall on a pixel of the mask. The carve's hot loop."""
@@ -170,8 +180,8 @@ def _balls(views: list[_View], points: Array, radius: float, least: int) -> tupl
         touches, within = view.balls(points[alive], radius)
         count[alive] += touches
         whole[alive] &= within
-        if view.cropped:  # what falls off a cropped image may go on beyond its edge
-            touches |= ~view.seen(points[alive])
+        if view.cropped:
+            touches |= view.cut_off(points[alive], radius)
         alive = alive[touches]
     out = np.zeros(len(points), bool)
     out[alive] = count[alive] >= least
@@ -185,7 +195,7 @@ def _points(views: list[_View], points: Array, least: int) -> Bool:
         keep = view.on_mask(points[alive])
         count[alive] += keep
         if view.cropped:
-            keep |= ~view.seen(points[alive])
+            keep |= view.cut_off(points[alive])
         alive = alive[keep]
     out = np.zeros(len(points), bool)
     out[alive] = count[alive] >= least
@@ -250,8 +260,8 @@ def _common_center(views: list[_View]) -> Array:
     return np.asarray(np.linalg.solve(A, b))
 
 
-def silhouette(camera: Camera, mesh: Mesh) -> Bool:
-    """The pixels `(H, W)` whose centres a mesh covers; parts behind the camera are left out."""
+def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bool:
+    """The pixels `(H, W)` that a mesh covers or its outline touches, as far as it is in front."""
     pixels, depth = camera.project(mesh.vertices)
     faces = mesh.faces[(depth[mesh.faces] > 1e-6).all(axis=1)]
     image = np.zeros((camera.height, camera.width), np.uint8)
@@ -260,3 +270,15 @@ def silhouette(camera: Camera, mesh: Mesh) -> Bool:
     for triangle in corners[faces]:
         cv2.fillConvexPoly(image, triangle, 1, lineType=cv2.LINE_8, shift=shift)
     return image.astype(bool)
+
+
+def trim_edges(mask: Bool, hair: Bool) -> Bool:
+    """`mask (H, W)` without the pixels on the image's edges that `hair (H, W)` does not hold.
+
+    A neck runs out of most images where the hair does not. The hull of masks trimmed like this
+    ends at such an edge instead of going on beyond it.
+    """
+    out = mask.copy()
+    for side in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        out[side] &= hair[side]
+    return out

@@ -9,7 +9,7 @@ from reconstruction.cameras import Camera
 from reconstruction.evaluation import compare_strands
 from reconstruction.mesh import Mesh
 from reconstruction.strands import Strands
-from reconstruction.visibility import Visibility, surface_samples
+from reconstruction.visibility import Visibility
 
 NAMES = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 
@@ -154,16 +154,3 @@ def test_the_head_hides_and_the_image_ends(front: Camera) -> None:
     assert not seen[below].any()
     assert seen[points[:, 2] > 1.5e-3].all()
     assert not Visibility([front], behind)(points + np.float32(0.2)).any()
-
-
-def test_surface_samples_leave_no_gap() -> None:
-    mesh = Mesh(
-        np.array([[0, 0, 0], [0.03, 0, 0], [0, 0.02, 0.01], [0.05, 0.05, 0]]),
-        np.array([[0, 1, 2], [1, 3, 2]]),
-    )
-    samples = np.concatenate(list(surface_samples(mesh, 1e-3)))
-    rng = np.random.default_rng(0)
-    for face in mesh.faces:
-        inside = rng.dirichlet(np.ones(3), 300) @ mesh.vertices[face]
-        gap = np.linalg.norm(inside[:, None] - samples[None], axis=2).min(axis=1)
-        assert gap.max() < 1e-3 / np.sqrt(3) + 1e-6
