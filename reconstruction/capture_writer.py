@@ -11,10 +11,11 @@ import json
 import math
 import os
 import threading
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import cv2
 import numpy as np
@@ -125,12 +126,35 @@ class CaptureWriter:
         timestamp: float | None = None,
         attempt: int = 0,
     ) -> FrameRecord:
-        """Write one frame durably and append its journal line.
+        """Write one frame durably and append its journal line: `store_frame`, then `commit`.
 
         `radiance (H, W, 3)` is scene-linear, W/(sr m²), as exposed at the step's level;
         `full_scale` is the radiance at which a channel saturates (inf: never), `count_scale` the
         radiance of one count (0: not quantised). Raises `CaptureError` for a frame of the wrong
         size, with numbers that are not finite, of an unknown step, or written before.
+        """
+        record = self.store_frame(
+            step, camera, radiance, full_scale=full_scale, count_scale=count_scale
+        )
+        record = replace(
+            record, pulse=pulse, block_id=block_id, timestamp=timestamp, attempt=attempt
+        )
+        self.commit([record])
+        return record
+
+    def store_frame(
+        self,
+        step: Step,
+        camera: str,
+        radiance: NDArray[np.floating],
+        *,
+        full_scale: float = math.inf,
+        count_scale: float = 0.0,
+    ) -> FrameRecord:
+        """Write and flush a frame's file; it belongs to the capture once `commit` has its record.
+
+        Flushing waits for the disk, and disks flush many files together as fast as one: store
+        from several threads and commit what has gathered. Arguments and errors as `write_frame`.
         """
         self._check(step, camera)
         expected = (self.rig.camera(camera).height, self.rig.camera(camera).width, 3)
@@ -148,20 +172,15 @@ class CaptureWriter:
         file = f"frames/{step.index:05d}/{camera}.exr"
         (self.path / file).parent.mkdir(exist_ok=True)
         write_exr(self.path / file, radiance, attributes, compress=False)
-        _sync_folder((self.path / file).parent)
-        record = FrameRecord(
-            step.index,
-            camera,
-            file,
-            sha256(self.path / file),
-            pulse,
-            block_id,
-            timestamp,
-            attempt,
-            utc_now(),
-        )
-        self._append(record)
-        return record
+        return FrameRecord(step.index, camera, file, sha256(self.path / file), recorded=utc_now())
+
+    def commit(self, records: Sequence[FrameRecord]) -> None:
+        """Make the records part of the capture: flush their folders, then the journal, once."""
+        for folder in {(self.path / r.file).parent for r in records if r.file is not None}:
+            _sync_folder(folder)
+        with self._lock:
+            append_lines(self._journal, records)
+            self.records.update({(r.step, r.camera): r for r in records})
 
     def record_missing(
         self,
@@ -180,15 +199,14 @@ class CaptureWriter:
             step.index,
             camera,
             None,
-            None,
-            pulse,
-            block_id,
-            timestamp,
-            attempt,
-            utc_now(),
-            reason,
+            pulse=pulse,
+            block_id=block_id,
+            timestamp=timestamp,
+            attempt=attempt,
+            recorded=utc_now(),
+            reason=reason,
         )
-        self._append(record)
+        self.commit([record])
         return record
 
     def finish(self, outcome: str, extra: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -230,11 +248,6 @@ class CaptureWriter:
         if self._has(step, self.rig.camera(camera)):
             raise CaptureError(f"step {step.index}, {camera}: this frame is written already")
 
-    def _append(self, record: FrameRecord) -> None:
-        with self._lock:
-            append_line(self._journal, record)
-            self.records[record.step, record.camera] = record
-
 
 def compress(path: str | Path, progress: Progress = silent) -> int:
     """Rewrite the uncompressed frames of a capture with ZIP, losslessly; returns the bytes saved.
@@ -259,9 +272,7 @@ def compress(path: str | Path, progress: Progress = silent) -> int:
             write_exr(new, image, _own_attributes(attributes), compress=True)
             _sync_folder(new.parent)
             file = str(new.relative_to(capture.path))
-            append_line(
-                journal, FrameRecord(**{**asdict(record), "file": file, "sha256": sha256(new)})
-            )
+            append_lines(journal, [replace(record, file=file, sha256=sha256(new))])
             saved += old.stat().st_size - new.stat().st_size
             old.unlink()
             progress("compressing frames", (i + 1) / len(todo))
@@ -269,11 +280,12 @@ def compress(path: str | Path, progress: Progress = silent) -> int:
     return saved
 
 
-def append_line(journal: Any, record: FrameRecord) -> None:
-    """Append one record to an open journal and flush it to disk."""
-    line = {k: v for k, v in asdict(record).items() if v is not None}
-    line.setdefault("file", None)
-    journal.write(json.dumps(line, allow_nan=False).encode() + b"\n")
+def append_lines(journal: BinaryIO, records: Sequence[FrameRecord]) -> None:
+    """Append records to an open journal and flush it to disk."""
+    for record in records:
+        line = {k: v for k, v in asdict(record).items() if v is not None}
+        line.setdefault("file", None)
+        journal.write(json.dumps(line, allow_nan=False).encode() + b"\n")
     journal.flush()
     os.fsync(journal.fileno())
 

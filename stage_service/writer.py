@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import queue
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from reconstruction.capture import Step
+from reconstruction.capture import FrameRecord, Step
 from reconstruction.capture_writer import CaptureWriter
 from stage_service.devices.cameras.interface import CameraInfo, Frame
+
+THREADS = 4
+"""Threads that flush side by side; a disk takes their flushes together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +27,20 @@ class Shot:
 
 
 class FrameWriter:
-    """Converts and writes frames on a thread of its own; at most `capacity` wait."""
+    """Converts and writes frames on threads of its own; at most `capacity` wait."""
 
     def __init__(self, writer: CaptureWriter, capacity: int) -> None:
         self._writer = writer
         self._queue: queue.Queue[Shot | None] = queue.Queue(capacity)
         self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="frame-writer", daemon=True)
-        self._thread.start()
+        self._stored: list[FrameRecord] = []
+        self._storing, self._committing = threading.Lock(), threading.Lock()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"frame-writer-{i}", daemon=True)
+            for i in range(THREADS)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def put(self, shot: Shot) -> None:
         """Hand over a frame; waits while the queue is full. Raises what writing raised."""
@@ -45,9 +54,10 @@ class FrameWriter:
 
     def close(self) -> None:
         """Write what waits, then stop. Raises what writing raised."""
-        if self._thread.is_alive():
+        for _ in self._threads:
             self._queue.put(None)
-            self._thread.join()
+        for thread in self._threads:
+            thread.join()
         self.check()
 
     def _run(self) -> None:
@@ -61,14 +71,25 @@ class FrameWriter:
 
     def _write(self, shot: Shot) -> None:
         frame, info = shot.frame, shot.info
-        self._writer.write_frame(
+        record = self._writer.store_frame(
             shot.step,
             shot.camera,
             frame.radiance(info),
             full_scale=frame.full_scale(info),
             count_scale=frame.count_scale(info),
+        )
+        record = replace(
+            record,
             pulse=shot.pulse,
             block_id=frame.block_id,
             timestamp=frame.timestamp,
             attempt=shot.attempt,
         )
+        with self._storing:
+            self._stored.append(record)
+        # Whoever commits takes along what others stored meanwhile: one flush for all of it.
+        with self._committing:
+            with self._storing:
+                batch, self._stored = self._stored, []
+            if batch:
+                self._writer.commit(batch)
