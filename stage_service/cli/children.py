@@ -9,7 +9,6 @@ import select
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any, Self
 
@@ -72,18 +71,11 @@ class Children:
         readable, _, _ = select.select([child.stdout], [], [], seconds)
         line = child.stdout.readline() if readable else ""
         if not line:
+            if readable:  # the pipe was closed: the process is about to be gone
+                child.wait(GRACE_S)
             raise self._not_ready(name, child, seconds)
         answer: dict[str, Any] = json.loads(line)
         return answer
-
-    def wait_for_file(self, child: subprocess.Popen[str], path: Path, seconds: float) -> None:
-        """Wait until the child has written `path`, as a sign that it is ready."""
-        deadline = time.monotonic() + seconds
-        while not path.is_file():
-            if child.poll() is not None or time.monotonic() > deadline:
-                name = next(n for n, c in self._running if c is child)
-                raise self._not_ready(name, child, seconds)
-            time.sleep(0.05)
 
     def check(self) -> None:
         """Raise `CommandError` when a child has ended by itself."""

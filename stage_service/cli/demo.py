@@ -102,11 +102,13 @@ def _start(children: Children, args: argparse.Namespace) -> str:
     out: Path = args.out
     state = out / "simulated"
     simulators = children.start(
-        "simulators", simulator_command(args, state, out / "truth", "--ports", "auto")
+        "simulators",
+        simulator_command(args, state, out / "truth", "--ports", "auto"),
+        answers=True,
     )
-    children.wait_for_file(simulators, state / "devices.toml", seconds=300)
+    devices = children.first_line("simulators", simulators, 300)["devices"]
     serve = own_command(
-        *("serve", "--json", "--rig", args.rig, "--devices", state / "devices.toml"),
+        *("serve", "--json", "--rig", args.rig, "--devices", devices),
         *("--root", out, "--port", "0"),
     )
     service = children.start("service", serve, answers=True)

@@ -55,7 +55,9 @@ def add(commands: Commands) -> None:
     simulate.add_argument("--truth", type=Path, help="write the true strands and appearance here")
     simulate.add_argument("--faults", type=Path, help="faults to inject")
     simulate.add_argument("--seed", type=int, default=0)
-    simulate.add_argument("--ports", default="auto", help="'auto' or the rig file's with 'rig'")
+    simulate.add_argument(
+        "--ports", choices=("auto", "rig"), default="auto", help="free TCP ports, or the rig file's"
+    )
 
 
 def run_serve(args: argparse.Namespace, output: Output) -> int:
@@ -96,14 +98,14 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
     """Spawn the simulators and stay until they end."""
     from stage_service.cli.children import Children, simulator_command
 
+    exit_on_sigterm()
     more = ["--ports", args.ports]
     more += ["--faults", args.faults] if args.faults is not None else []
     with Children(args.state / "logs") as children:
         command = simulator_command(args, args.state, args.truth, *more)
-        child = children.start("simulators", command, to_log=False)
-        devices = args.state / "devices.toml"
-        children.wait_for_file(child, devices, seconds=600)
-        output.result({"devices": str(devices)}, f"the simulated rig answers; see {devices}")
+        child = children.start("simulators", command, to_log=False, answers=True)
+        devices = children.first_line("simulators", child, 600)["devices"]
+        output.result({"devices": devices}, f"the simulated rig answers; see {devices}")
         code = child.wait()
         return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
 

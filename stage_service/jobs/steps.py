@@ -45,14 +45,16 @@ def reconstruct(context: StepContext) -> Figures:
     from reconstruction.pipeline import ReconstructOptions
     from reconstruction.pipeline import reconstruct as run
 
-    options = ReconstructOptions(**context.options.reconstruct)
-    run(
-        Capture(context.capture),
-        context.model,
-        method=context.options.method,
-        options=options,
-        progress=context.progress,
-    )
+    asked = context.options
+    try:
+        options = ReconstructOptions(
+            **{"held_out": asked.held_out_cameras, "seed": asked.seed, **asked.reconstruct}
+        )
+    except TypeError as error:
+        raise ValueError(f"options.reconstruct: {error}") from error
+    capture = Capture(context.capture)
+    capture.steps = tuple(s for s in capture.steps if s.light not in asked.held_out_lights)
+    run(capture, context.model, method=asked.method, options=options, progress=context.progress)
     return {"strands": "strands.npz"}
 
 

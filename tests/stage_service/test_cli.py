@@ -238,8 +238,7 @@ def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path)
             pids.append(child.pid)
             assert children.first_line("good", child, 10) == {}
             assert children.peak_memory_gb()["good"] > 0.001
-            bad = children.start("bad", failing)
-            children.wait_for_file(bad, tmp_path / "never", 10)
+            children.first_line("bad", children.start("bad", failing, answers=True), 10)
 
     with pytest.raises(CommandError, match=r"bad: ended with exit code 1; .*no such camera"):
         command()

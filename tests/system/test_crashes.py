@@ -1,0 +1,68 @@
+"""Killed without warning: the worker in mid-job, the service in mid-capture."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from reconstruction.capture import Capture
+
+
+def test_a_job_outlives_its_worker(stage):
+    stage.simulate()
+    stage.serve()
+    worker = stage.work()
+    capture = stage.capture(
+        {
+            "head": str(stage.folder / "truth" / "head.obj"),
+            "pipeline": {"name": "light_planes", "options": {"held_out_lights": ["light_004"]}},
+        }
+    )
+    path = f"/jobs/{capture['job']}"
+    stage.until(lambda: (stage.get(path)["progress"] or {}).get("step") == "fit", 100)
+    worker.kill()
+    worker.wait()
+    assert stage.get(path)["state"] == "running"
+    assert stage.get("/health")["worker"] is False
+    strands = Path(stage.get(path)["model"]) / "strands.npz"
+    written = strands.stat().st_mtime_ns
+    stage.work()
+    stage.until(lambda: stage.get(path)["state"] == "done", 200)
+    job = stage.get(path)
+    assert (job["outcome"], job["error"]) == ("succeeded", None)
+    assert strands.stat().st_mtime_ns == written, "reconstruction was done, and was done again"
+    assert (strands.parent / "results.json").is_file()
+
+
+def test_a_killed_service_leaves_no_lamp_lit_and_every_finished_frame(stage):
+    pulse = 8
+    stage.simulate([{"device": "trigger", "kind": "silent", "pulse": pulse}])
+    service = stage.serve()
+    capture = stage.post("/captures", {})
+    stage.until(lambda: stage.get(f"/captures/{capture['id']}")["step"] == pulse - 1)
+    # The service now waits for the trigger box's answer, and the lamp is on.
+    stage.until(lambda: stage.lamps_lit() == 1)
+    service.kill()
+    service.wait()
+    assert stage.lamps_lit() == 1
+    killed = time.monotonic()
+    stage.until(lambda: stage.lamps_lit() == 0, stage.WATCHDOG_S + 2.0)
+    assert time.monotonic() - killed < stage.WATCHDOG_S + 1.0
+
+    path = Path(capture["path"])
+    left = Capture(path)
+    frames = [r for r in left.records.values() if r.file is not None]
+    assert len(frames) >= stage.CAMERAS * (pulse - 2)
+    for record in frames:
+        assert left.frame(left.steps[record.step], record.camera).shape == (24, 24, 3)
+    problems = stage.verify(path)
+    missing = stage.FRAMES - len(frames)
+    assert problems == [
+        "manifest.json is missing: the capture was not finished.",
+        f"{missing} planned frames were never shot; the first is step "
+        f"{len(frames) // stage.CAMERAS} (olat), cam_{len(frames) % stage.CAMERAS}.",
+    ]
+    stage.serve()
+    known = stage.get(f"/captures/{capture['id']}")
+    assert (known["state"], known["outcome"]) == ("done", "interrupted")
+    assert known["frames_written"] == len(frames)
