@@ -1,4 +1,4 @@
-"""Procedural grooms: strands stepped from scalp roots along comb, gravity and the head's surface."""
+"""Procedural grooms: strands stepped from roots along comb, gravity and the head's surface."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ GROOMS = {
 def covering_radius(strands: int) -> float:
     """Strand radius (metres) with which `strands` cover what a whole head of hair covers.
 
-    100,000 fibres of 40 µm radius; 0.35 mm for 11,400 strands. Never under a fibre's 40 µm, nor over 1 mm.
+    100,000 fibres of 40 µm radius; 0.35 mm for 11,400 strands. Between 40 µm and 1 mm.
     """
     return float(np.clip(_COVERAGE / max(strands, 1), 40e-6, 1e-3))
 

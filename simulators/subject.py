@@ -118,7 +118,7 @@ def load_subject(
 
 
 def check_fits(subject: Subject, rig: Rig) -> None:
-    """Raise `SubjectError` unless at least half of the hair's points are on every camera's image."""
+    """Raise `SubjectError` unless every camera sees at least half of the hair's points."""
     points = subject.strands.points.astype(float)
     for camera in rig.cameras:
         pixels, depth = camera.project(points)

@@ -1,0 +1,128 @@
+"""`python -m simulators`: a rig and a subject that exist only here, behind the real wires."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import signal
+import sys
+import threading
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+
+from reconstruction.rig import RigError
+from simulators.drift import Drift
+from simulators.faults import Faults
+from simulators.frames import FrameMaker, cache_key
+from simulators.lamps import Lamps
+from simulators.render_process import RenderProcess
+from simulators.responses import MitsubaResponder, Quality
+from simulators.sensor import Sensor
+from simulators.stage import SimulatedStage
+from simulators.subject import Subject, check_fits, load_subject
+from simulators.truth import EXPOSURES, write_truth
+from simulators.world import World
+from stage_service.config import RigFile, load_rig_file
+
+_FAILED, _BAD_INPUT = 1, 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the simulated rig until SIGTERM or SIGINT; returns the exit code.
+
+    When ready, one line of JSON goes to stdout and `STATE/devices.toml` is there. Exit code 2 is a
+    wrong argument or file, 1 anything else that keeps the devices from starting.
+    """
+    parser = _parser()
+    args = parser.parse_args(arguments)
+    if args.state is None and args.truth_only is None:
+        parser.error("--state FOLDER is required (or --truth-only FOLDER)")
+    if args.spp < 1:
+        parser.error(f"--spp must be at least 1, got {args.spp}")
+    try:
+        rig_file = load_rig_file(args.rig)
+        subject = load_subject(args.subject, args.head, seed=args.seed)
+        check_fits(subject, rig_file.rig)
+        drift = Drift(_poses(rig_file), args.drift_mm * 1e-3, args.seed)
+        if args.truth_only is not None:
+            write_truth(args.truth_only, subject, drift)
+            return 0
+        cameras = [c.name for c in rig_file.rig.cameras]
+        faults = Faults.load(args.faults, cameras) if args.faults else Faults()
+        if args.truth is not None:
+            write_truth(args.truth, subject, drift)
+    except (ValueError, RigError, OSError) as error:
+        print(f"simulators: {error}", file=sys.stderr)
+        return _BAD_INPUT
+    try:
+        _run(args, rig_file, subject, drift, faults)
+    except OSError as error:
+        print(f"simulators: {error}", file=sys.stderr)
+        return _FAILED
+    return 0
+
+
+def _run(
+    args: argparse.Namespace, rig_file: RigFile, subject: Subject, drift: Drift, faults: Faults
+) -> None:
+    rig, sensor, quality = rig_file.rig, Sensor(), Quality.scaled(args.spp)
+    leave = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: leave.set())
+    with ExitStack() as stack:
+        make = functools.partial(MitsubaResponder, rig, subject, drift, quality, args.seed)
+        responder = RenderProcess(make)
+        key = cache_key(subject.digest(), rig.to_dict(), asdict(quality), args.seed)
+        frames = FrameMaker(rig, responder, sensor, args.seed, args.cache, key)
+        log = args.truth / EXPOSURES if args.truth is not None else None
+        world = World(rig, Lamps(len(rig.lights)), faults, frames.counts, log)
+        free = args.ports == "auto"
+        stage = SimulatedStage(world, sensor, faults, args.state, rig_file.devices, free)
+        # Ends in reverse: the renderer first, so that no frame holds up the devices' end.
+        stack.enter_context(stage)
+        stack.callback(responder.stop)
+        ready = {"ready": True, "devices": str(args.state / "devices.toml"), **stage.devices}
+        print(json.dumps(ready), flush=True)
+        leave.wait()
+
+
+def _poses(rig_file: RigFile) -> int:
+    """Tracking frames of a whole sweep: one for every full group of rows."""
+    every = max(rig_file.capture.tracking_every, 1)
+    return max(1, sum(max(1, p.height // every) for p in rig_file.rig.projectors))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m simulators",
+        description="Simulated light stage: LED bank on Modbus TCP, trigger box and projector "
+        "controller on pseudo-terminals, cameras on TCP. Frames are rendered from what the devices "
+        "were commanded to do. Runs until SIGTERM.",
+    )
+    parser.add_argument("--rig", type=Path, required=True, help="rig file (TOML or JSON)")
+    parser.add_argument(
+        "--subject", default="wavy", help="wavy, straight, curly, or a strand file (default: wavy)"
+    )
+    parser.add_argument("--head", type=Path, help="OBJ of the head under the strand file's hair")
+    parser.add_argument("--state", type=Path, help="folder for devices.toml and the serial ports")
+    parser.add_argument("--seed", type=int, default=0, help="subject, drift and noise (default: 0)")
+    parser.add_argument("--faults", type=Path, help="JSON list of faults (simulators/faults.py)")
+    parser.add_argument(
+        "--ports", choices=("auto", "rig"), default="rig", help="free TCP ports, or the rig file's"
+    )
+    parser.add_argument("--truth", type=Path, help="write the true strands, head, poses here")
+    parser.add_argument("--truth-only", type=Path, help="write the truth here and end")
+    parser.add_argument("--cache", type=Path, help="keep the lamps' responses here between runs")
+    parser.add_argument(
+        "--spp", type=int, default=Quality.lamps, help="paths per pixel (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--drift-mm", type=float, default=1.5, help="how far the subject drifts (default: 1.5)"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""All simulated devices of one rig, started and stopped together."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from simulators.cameras import CameraLink
+from simulators.faults import Faults
+from simulators.led_bank import LedBank
+from simulators.sensor import Sensor
+from simulators.serial_peer import SerialPeer
+from simulators.trigger_box import TriggerBox
+from simulators.world import World
+from stage_service.config import DevicesConfig
+
+HOST = "127.0.0.1"
+DEVICES_FILE = "devices.toml"
+
+
+class SimulatedStage:
+    """The four peers around a `World`; a context manager.
+
+    `configured` is the rig file's `[devices]`; its TCP ports are used, or any free ones with
+    `free_ports` or without it. Inside, `devices` holds the `[devices]` table with the true ports
+    and paths, which `state/devices.toml` holds, too.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        sensor: Sensor,
+        faults: Faults,
+        state: Path,
+        configured: DevicesConfig | None = None,
+        free_ports: bool = True,
+    ) -> None:
+        self._world = world
+        self._sensor = sensor
+        self._faults = faults
+        self._state = state
+        self._configured = configured
+        self._free_ports = free_ports
+        self._stack = ExitStack()
+        self.devices: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._start(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def _start(self, stack: ExitStack) -> None:
+        self._state.mkdir(parents=True, exist_ok=True)
+        world, wires = self._world, self._configured
+        fixed = None if self._free_ports else wires
+        light_host, light_port = (fixed.lights.host, fixed.lights.port) if fixed else (HOST, 0)
+        camera_host, camera_port = (fixed.cameras.host, fixed.cameras.port) if fixed else (HOST, 0)
+        stack.callback(world.stop)
+        lights = LedBank(world.lamps, light_host, light_port, world.hanging)
+        stack.callback(lights.stop)
+        light_port = lights.start()
+        cameras = CameraLink(world, self._sensor, camera_host, camera_port)
+        stack.callback(cameras.stop)
+        camera_port = cameras.start()
+        trigger = TriggerBox(world, self._faults)
+        serial = {"trigger": trigger.reply, "projectors": world.projectors.reply}
+        paths = {}
+        for name, reply in serial.items():
+            peer = SerialPeer(self._state.absolute() / name, reply)
+            peer.start()
+            stack.callback(peer.stop)
+            paths[name] = str(peer.link)
+        self.devices = wires.model_dump(mode="json", exclude_none=True) if wires else {}
+        actual: dict[str, dict[str, Any]] = {
+            "lights": {"kind": "modbus_tcp", "host": light_host, "port": light_port},
+            "trigger": {"kind": "serial", "port": paths["trigger"]},
+            "projectors": {"kind": "serial", "port": paths["projectors"]},
+            "cameras": {"kind": "link", "host": camera_host, "port": camera_port},
+        }
+        for name, table in actual.items():
+            self.devices[name] = {**self.devices.get(name, {}), **table}
+        if not world.rig.projectors:
+            del self.devices["projectors"]
+        file = self._state / DEVICES_FILE
+        stack.callback(file.unlink, missing_ok=True)
+        ready = file.with_name(f"{file.name}.{os.getpid()}")
+        ready.write_text(_toml({"devices": self.devices}))
+        ready.replace(file)
+
+
+def _toml(table: dict[str, Any], path: str = "") -> str:
+    """`table` as TOML; its values are texts, numbers and tables, which JSON spells as TOML does."""
+    plain = {k: v for k, v in table.items() if not isinstance(v, dict)}
+    text = "".join(f"{k} = {json.dumps(v)}\n" for k, v in plain.items())
+    if path and plain:
+        text = f"[{path}]\n{text}\n"
+    for key, value in table.items():
+        if isinstance(value, dict):
+            text += _toml(value, f"{path}.{key}" if path else key)
+    return text

@@ -1,0 +1,175 @@
+"""What ties the devices together: a pulse turns their commanded state into the cameras' frames."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.rig import Rig
+from simulators.faults import Faults
+from simulators.frames import Snapshot
+from simulators.lamps import Lamps
+from simulators.projector_controller import ProjectorController, Show
+
+Counts = NDArray[np.uint16]
+MakeCounts = Callable[[str, Snapshot, float], Counts]
+_BLOCK_IDS = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class Exposed:
+    """A frame that a camera holds: `counts` may still be in the making."""
+
+    block_id: int
+    timestamp: float
+    exposure: float
+    counts: Future[Counts]
+
+
+@dataclass
+class _CameraState:
+    exposure: float | None = None  # None: not armed
+    block_id: int = 0
+    queue: deque[Exposed] = field(default_factory=deque)
+
+
+class World:
+    """The commanded state of the stage, and the frames it leads to. Safe to call from any thread.
+
+    The subject is at pose 0 until the sweep. A tracking exposure (all projectors on) after rows
+    were shown begins the next pose, which holds for the rows after it; a repeated tracking
+    exposure stays at its pose. The subject takes their place again, pose 0, when a new capture
+    begins: when the first pulse after a reset sees no light, or a lamp alone is lit.
+
+    `make` renders and exposes; it runs on one thread, frame after frame in the order of the
+    pulses. `log`, when given, gets one JSON line a pulse with its pose.
+    """
+
+    def __init__(
+        self, rig: Rig, lamps: Lamps, faults: Faults, make: MakeCounts, log: Path | None = None
+    ) -> None:
+        self.rig = rig
+        self.lamps = lamps
+        self.projectors = ProjectorController(rig.projectors, faults, lambda: self.pulses)
+        lamps.cut_by(self.safety)
+        self._faults = faults
+        self._make = make
+        self._log = log
+        self._lock = threading.RLock()
+        self._pulses = 0
+        self._fired = 0
+        self._pose = 0
+        self._rows_shown = False
+        self._cameras = {c.name: _CameraState() for c in rig.cameras}
+        self._work = ThreadPoolExecutor(1, thread_name_prefix="frames")
+        self._began = time.monotonic()
+
+    @property
+    def pulses(self) -> int:
+        """Pulses since reset."""
+        return self._pulses
+
+    def safety(self) -> tuple[bool, bool]:
+        """Whether the interlock is open, and whether the emergency stop is pressed."""
+        interlock, estop = (
+            self._faults.since("trigger", kind, self._fired) for kind in ("interlock", "estop")
+        )
+        return interlock, estop
+
+    def reset(self) -> None:
+        """Set the pulse count to 0."""
+        with self._lock:
+            self._pulses = 0
+
+    def pulse(self) -> int:
+        """Fire all armed cameras at the present state; returns the pulse count."""
+        with self._lock:
+            self._pulses += 1
+            self._fired += 1
+            power, show = self.lamps.power(), self.projectors.show
+            self._move_subject(power, show)
+            shot = Snapshot(self._pulses, power, show, self._pose)
+            for name, camera in self._cameras.items():
+                if camera.exposure is None:
+                    continue
+                if self._faults.once("camera", "drop", self._pulses, name):
+                    continue
+                self._expose(name, camera, camera.exposure, shot)
+            if self._log is not None:
+                with self._log.open("a") as log:
+                    log.write(json.dumps({"pulse": shot.pulse, "pose": shot.pose}) + "\n")
+            return self._pulses
+
+    def hello(self, camera: str) -> None:
+        """Start counting the camera's frames again; it is not armed and holds none."""
+        with self._lock:
+            self._empty(camera)
+            self._cameras[camera].exposure = None
+            self._cameras[camera].block_id = 0
+
+    def arm(self, camera: str, exposure: float | None) -> None:
+        """Arm for the next pulses with an empty queue; None disarms and leaves the queue."""
+        with self._lock:
+            if exposure is not None:
+                self._empty(camera)
+            self._cameras[camera].exposure = exposure
+
+    def oldest(self, camera: str) -> Exposed | None:
+        """The oldest frame that the camera holds, ready or not; it stays until `take`."""
+        with self._lock:
+            queue = self._cameras[camera].queue
+            return queue[0] if queue else None
+
+    def take(self, camera: str, frame: Exposed) -> None:
+        """Remove `frame`, which was the oldest, if it is still there."""
+        with self._lock:
+            queue = self._cameras[camera].queue
+            if queue and queue[0] is frame:
+                queue.popleft()
+
+    def mute(self, camera: str) -> bool:
+        """Whether a fault keeps the camera from answering."""
+        return self._faults.since("camera", "mute", self._fired, camera)
+
+    def hanging(self) -> bool:
+        """Whether a fault keeps the light bank from answering."""
+        return self._faults.since("lights", "hang", self._fired)
+
+    def stop(self) -> None:
+        """Make no more frames."""
+        with self._lock:
+            for name in self._cameras:
+                self._empty(name)
+        self._work.shutdown(wait=True, cancel_futures=True)
+
+    def _move_subject(self, power: NDArray[np.float64], show: Show) -> None:
+        lit = int(np.count_nonzero(power))
+        anew = lit == 1 or (self._pulses == 1 and lit == 0 and show.level == 0)
+        if anew:
+            self._pose, self._rows_shown = 0, False
+        elif show.everything:
+            self._pose += self._rows_shown
+            self._rows_shown = False
+        elif show.level > 0:
+            self._rows_shown = True
+
+    def _expose(self, name: str, camera: _CameraState, exposure: float, shot: Snapshot) -> None:
+        camera.block_id = camera.block_id % _BLOCK_IDS + 1
+        work = self._work.submit(self._make, name, shot, exposure)
+        now = time.monotonic() - self._began
+        camera.queue.append(Exposed(camera.block_id, now, exposure, work))
+
+    def _empty(self, camera: str) -> None:
+        queue = self._cameras[camera].queue
+        for frame in queue:
+            frame.counts.cancel()
+        queue.clear()
