@@ -27,11 +27,11 @@ def render_smoothed(
 ) -> NDArray[np.float32]:
     """Radiance `(L, H, W, 3)` under each of `lights` alone, W/(sr m²), without fireflies.
 
-    Light that a fibre sends on from another fibre has been spread by every hit before it, so it
-    varies slowly over the image, and carries nearly all of the noise. It is averaged over a Gaussian
-    of `sigma` pixels, hair and head apart, each by its share of the pixels, so that
-    nothing leaks over an edge. Direct light, with the strands' highlights and shadows, is left
-    as it is. `render_olat` is the unbiased reference; the difference is bias of the smoothing.
+    Light that a fibre sends on from another fibre has been spread by every hit before it: it varies
+    slowly over the image and carries nearly all of the noise. It is averaged over a Gaussian of
+    `sigma` pixels, hair and head apart, each by its share of the pixels, so that nothing leaks over
+    an edge. Direct light, with the strands' highlights and shadows, is left as it is. `render_olat`
+    is the unbiased reference; what differs is noise there and bias of the smoothing here.
     """
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
