@@ -10,7 +10,7 @@ from reconstruction.capture import FrameRecord, Step
 from reconstruction.capture_writer import CaptureWriter
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
-THREADS = 4
+THREADS = 8
 """Threads that flush side by side; a disk takes their flushes together."""
 
 
