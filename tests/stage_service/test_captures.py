@@ -97,8 +97,8 @@ def test_one_capture_at_a_time_and_steering(manager, world):
     assert manager.wait(second, 20).outcome == "completed"
 
 
-def test_blackout_ends_a_capture_at_once_even_while_a_camera_is_busy(manager, world):
-    world.busy = {"cam_1": 10**9}
+def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, world):
+    world.busy = {"cam_1": 10**9, "cam_2": 10**9}
     capture_id = manager.start(LONG)
     until(manager, "capture.state", state="running")
     assert manager.blackout() == {

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.errors import Cancelled
 
 T = TypeVar("T")
 
@@ -32,7 +33,8 @@ class FanOut:
     def __call__(self, call: Callable[[Camera], T]) -> dict[str, T]:
         """`call(camera)` for every camera, by name, when all are done.
 
-        Raises the error of the only camera that failed, or an `ExceptionGroup` of all that did.
+        Raises the error of the only camera that failed, or an `ExceptionGroup` of all that did;
+        `Cancelled` only where nothing else went wrong.
         """
         answers: queue.SimpleQueue[tuple[str, T | None, Exception | None]] = queue.SimpleQueue()
         for work in self._work:
@@ -45,6 +47,7 @@ class FanOut:
                 errors.append(error)
             else:
                 done[name] = value  # type: ignore[assignment]
+        errors = [e for e in errors if not isinstance(e, Cancelled)] or errors[:1]
         if len(errors) == 1:
             raise errors[0]
         if errors:

@@ -1,0 +1,187 @@
+"""One contract per device interface, run against every peer: the tests' own and the simulators'."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stage_service.config import RigFile, load_rig_file
+from stage_service.devices.errors import DeviceError
+from stage_service.devices.stage import Stage
+from stage_service.safety import blackout, check_interlocks
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+NEVER = threading.Event()
+RIG = """
+name = "small"
+[dome]
+lights = 200
+radius = 1.2
+intensity = [8.0, 8.0, 8.0]
+[[cameras]]
+name = "cam_0"
+position = [0.0, -0.95, 0.12]
+target = [0.0, 0.0, 0.0]
+fov_deg = 22.0
+width = 16
+height = 12
+[[projectors]]
+name = "left"
+position = [0.0, 1.0, 0.3]
+target = [0.0, 0.0, 0.0]
+fov_deg = 17.0
+width = 12
+height = 12
+[devices.lights]
+port = 15020
+[devices.trigger]
+port = "trigger"
+[devices.projectors]
+port = "projectors"
+[devices.cameras]
+port = 15021
+"""
+
+
+@pytest.fixture(scope="module")
+def simulators(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigFile]:
+    """`python -m simulators` for a small rig, in a process of its own."""
+    folder = tmp_path_factory.mktemp("simulators")
+    (folder / "rig.toml").write_text(RIG)
+    command = [sys.executable, "-m", "simulators", "--rig", folder / "rig.toml"]
+    with (folder / "log").open("w") as log:
+        process = subprocess.Popen(
+            [*command, "--state", folder, "--ports", "auto", "--spp", "1"],
+            cwd=CHECKOUT,
+            stdout=log,
+            stderr=log,
+            env=os.environ,
+        )
+    devices = folder / "devices.toml"
+    deadline = time.monotonic() + 60
+    while not devices.exists():
+        assert process.poll() is None, (folder / "log").read_text()
+        assert time.monotonic() < deadline, (folder / "log").read_text()
+        time.sleep(0.05)
+    yield load_rig_file(folder / "rig.toml", devices)
+    process.terminate()
+    process.wait(20)
+
+
+@pytest.fixture(params=["the tests' peers", "simulators"])
+def stage(request: pytest.FixtureRequest) -> Iterator[Stage]:
+    own = request.param != "simulators"
+    rig_file: Any = request.getfixturevalue("rig_file" if own else "simulators")
+    one = Stage.of(rig_file)
+    one.connect()
+    yield one
+    blackout(one)
+    one.close()
+
+
+def test_light_bank(stage):
+    lights = stage.lights
+    lights.set_watchdog(60.0)
+    assert lights.count == 200
+    lights.select(0)
+    assert lights.status().lit == 1
+    lights.select(199)
+    assert lights.status().lit == 1
+    lights.all_on()
+    assert lights.status().lit == 200
+    lights.heartbeat()
+    lights.set_level(0.25)
+    lights.set_level(1.0)
+    lights.off()
+    status = lights.status()
+    assert (status.lit, status.watchdog_tripped, status.estop_pressed) == (0, False, False)
+    with pytest.raises(DeviceError, match="Modbus exception 3"):
+        lights.set_watchdog(0.05)
+    lights.select(5)
+
+
+def test_trigger_box(stage):
+    trigger = stage.trigger
+    trigger.reset()
+    assert [trigger.pulse(1e-6), trigger.pulse(10.0), trigger.count()] == [1, 2, 2]
+    trigger.reset()
+    assert trigger.count() == 0
+    check_interlocks(stage)
+    with pytest.raises(DeviceError, match="ERR 1"):
+        trigger._lines.ask("FIRE", "OK", "firing")
+
+
+def test_projectors(stage):
+    projectors = stage.projectors
+    assert "left" in projectors.names
+    projectors.line("left", 11, 0.5)
+    assert not projectors.is_dark()
+    projectors.all_on(1.0)
+    assert not projectors.is_dark()
+    projectors.off()
+    assert projectors.is_dark()
+    with pytest.raises(DeviceError, match="ERR 2"):
+        projectors.line("nobody", 0, 1.0)
+
+
+def test_camera(stage):
+    camera, trigger = stage.cameras[0], stage.trigger
+    stage.lights.off()
+    assert camera.read(NEVER) is None
+    trigger.pulse(0.001)
+    assert camera.read(NEVER) is None  # not armed
+    camera.arm(0.001)
+    trigger.pulse(0.001)
+    trigger.pulse(0.001)
+    frames = [camera.read(NEVER) for _ in range(2)]
+    assert [f.block_id for f in frames] == [1, 2]
+    for frame in frames:
+        assert frame.counts.shape == (camera.info.height, camera.info.width, 3)
+        assert frame.exposure == 0.001
+        # No lamp was on: black level and its noise, nothing else.
+        np.testing.assert_allclose(frame.counts.mean(), camera.info.black, atol=1.0)
+    assert camera.read(NEVER) is None
+    trigger.pulse(0.001)
+    camera.arm(0.002)  # empties the queue
+    assert camera.read(NEVER) is None
+    trigger.pulse(0.002)
+    frame = camera.read(NEVER)
+    assert (frame.block_id, frame.exposure) == (4, 0.002)
+    camera.disarm()
+    trigger.pulse(0.001)
+    assert camera.read(NEVER) is None
+
+
+def test_blackout_is_read_back(stage):
+    stage.lights.set_watchdog(60.0)
+    stage.lights.all_on()
+    stage.projectors.all_on(1.0)
+    assert blackout(stage).safe
+    assert stage.lights.status().lit == 0
+    assert stage.projectors.is_dark()
+
+
+def test_the_simulated_bank_goes_dark_when_the_heartbeat_stops(simulators):
+    stage = Stage.of(simulators)
+    stage.lights.connect()
+    stage.lights.set_watchdog(0.1)
+    stage.lights.all_on()
+    deadline = time.monotonic() + 5
+    while stage.lights.status().lit:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert stage.lights.status().watchdog_tripped
+    stage.lights.heartbeat()
+    status = stage.lights.status()
+    assert (status.watchdog_tripped, status.lit) == (False, 0)
+    stage.lights.set_watchdog(2.0)
+    stage.close()
