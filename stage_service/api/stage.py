@@ -18,6 +18,7 @@ from stage_service.capture_status import CaptureStatus
 from stage_service.captures import CaptureManager, UnknownCapture
 from stage_service.config import RigFile
 from stage_service.events import EventLog
+from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.jobs.slots import worker_is_alive
@@ -160,6 +161,15 @@ class Stage:
         """Begin a capture. Raises `BadInput`, `PlanError`, `Busy`."""
         if request.pipeline is not None:
             _check_names(request.pipeline, self.rig_file.rig)
+            if "reconstruct" not in PIPELINES[request.pipeline.name]:
+                raise BadInput(
+                    f"pipeline: {request.pipeline.name!r} works on strands that are there already; "
+                    "a new capture has none"
+                )
+            if request.head is None:
+                raise BadInput(
+                    f"pipeline: {request.pipeline.name!r} roots strands on a scalp: give the head"
+                )
         head = None
         if request.head is not None:
             try:
@@ -225,10 +235,17 @@ class Stage:
             raise NotFinished(f"capture {request.capture} has no manifest yet: it is not finished")
         _check_names(request.pipeline, Capture(path).rig)
         job = new_job_id()
+        model = self.root / "models" / (request.model or job)
+        rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
+        if not rebuilds and not (model / "strands.npz").is_file():
+            raise BadInput(
+                f"model: {request.pipeline.name!r} needs a model with strands: name one that "
+                "'reconstruct' made"
+            )
         return self.queue.submit(
             request.pipeline.name,
             path,
-            self.root / "models" / (request.model or job),
+            model,
             request.pipeline.options,
             job=job,
         )

@@ -54,6 +54,7 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
 
 def _olat(args: argparse.Namespace) -> dict[str, Any]:
     from appearance.bench_olat import run
+
     from appearance.hair_appearance import HairAppearance
     from appearance.scene import build_scene
     from reconstruction.mesh import read_obj

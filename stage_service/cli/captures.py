@@ -45,7 +45,8 @@ def run_import(args: argparse.Namespace, output: Output) -> int:
     """Import a folder."""
     from reconstruction.import_folder import import_folder
 
-    capture = import_folder(args.folder, args.out)
+    with progress_bar("import") as progress:
+        capture = import_folder(args.folder, args.out, progress)
     counts = {
         "cameras": len(capture.rig.cameras),
         "lights": len(capture.rig.lights),

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-from stage_service.cli.output import UNREACHABLE, CommandError
+from stage_service.cli.output import BAD_INPUT, UNREACHABLE, CommandError
 
 GRACE_S = 15.0
 """How long a child may take to end by itself: the service puts the lights off in that time."""
@@ -100,7 +100,8 @@ class Children:
     def _not_ready(self, name: str, child: subprocess.Popen[str], seconds: float) -> CommandError:
         code = child.poll()
         what = f"ended with exit code {code}" if code is not None else f"not ready in {seconds} s"
-        return CommandError(f"{name}: {what}; {self._last_words(name)}", UNREACHABLE)
+        why = BAD_INPUT if code in (2, 3) else UNREACHABLE
+        return CommandError(f"{name}: {what}; {self._last_words(name)}", why)
 
     def _last_words(self, name: str) -> str:
         log = self.log(name)

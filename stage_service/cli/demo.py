@@ -18,7 +18,7 @@ from stage_service.cli.processes import exit_on_sigterm
 
 MARK = ".hairstage-demo"
 EVERY_NTH_LIGHT = 28
-"""Of the lights, so many are held out: a dozen of 331."""
+"""One of so many lights is held out: a dozen of 331. Of few lights, four are."""
 
 
 def demo(args: argparse.Namespace, output: Output) -> int:
@@ -31,6 +31,8 @@ def demo(args: argparse.Namespace, output: Output) -> int:
     for field in ("subject", "environment"):
         value = getattr(args, field)
         if "." in value or "/" in value:
+            if not Path(value).is_file():
+                raise CommandError(f"--{field}: there is no file {value}", BAD_INPUT, "BadInput")
             setattr(args, field, str(Path(value).resolve()))
     _prepare(out)
 
@@ -120,7 +122,8 @@ def _start(children: Children, args: argparse.Namespace) -> str:
 
 def _held_out(rig: Rig, camera: str | None) -> dict[str, list[str]]:
     name = rig.cameras[-1].name if camera is None else rig.camera(camera).name
-    lights = [light.name for light in rig.lights[EVERY_NTH_LIGHT // 2 :: EVERY_NTH_LIGHT]]
+    every = min(EVERY_NTH_LIGHT, max(len(rig.lights) // 4, 1))
+    lights = [light.name for light in rig.lights[every // 2 :: every]]
     return {"held_out_cameras": [name], "held_out_lights": lights}
 
 

@@ -11,6 +11,7 @@ from appearance.hair_appearance import HairAppearance
 from appearance.longitudinal import colour_of_absorption, variance_of_roughness
 from reconstruction.capture import Capture
 from reconstruction.report import Progress
+from reconstruction.report_plots import plot_geometry
 from stage_service.jobs.geometry import evaluate_geometry
 
 GROUPS = ("held_out_lights", "held_out_camera")
@@ -38,6 +39,7 @@ def gather(
         progress=progress,
     )
     controls = geometry.pop("controls")
+    plot_geometry({"ours": geometry, **controls}, model / "plots" / "geometry.png")
     results = json.loads((model / "results.json").read_text())
     return {
         "capture": {

@@ -107,17 +107,22 @@ def evaluate(context: StepContext) -> Figures:
 def results(context: StepContext) -> Figures:
     """Gather every figure of the job in `results.json`, and draw the report's plots."""
     from reconstruction.report import Report
-    from reconstruction.report_plots import plot_report
+    from reconstruction.report_plots import plot_geometry, plot_report
 
+    plots = context.model / "plots"
+    plot_report(Report.load(context.model / "report.json"), plots)
+    done = {step: result["figures"] for step, result in context.previous.items()}
     figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
-    for step, key in (("assess", "images"), ("evaluate", "geometry")):
-        found = context.previous.get(step, {}).get("figures", {})
-        if found and "left_out" not in found:
-            figures[key] = found
+    if "assess" in done:
+        figures["images"] = done["assess"]
+    if "visible" in done.get("evaluate", {}):
+        figures["geometry"] = {k: done["evaluate"][k] for k in ("visible", "all")}
+        figures["controls"] = done["evaluate"]["controls"]
+        ours = {"ours": figures["geometry"], **figures["controls"]}
+        plot_geometry(ours, plots / "geometry.png")
     part = context.model / "results.part"
     part.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
     part.replace(context.model / "results.json")
-    plot_report(Report.load(context.model / "report.json"), context.model / "plots")
     return {"results": "results.json"}
 
 

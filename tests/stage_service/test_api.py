@@ -71,6 +71,13 @@ def http(server: Server) -> httpx.Client:
     return server.http
 
 
+@pytest.fixture
+def head(tmp_path: Path) -> str:
+    path = tmp_path / "head.obj"
+    path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\ng scalp\nf 1 2 3\n")
+    return str(path)
+
+
 def capture_done(http: httpx.Client, body: dict[str, Any]) -> dict[str, Any]:
     begun = http.post("/captures", json=body)
     assert begun.status_code == 202, begun.text
@@ -104,9 +111,9 @@ def test_a_plan_is_costed_without_touching_the_stage(http, world):
     assert errors == [{"field": "body.exposures", "message": "Extra inputs are not permitted"}]
 
 
-def test_a_capture_its_frames_and_its_job(http, server):
-    body = {"plan": SHORT, "pipeline": {"name": "light_planes", "options": {"seed": 3}}}
-    done = capture_done(http, body)
+def test_a_capture_its_frames_and_its_job(http, server, head):
+    pipeline = {"name": "light_planes", "options": {"seed": 3}}
+    done = capture_done(http, {"plan": SHORT, "pipeline": pipeline, "head": head})
     assert (done["outcome"], done["frames_written"], done["frames_missing"]) == ("completed", 18, 0)
     assert [c["id"] for c in http.get("/captures").json()] == [done["id"]]
 
@@ -144,16 +151,17 @@ def test_a_capture_its_frames_and_its_job(http, server):
     assert "cam_7" in problem(refused, "bad-input")["detail"]
 
 
-def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, tmp_path):
+def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, tmp_path, head):
     server = Server(rig_file, tmp_path)
     server.stage.captures._on_complete = None  # as if killed right after the manifest
-    begun = server.http.post("/captures", json={"plan": SHORT, "pipeline": {"name": "fit"}}).json()
+    body = {"plan": SHORT, "pipeline": {"name": "reconstruct"}, "head": head}
+    begun = server.http.post("/captures", json=body).json()
     until(lambda: server.stage.captures.get(begun["id"]).state == "done")
     assert server.http.get("/jobs").json() == []
     server.stop()
     server = Server(rig_file, tmp_path)
     try:
-        assert [j["pipeline"] for j in server.http.get("/jobs").json()] == ["fit"]
+        assert [j["pipeline"] for j in server.http.get("/jobs").json()] == ["reconstruct"]
         assert server.http.get(f"/captures/{begun['id']}").json()["job"] is not None
     finally:
         server.stop()
@@ -267,6 +275,18 @@ def test_files_of_a_request_are_checked_before_anything_is_lit(http, world, tmp_
     assert "expected 8x6, got 4x4" in problem(refused, "bad-input")["detail"]
     assert http.get("/captures").json() == []
     assert world.pulses == 0
+
+
+def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, head):
+    for pipeline, given, why in (
+        ("light_planes", {}, "give the head"),
+        ("fit", {"head": head}, "strands that are there already"),
+    ):
+        refused = http.post("/captures", json={"pipeline": {"name": pipeline}, **given})
+        assert why in problem(refused, "bad-input")["detail"]
+    done = capture_done(http, {"plan": SHORT})
+    refused = http.post("/jobs", json={"capture": done["id"], "pipeline": {"name": "fit"}})
+    assert "a model with strands" in problem(refused, "bad-input")["detail"]
 
 
 def test_every_route_of_the_api_is_there_and_documented(http):

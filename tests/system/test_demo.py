@@ -1,0 +1,68 @@
+"""`hairstage demo` on the tiny rig: every figure it promises, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+
+def command(stage, out: Path) -> list[str]:
+    words = [sys.executable, "-m", "stage_service.cli", "demo", "--json", "--rig", str(stage.rig)]
+    words += ["--subject", str(stage.folder / "subject.npz")]
+    words += ["--head", str(stage.folder / "head.obj"), "--out", str(out)]
+    return words
+
+
+def processes_of(out: Path) -> list[int]:
+    """Processes that name the folder on their command line."""
+    found = []
+    for cmdline in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if str(out).encode() in cmdline.read_bytes():
+                found.append(int(cmdline.parent.name))
+        except OSError:
+            continue  # it ended while we looked
+    return found
+
+
+def test_the_demo_leaves_every_figure_and_no_process(stage):
+    out = stage.folder / "demo"
+    done = subprocess.run(command(stage, out), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    results = json.loads((out / "results.json").read_text())
+    assert json.loads(done.stdout) == results
+    assert results["seconds"] > 1
+    thresholds = {"1mm_10deg", "2mm_20deg", "3mm_30deg"}
+    for figures in (results["geometry"], *results["controls"].values()):
+        for over in ("visible", "all"):
+            assert set(figures[over]) == thresholds
+            for scores in figures[over].values():
+                assert all(0 <= scores[k] <= 1 for k in ("precision", "recall", "f"))
+    assert set(results["controls"]) == {"hull_vertical", "hull_smooth_field"}
+    for group in ("held_out_lights", "held_out_camera"):
+        for method in ("ours", "mean_colour", "diffuse", "three_nearest"):
+            assert results["images"][group][method]["psnr"] > 0
+            assert -1 <= results["images"][group][method]["ssim"] <= 1
+    fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]
+    assert set(fitted) == set(true) >= {"beta_m", "v", "colour", "skin"}
+    assert results["held_out"]["held_out_cameras"] == ["cam_2"]
+    for name in ("strands.npz", "strands.hair", "strands.usdc", "appearance.json", "report.json"):
+        assert (out / "model" / name).is_file(), name
+    assert (out / "capture" / "manifest.json").is_file()
+    assert list((out / "model" / "plots").iterdir())
+    assert processes_of(out) == []
+    # Once more into the same folder: it is the demo's own, and is replaced.
+    (out / "captures" / "old").mkdir()
+    begun = subprocess.Popen(command(stage, out), stdout=subprocess.PIPE, text=True)
+    stage.until(lambda: list(out.glob("captures/*/journal.jsonl")))
+    assert not (out / "captures" / "old").exists()
+    begun.send_signal(signal.SIGINT)
+    answer, _ = begun.communicate(timeout=60)
+    assert begun.returncode == 130
+    assert json.loads(answer)["error"]["type"] == "Interrupted"
+    assert processes_of(out) == []
+    (manifest,) = out.glob("captures/*/manifest.json")
+    assert json.loads(manifest.read_text())["outcome"] == "aborted"
