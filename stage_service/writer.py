@@ -27,13 +27,18 @@ class Shot:
 
 
 class FrameWriter:
-    """Converts and writes frames on threads of its own; at most `capacity` wait."""
+    """Converts and writes frames on threads of its own; at most `capacity` wait.
+
+    One thread puts. Frames are stored side by side and journalled in the order of `put`, so a
+    crash leaves a capture without gaps.
+    """
 
     def __init__(self, writer: CaptureWriter, capacity: int) -> None:
         self._writer = writer
-        self._queue: queue.Queue[Shot | None] = queue.Queue(capacity)
+        self._queue: queue.Queue[tuple[int, Shot] | None] = queue.Queue(capacity)
         self._error: Exception | None = None
-        self._stored: list[FrameRecord] = []
+        self._stored: dict[int, FrameRecord] = {}
+        self._next_put = self._next_commit = 0
         self._storing, self._committing = threading.Lock(), threading.Lock()
         self._threads = [
             threading.Thread(target=self._run, name=f"frame-writer-{i}", daemon=True)
@@ -45,7 +50,8 @@ class FrameWriter:
     def put(self, shot: Shot) -> None:
         """Hand over a frame; waits while the queue is full. Raises what writing raised."""
         self.check()
-        self._queue.put(shot)
+        self._queue.put((self._next_put, shot))
+        self._next_put += 1
 
     def check(self) -> None:
         """Raise what writing raised, if it did."""
@@ -61,15 +67,15 @@ class FrameWriter:
         self.check()
 
     def _run(self) -> None:
-        while (shot := self._queue.get()) is not None:
+        while (item := self._queue.get()) is not None:
             # After an error the queue is still emptied, or `put` would wait for ever.
             if self._error is None:
                 try:
-                    self._write(shot)
+                    self._write(*item)
                 except Exception as error:  # handed to the sequencer by `check`
                     self._error = error
 
-    def _write(self, shot: Shot) -> None:
+    def _write(self, number: int, shot: Shot) -> None:
         frame, info = shot.frame, shot.info
         record = self._writer.store_frame(
             shot.step,
@@ -86,10 +92,13 @@ class FrameWriter:
             attempt=shot.attempt,
         )
         with self._storing:
-            self._stored.append(record)
+            self._stored[number] = record
         # Whoever commits takes along what others stored meanwhile: one flush for all of it.
         with self._committing:
+            batch = []
             with self._storing:
-                batch, self._stored = self._stored, []
+                while self._next_commit in self._stored:
+                    batch.append(self._stored.pop(self._next_commit))
+                    self._next_commit += 1
             if batch:
                 self._writer.commit(batch)
