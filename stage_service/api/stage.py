@@ -92,6 +92,32 @@ class JobRequest(BaseModel):
 class CaptureView(CaptureStatus):
     """A capture's status and the job that its completion enqueued."""
 
+    model_config = ConfigDict(
+        frozen=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "20261121-093000-1f2e",
+                    "state": "done",
+                    "outcome": "completed",
+                    "error": None,
+                    "path": "/data/stage/captures/20261121-093000-1f2e",
+                    "steps": 545,
+                    "step": 545,
+                    "frames_planned": 4360,
+                    "frames_written": 4360,
+                    "frames_missing": 0,
+                    "seconds_predicted": 29.6,
+                    "seconds": 31.2,
+                    "left_out": [],
+                    "started": "2026-11-21T09:30:00.123+00:00",
+                    "request": {"pipeline": {"name": "light_planes", "options": {}}},
+                    "job": "job-20261121-093000-1f2e",
+                }
+            ]
+        },
+    )
+
     job: str | None
 
 

@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
         run_bench,
         "measure error against run time",
         "olat: our renderer of many lights against Mitsuba's own path integrator, light by light. "
-        "all: every one of them. Results go to OUT/<name>.json.",
+        "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
     )
     bench.add_argument("name", choices=[*NAMES, "all"])
     bench.add_argument("--out", type=Path, default=Path("runs/bench"))
@@ -43,20 +43,13 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
     """Run one benchmark, or all."""
     names = NAMES if args.name == "all" else (args.name,)
     args.out.mkdir(parents=True, exist_ok=True)
-    results: dict[str, Any] = {}
-    for name in names:
-        results[name] = {"olat": _olat}[name](args)
-        text = json.dumps(results[name], indent=1, allow_nan=False)
-        (args.out / f"{name}.json").write_text(text + "\n")
-    output.result(results)
+    output.result({name: {"olat": _olat}[name](args) for name in names})
     return 0
 
 
 def _olat(args: argparse.Namespace) -> dict[str, Any]:
     from appearance.bench_olat import run
-
     from appearance.hair_appearance import HairAppearance
-    from appearance.scene import build_scene
     from reconstruction.mesh import read_obj
     from reconstruction.rig import Rig
     from reconstruction.strand_files import read_strands
@@ -68,13 +61,17 @@ def _olat(args: argparse.Namespace) -> dict[str, Any]:
         _write_truth(args, truth)
         appearance = json.loads((truth / "appearance.json").read_text())
         head = truth / "head.obj"
-        scene = build_scene(
-            read_strands(truth / "strands.npz"),
-            read_obj(head) if head.is_file() else None,
+        progress("rendering", 0.1)
+        return run(
+            args.out,
+            strands=read_strands(truth / "strands.npz"),
+            head=read_obj(head) if head.is_file() else None,
             hair=HairAppearance.from_dict(appearance["hair"]),
-            skin=appearance["skin"],
+            skin=tuple(appearance["skin"]),
+            camera=rig.cameras[0],
+            lights=rig.lights,
+            seed=args.seed,
         )
-        return run(scene, rig.cameras[0], rig.lights, progress=progress)
 
 
 def _write_truth(args: argparse.Namespace, folder: Path) -> None:

@@ -72,7 +72,40 @@ class JobError(BaseModel):
 class Job(BaseModel):
     """One run of a pipeline. `outcome` is set exactly when `state` is `done`; times are UTC."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(
+        frozen=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "job-20261121-093000-1f2e",
+                    "pipeline": "light_planes",
+                    "state": "running",
+                    "outcome": None,
+                    "capture": "/data/stage/captures/20261121-093000-1f2e",
+                    "model": "/data/stage/models/20261121-093000-1f2e",
+                    "options": {"held_out_cameras": ["cam_07"], "environment": "studio"},
+                    "progress": {
+                        "step": "reconstruct",
+                        "steps": [
+                            "compress",
+                            "reconstruct",
+                            "fit",
+                            "assess",
+                            "evaluate",
+                            "results",
+                        ],
+                        "what": "tracing strands",
+                        "share": 0.28,
+                        "step_share": 0.7,
+                    },
+                    "error": None,
+                    "created": "2026-11-21T09:31:12.000+00:00",
+                    "started": "2026-11-21T09:31:13.000+00:00",
+                    "finished": None,
+                }
+            ]
+        },
+    )
 
     id: str
     pipeline: str
