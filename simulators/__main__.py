@@ -43,14 +43,14 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--spp must be at least 1, got {args.spp}")
     try:
         rig_file = load_rig_file(args.rig)
+        cameras = [c.name for c in rig_file.rig.cameras]
+        faults = Faults.load(args.faults, cameras) if args.faults else Faults()
         subject = load_subject(args.subject, args.head, seed=args.seed)
         check_fits(subject, rig_file.rig)
         drift = Drift(_poses(rig_file), args.drift_mm * 1e-3, args.seed)
         if args.truth_only is not None:
             write_truth(args.truth_only, subject, drift)
             return 0
-        cameras = [c.name for c in rig_file.rig.cameras]
-        faults = Faults.load(args.faults, cameras) if args.faults else Faults()
         if args.truth is not None:
             write_truth(args.truth, subject, drift)
     except (ValueError, RigError, OSError) as error:

@@ -16,7 +16,8 @@ EXPOSURES = "exposures.jsonl"
 def write_truth(folder: Path, subject: Subject, drift: Drift) -> None:
     """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`.
 
-    All at pose 0. `exposures.jsonl` beside them, begun empty here and continued by `World`, says the pose of each pulse.
+    All at pose 0. `exposures.jsonl` beside them, begun empty here and continued by `World`, says
+    the pose of each pulse.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_strands(folder / "strands.npz", subject.strands)

@@ -1,0 +1,70 @@
+"""The command that runs the simulated rig."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+RIG = """
+[[cameras]]
+name = "cam"
+position = [0.0, -0.95, 0.1]
+target = [0.0, 0.0, 0.0]
+fov_deg = 22.0
+width = 8
+height = 8
+[[lights]]
+name = "lamp"
+position = [0.0, -1.2, 0.3]
+intensity = [8.0, 8.0, 8.0]
+"""
+
+
+@pytest.fixture
+def rig_file(tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text(RIG)
+    return file
+
+
+def run(*arguments, **more):
+    command = [sys.executable, "-m", "simulators", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=-1, stderr=-1, text=True, **more)
+
+
+def test_the_command_says_when_it_is_ready_and_ends_on_sigterm(rig_file, tmp_path):
+    state, truth = tmp_path / "state", tmp_path / "truth"
+    with run("--rig", rig_file, "--state", state, "--truth", truth, "--ports", "auto") as process:
+        ready = json.loads(process.stdout.readline())
+        devices = tomllib.loads((state / "devices.toml").read_text())["devices"]
+        assert ready["ready"] is True
+        assert {k: ready[k] for k in devices} == devices
+        assert set(devices) == {"lights", "trigger", "cameras"}
+        assert (state / "trigger").is_symlink()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+        assert process.stderr.read() == ""
+    assert list(state.iterdir()) == []
+    names = {"strands.npz", "head.obj", "appearance.json", "poses.json", "exposures.jsonl"}
+    assert {f.name for f in truth.iterdir()} == names
+    assert set(json.loads((truth / "appearance.json").read_text())) == {"hair", "skin"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--subject", "afro", "--state", "s"], "no subject 'afro'"),
+        (["--state", "s", "--faults", "none.json"], "none.json"),
+        ([], "--state FOLDER is required"),
+    ],
+)
+def test_wrong_arguments_end_it_with_code_2(rig_file, arguments, said):
+    with run("--rig", rig_file, *arguments) as process:
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert said in errors
