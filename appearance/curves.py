@@ -21,10 +21,9 @@ def spline_control_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Control points `(N + 2 S, 4)` (x, y, z, radius) and first control points of the segments.
 
-    The cubic segments `(N - S,)` number as the strands' own segments do, strand after strand, unless
-    a strand's points are spaced too unevenly: then all strands are resampled at equal arc lengths
-    first. Points are interpolated with natural ends (no curvature at root and tip), solved for
-    all strands of one length at a time.
+    Points are interpolated with natural ends (no curvature at root and tip), for all strands of one
+    length at a time. Strands whose points are spaced too unevenly are resampled at equal arc
+    lengths first, as many points as before.
     """
     strands = _evened(strands)
     counts = np.diff(strands.offsets)
@@ -70,19 +69,35 @@ def _interpolating(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _evened(strands: Strands) -> Strands:
-    """`strands`, resampled where segment lengths within a strand differ too much."""
-    starts = strands.segment_starts
-    length = np.linalg.norm(
-        strands.points[starts + 1].astype(float) - strands.points[starts].astype(float), axis=1
-    )
-    if len(length) == 0:
+    """`strands` with the unevenly spaced ones resampled at their own mean segment length."""
+    if len(strands) == 0:
         return strands
+    starts = strands.segment_starts
+    points = strands.points.astype(float)
+    length = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
     edges = strands.offsets[:-1] - np.arange(len(strands))
     longest = np.maximum.reduceat(length, edges)
     shortest = np.minimum.reduceat(length, edges)
-    if (longest <= MOST_UNEVEN * shortest).all():
+    uneven = np.flatnonzero(longest > MOST_UNEVEN * shortest)
+    if len(uneven) == 0:
         return strands
-    return strands.resampled(float(np.median(length)))
+    arc = np.zeros(len(points))
+    arc[starts + 1] = length
+    arc = np.cumsum(arc)
+    radius = np.broadcast_to(np.asarray(strands.radius, float), len(points))
+    out, out_radius = points.copy(), radius.copy()
+    for i in uneven:
+        span = slice(strands.offsets[i], strands.offsets[i + 1])
+        at = np.linspace(arc[span][0], arc[span][-1], len(arc[span]))
+        for k in range(3):
+            out[span, k] = np.interp(at, arc[span], points[span, k])
+        out_radius[span] = np.interp(at, arc[span], radius[span])
+    varies = isinstance(strands.radius, np.ndarray)
+    return Strands(
+        out.astype(np.float32),
+        strands.offsets,
+        out_radius.astype(np.float32) if varies else strands.radius,
+    )
 
 
 def _ranges(counts: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -44,7 +44,7 @@ class HairAppearance:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Read what `to_dict` wrote; raises `ValueError` naming a field that is unknown or absent."""
+        """Read what `to_dict` wrote; `ValueError` names a field that is unknown or absent."""
         known = {f.name for f in fields(cls)}
         if unknown := set(data) - known:
             raise ValueError(f"hair: unknown fields {sorted(unknown)}; known are {sorted(known)}")

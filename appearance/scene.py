@@ -47,6 +47,27 @@ class HairScene:
         """The same geometry with another hair material; nothing is rebuilt."""
         return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair))
 
+    def material_shapes(self) -> dict[str, Any]:
+        """The shapes with their materials attached, as Mitsuba's own integrators expect them.
+
+        For comparisons with Mitsuba: the shapes are shared with this scene and keep the materials
+        of the latest call. Fibres are attached stock BSDFs, the head a two-sided `diffuse`.
+        """
+        import mitsuba as mi
+
+        shapes: dict[str, Any] = {}
+        if self.hair_shape is not None:
+            bsdf = self.hair_bsdf
+            if isinstance(self.hair, DiffuseHair):
+                bsdf = mi.load_dict(_diffuse(self.hair.albedo))
+            self.hair_shape.set_bsdf(bsdf)
+            shapes["hair"] = self.hair_shape
+        if self.head_shape is not None:
+            skin = {"type": "twosided", "material": _diffuse(self.skin)}
+            self.head_shape.set_bsdf(mi.load_dict(skin))
+            shapes["head"] = self.head_shape
+        return shapes
+
     def with_skin(self, skin: ArrayLike) -> HairScene:
         """The same geometry with another diffuse albedo `skin (3,)` on the head."""
         return replace(self, skin=_albedo(skin))
@@ -103,19 +124,23 @@ def _hair_bsdf(hair: HairAppearance | DiffuseHair) -> Any | None:
     import mitsuba as mi
 
     bsdf = mi.load_dict(mitsuba_hair(hair))
-    parameters = mi.traverse(bsdf)
+    parameters: Any = mi.traverse(bsdf)
     # A touched parameter becomes a variable of the kernels: fits change it without recompiling.
     for name in ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta"):
-        parameters[name] = dr.opaque(mi.Float, float(parameters[name][0]))
+        parameters[name] = dr.opaque(mi.Float, parameters[name][0])
     parameters["sigma_a.value"] = mi.Color3f(*(dr.opaque(mi.Float, s) for s in hair.sigma_a))
     parameters.update()
     return bsdf
 
 
+def _diffuse(albedo: tuple[float, float, float]) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}}
+
+
 def _albedo(skin: ArrayLike) -> tuple[float, float, float]:
     values = np.asarray(skin, float)
     if values.shape != (3,) or not ((values >= 0) & (values <= 1)).all():
-        raise ValueError(f"skin must be an albedo of 3 numbers in [0, 1], got {skin}")
+        raise ValueError(f"skin must be an albedo of 3 numbers in [0, 1], got {values}")
     return float(values[0]), float(values[1]), float(values[2])
 
 

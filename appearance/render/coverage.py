@@ -13,7 +13,7 @@ from reconstruction.cameras import Camera
 def coverage(
     scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0
 ) -> dict[str, NDArray[np.float32]]:
-    """Share of each pixel that shows hair and head: `{"hair": (H, W), "head": (H, W)}` in [0, 1]."""
+    """Share of each pixel that shows `"hair"` and `"head"`: two images `(H, W)` in [0, 1]."""
     import drjit as dr
     import mitsuba as mi
 
@@ -22,9 +22,7 @@ def coverage(
     size = camera.width * camera.height
     paths = wave(camera, dr.arange(mi.UInt32, size), size, 0, spp, spp, seed)
     surface = Surface(scene)
-    pi = scene.mi_scene.ray_intersect_preliminary(
-        paths.rays, coherent=True
-    )
+    pi = scene.mi_scene.ray_intersect_preliminary(paths.rays, coherent=True)
     hit = pi.is_valid()
     hair = hit & surface.is_hair(pi)
     out = {}
@@ -36,7 +34,7 @@ def coverage(
     return out
 
 
-def covered_pixels(scene: HairScene, camera: Camera, spp: int = 16) -> NDArray[np.int64]:
+def covered_pixels(scene: HairScene, camera: Camera, spp: int = 9) -> NDArray[np.int64]:
     """Flat indices `(P,)` of the pixels that see the subject in at least one of `spp` samples.
 
     A pixel that the subject covers by less than 1/`spp` may be left out, and reads as background.

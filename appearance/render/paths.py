@@ -100,9 +100,7 @@ class Surface:
         wo.z = dr.select(inside, -wo.z, wo.z)
         weight = dr.select(hair & (si.wi.z < 0), 0, self._diffuse(hair))
         if self.scene.hair_bsdf is not None:
-            sample, value = self.scene.hair_bsdf.sample(
-                mi.BSDFContext(), si, u1, u2, active & hair
-            )
+            sample, value = self.scene.hair_bsdf.sample(mi.BSDFContext(), si, u1, u2, active & hair)
             wo = dr.select(hair, sample.wo, wo)
             weight = dr.select(hair, value, weight)
         return wo, dr.select(active, weight, 0)
@@ -161,6 +159,35 @@ def walk(
         return si, throughput, depth, rng, active & (depth + 1 < max_depth)
 
     dr.while_loop((si, throughput, mi.UInt32(0), rng, active), more, body, label="path")
+
+
+def light_from(
+    surface: Surface,
+    si: Any,
+    throughput: Any,
+    target: Any,
+    intensity: Any,
+    dim: Any,
+    chance: Any,
+    active: Any,
+) -> tuple[Any, Any]:
+    """Radiance that a point light at `target` sends along the path, and where it arrives.
+
+    A contribution below `dim` casts its shadow ray only with probability contribution/`dim` (by
+    `chance` in [0, 1)) and then counts as `dim`: the mean stays, and shadow rays, which cost ten
+    times what the BSDF does, go where the light is.
+    """
+    import drjit as dr
+
+    towards = target - si.p
+    squared = dr.squared_norm(towards)
+    wo = si.to_local(towards * dr.rsqrt(squared))
+    value = throughput * surface.eval(si, wo, active) * (intensity / squared)
+    brightest = dr.max(value)
+    kept = dr.maximum(brightest, dim)
+    lit = active & (chance * kept < brightest)
+    lit &= ~surface.scene.mi_scene.ray_test(si.spawn_ray_to(target), lit)
+    return value * (kept / brightest), lit
 
 
 def continue_path(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import (
     Surface,
+    light_from,
     opaque,
     opaque_index,
     opaque_matrix,
@@ -25,6 +26,8 @@ from reconstruction.cameras import Camera
 from reconstruction.projectors import Projector
 
 _LANES = 1 << 20
+_PILOT = 512  # pixels of the pilot pass
+_PILOT_STREAM = 1 << 31
 _REACH = 4.0  # standard deviations of the line's blur beyond which a row is not asked
 
 
@@ -38,7 +41,8 @@ def render_scanlines(
     seed: int = 0,
     pixels: ArrayLike | None = None,
     rows: Mapping[str, range] | None = None,
-    rr_depth: int = 4,
+    rr_depth: int = 3,
+    thrift: float = 1.0,
 ) -> dict[str, NDArray[np.float32]]:
     """Radiance of each row of each projector at full level, W/(sr m²).
 
@@ -46,6 +50,7 @@ def render_scanlines(
     indices). Every vertex of a camera path that a projector sees lies on one fractional row of it:
     its light goes to the few rows within reach of the line's blur (`Projector.row_weight`), so one
     pass answers the whole sweep. The sum over all rows is that projector with all rows on.
+    Roulette of shadow rays (`thrift`) and of paths (`rr_depth`) as in `render_olat`.
     `rows` limits a projector to a range of its rows. A moved subject is rendered with the camera
     and the projectors `moved` instead: the scene stays as it is.
     """
@@ -56,7 +61,10 @@ def render_scanlines(
     if unknown := set(rows or {}) - set(names):
         raise ValueError(f"rows names unknown projectors {sorted(unknown)}; there are {names}")
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    films = _render(scene, camera, projectors, index, ranges, spp, max_depth, seed, rr_depth)
+    plan = _Plan(projectors, ranges, max_depth, rr_depth, (0.0,) * len(projectors))
+    if thrift > 0 and len(index):
+        plan = replace(plan, dim=_dim(scene, camera, index, plan, seed, thrift))
+    films = _render(scene, camera, index, plan, spp, (seed, 0))
     if pixels is not None:
         return films
     out = {}
@@ -77,21 +85,44 @@ def _rows(projector: Projector, rows: range | None) -> range:
     return wanted
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """What is swept, and how paths and shadow rays are spent; `dim` as in `light_from`."""
+
+    projectors: Sequence[Projector]
+    rows: dict[str, range]
+    max_depth: int
+    rr_depth: int
+    dim: tuple[float, ...]
+
+
+def _dim(
+    scene: HairScene,
+    camera: Camera,
+    index: NDArray[np.int64],
+    plan: _Plan,
+    seed: int,
+    thrift: float,
+) -> tuple[float, ...]:
+    """`thrift` times the mean radiance under each projector, from a few paths."""
+    few = index[:: max(1, len(index) // _PILOT)]
+    films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))
+    return tuple(thrift * float(f.sum(0).mean(0).max(initial=0.0)) for f in films.values())
+
+
 def _render(
     scene: HairScene,
     camera: Camera,
-    projectors: Sequence[Projector],
     index: NDArray[np.int64],
-    ranges: dict[str, range],
+    plan: _Plan,
     spp: int,
-    max_depth: int,
-    seed: int,
-    rr_depth: int,
+    seed: tuple[int, int],
 ) -> dict[str, NDArray[np.float32]]:
     """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
     import drjit as dr
     import mitsuba as mi
 
+    projectors, ranges = plan.projectors, plan.rows
     n = len(index)
     if n == 0:
         return {p.name: np.zeros((len(ranges[p.name]), 0, 3), np.float32) for p in projectors}
@@ -99,10 +130,10 @@ def _render(
     pixel = mi.UInt32(index.astype(np.uint32))
     surface = Surface(scene)
     for first, count in passes(spp, max(1, _LANES // n)):
-        paths = wave(camera, pixel, n, first, count, spp, seed)
+        paths = wave(camera, pixel, n, first, count, spp, *seed)
         gathers = [
-            _Gather(surface, film, paths.slot, opaque_index(n), p, ranges[p.name])
-            for p, film in zip(projectors, films, strict=True)
+            _Gather(surface, film, paths.slot, opaque_index(n), p, ranges[p.name], dim)
+            for p, film, dim in zip(projectors, films, plan.dim, strict=True)
         ]
 
         def gather(
@@ -114,9 +145,9 @@ def _render(
             gathers: list[_Gather] = gathers,
         ) -> None:
             for one in gathers:
-                one(si, throughput, active)
+                one(si, throughput, rng.next_float32(), active)
 
-        walk(surface, paths.rays, paths.rng, gather, max_depth, rr_depth)
+        walk(surface, paths.rays, paths.rng, gather, plan.max_depth, plan.rr_depth)
         dr.eval(films)
     return {
         p.name: np.array(film, dtype=np.float32).reshape(len(ranges[p.name]), n, 3)
@@ -135,9 +166,9 @@ class _Gather:
     slots: Any
     projector: Projector
     rows: range
+    dim: float
 
-    def __call__(self, si: Any, throughput: Any, active: Any) -> None:
-        import drjit as dr
+    def __call__(self, si: Any, throughput: Any, chance: Any, active: Any) -> None:
         import mitsuba as mi
 
         if not self.rows:
@@ -152,13 +183,9 @@ class _Gather:
         reach = _REACH * p.line_sigma + 0.5
         low, high = opaque([self.rows.start - reach, self.rows.stop - 1 + reach])
         seen = active & (local.z > 0) & (u >= -0.5) & (u < k[5]) & (v > low) & (v < high)
-        towards = centre - si.p
-        squared = dr.squared_norm(towards)
-        wo = si.to_local(towards * dr.rsqrt(squared))
-        value = throughput * self.surface.eval(si, wo, seen)
-        value *= mi.Color3f(*opaque(p.intensity * SCALE**2)) / squared
-        seen &= dr.max(value) > 0
-        seen &= ~self.surface.scene.mi_scene.ray_test(si.spawn_ray_to(centre), seen)
+        intensity = mi.Color3f(*opaque(p.intensity * SCALE**2))
+        (dim,) = opaque(self.dim)
+        value, seen = light_from(self.surface, si, throughput, centre, intensity, dim, chance, seen)
         self._splat(value, v, reach, seen)
 
     def _splat(self, value: Any, v: Any, reach: float, seen: Any) -> None:

@@ -1,0 +1,161 @@
+"""Pictures under an environment map: lat-long radiance all around the subject.
+
+Orientation: row 0 of a map `(h, w, 3)` is the zenith (+z), the last row the nadir; the middle
+column looks along +x and columns to its right turn clockwise seen from above (towards −y), so that a
+map is upright and not mirrored when seen from inside. Blender's equirectangular convention.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.render.coverage import covered_pixels
+from appearance.render.environment_maps import check_environment
+from appearance.render.paths import (
+    Surface,
+    camera_rays,
+    opaque,
+    opaque_index,
+    passes,
+    walk,
+    wave,
+)
+from appearance.scene import HairScene
+from reconstruction.cameras import Camera
+
+_LANES = 1 << 20
+
+
+def render_environment(
+    scene: HairScene,
+    camera: Camera,
+    envmap: NDArray[np.floating],
+    *,
+    spp: int = 64,
+    max_depth: int = 24,
+    seed: int = 0,
+    rotation_deg: float = 0.0,
+    background: bool = False,
+    rr_depth: int = 4,
+) -> NDArray[np.float32]:
+    """Radiance `(H, W, 3)`, W/(sr m²), of the subject lit by `envmap (h, w, 3)` alone.
+
+    `rotation_deg` turns the map counter-clockwise seen from above. Pixels off the subject are 0,
+    or the map with `background`. Each vertex of a path asks one direction, drawn in proportion to
+    the map's brightness. Raises `ValueError` for maps that are negative or not finite.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if spp < 1 or max_depth < 1:
+        raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
+    sky = _Sky.of(check_environment(envmap, "envmap"), rotation_deg)
+    image = np.zeros((camera.height * camera.width, 3), np.float32)
+    if background:
+        row, column = np.divmod(np.arange(len(image)), camera.width)
+        rays = camera_rays(camera, mi.Float(column + 0.5), mi.Float(row + 0.5))
+        image[:] = np.array(sky.radiance(rays.d)).T
+    index = covered_pixels(scene, camera)
+    if len(index):
+        pixel = mi.UInt32(index.astype(np.uint32))
+        film = dr.zeros(mi.Float, 3 * len(index))
+        for first, count in passes(spp, max(1, _LANES // len(index))):
+            paths = wave(camera, pixel, len(index), first, count, spp, seed)
+            if background:
+                missed = ~scene.mi_scene.ray_test(paths.rays)
+                _add(film, paths.slot, sky.radiance(paths.rays.d), missed)
+            gather = _Gather(Surface(scene), film, paths.slot, sky)
+            walk(gather.surface, paths.rays, paths.rng, gather, max_depth, rr_depth)
+            dr.eval(film)
+        image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def _add(film: Any, slot: Any, value: Any, active: Any) -> None:
+    import drjit as dr
+
+    for channel in range(3):
+        dr.scatter_add(film, value[channel], slot * 3 + channel, active)
+
+
+@dataclass(frozen=True)
+class _Sky:
+    """A map on the device, constant over each texel."""
+
+    texels: Any
+    distribution: Any
+    width: Any
+    height: Any
+    turn: Any
+
+    @classmethod
+    def of(cls, envmap: NDArray[np.float32], rotation_deg: float) -> _Sky:
+        import mitsuba as mi
+
+        height, width = envmap.shape[:2]
+        edges = np.cos(np.linspace(0, np.pi, height + 1))
+        weight = envmap.astype(float).sum(-1) * (edges[:-1] - edges[1:])[:, None]
+        weight = np.maximum(weight, 1e-6 * weight.max(initial=0.0))
+        if weight.max(initial=0.0) == 0:
+            weight = np.ones_like(weight)
+        (turn,) = opaque(rotation_deg / 360)
+        return cls(
+            mi.Float(envmap.astype(np.float32).ravel()),
+            mi.DiscreteDistribution(mi.Float((weight / weight.sum()).ravel())),
+            opaque_index(width),
+            opaque_index(height),
+            turn,
+        )
+
+    def radiance(self, direction: Any) -> Any:
+        """`Color3f` that arrives from `direction`."""
+        import drjit as dr
+        import mitsuba as mi
+
+        u = 0.5 + self.turn - dr.atan2(direction.y, direction.x) * dr.inv_two_pi
+        u = u - dr.floor(u)
+        v = dr.safe_acos(direction.z) * dr.inv_pi
+        column = dr.minimum(mi.UInt32(u * mi.Float(self.width)), self.width - 1)
+        row = dr.minimum(mi.UInt32(v * mi.Float(self.height)), self.height - 1)
+        return dr.gather(mi.Color3f, self.texels, row * self.width + column)
+
+    def sample(self, rng: Any, active: Any) -> tuple[Any, Any]:
+        """A direction, and its radiance divided by the density of the draw."""
+        import drjit as dr
+        import mitsuba as mi
+
+        texel, chance = self.distribution.sample_pmf(rng.next_float32(), active)
+        row = texel // self.width
+        u = (mi.Float(texel - row * self.width) + rng.next_float32()) / mi.Float(self.width)
+        # Uniform in solid angle over the texel: its rows bound z, not the angle.
+        top = dr.cos(dr.pi * mi.Float(row) / mi.Float(self.height))
+        bottom = dr.cos(dr.pi * mi.Float(row + 1) / mi.Float(self.height))
+        z = dr.lerp(top, bottom, rng.next_float32())
+        sin, cos = dr.sincos((0.5 + self.turn - u) * dr.two_pi)
+        radius = dr.safe_sqrt(1 - z * z)
+        solid_angle = (top - bottom) * dr.two_pi / mi.Float(self.width)
+        value = dr.gather(mi.Color3f, self.texels, texel, active) * (solid_angle / chance)
+        return mi.Vector3f(radius * cos, radius * sin, z), value
+
+
+@dataclass(frozen=True)
+class _Gather:
+    """Light from one direction of the sky at a path's vertex."""
+
+    surface: Surface
+    film: Any
+    slot: Any
+    sky: _Sky
+
+    def __call__(self, si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
+        import drjit as dr
+
+        towards, light = self.sky.sample(rng, active)
+        value = throughput * light * self.surface.eval(si, si.to_local(towards), active)
+        lit = active & (dr.max(value) > 0)
+        lit &= ~self.surface.scene.mi_scene.ray_test(si.spawn_ray(towards), lit)
+        _add(self.film, self.slot, value, lit)

@@ -1,0 +1,119 @@
+"""Environment maps: the project's own procedural ones, and readers for the user's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.exr import read_exr
+
+Image = NDArray[np.float32]
+
+
+def load_environment(path: str | Path) -> Image:
+    """Read a lat-long map `(h, w, 3)`, scene-linear RGB, from Radiance `.hdr` or OpenEXR `.exr`.
+
+    Raises `ValueError` that names the file when it is absent, of another kind, negative or not
+    finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such environment map")
+    if path.suffix.lower() == ".exr":
+        return check_environment(read_exr(path)[0], str(path))
+    if path.suffix.lower() != ".hdr":
+        raise ValueError(f"{path}: an environment map must be .hdr or .exr")
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.dtype != np.float32:
+        raise ValueError(f"{path}: cannot be read as a Radiance .hdr image")
+    return check_environment(np.ascontiguousarray(image[:, :, 2::-1]), str(path))
+
+
+def check_environment(envmap: NDArray[np.floating], name: str) -> Image:
+    """`envmap` as float32; raises `ValueError` unless it is `(h, w, 3)`, finite and not negative."""
+    image = np.asarray(envmap, np.float32)
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"{name}: expected a map of shape (h, w, 3), got {image.shape}")
+    wrong = ~np.isfinite(image) | (image < 0)
+    if wrong.any():
+        row, column, channel = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"{name}: radiance must be finite and not negative, but {int(wrong.sum())} values are "
+            f"not, the first at row {row}, column {column}: {image[row, column, channel]}"
+        )
+    return image
+
+
+def studio(height: int = 128) -> Image:
+    """A dim grey room with three soft boxes `(height, 2 height, 3)`: key, cool fill, warm rim.
+
+    The key is in front of a subject that faces −y, high on its right; mean radiance about 1.
+    """
+    direction = _directions(height)
+    image = np.empty((height, 2 * height, 3), np.float32)
+    image[:] = (0.08 + 0.06 * np.clip(direction[..., 2:] + 0.5, 0, 1)) * np.array([1, 1, 1.05])
+    for azimuth, elevation, half_width, half_height, colour in (
+        (-125.0, 38.0, 22.0, 18.0, (22.0, 20.5, 18.5)),
+        (-40.0, 12.0, 26.0, 30.0, (2.2, 2.6, 3.2)),
+        (75.0, 42.0, 12.0, 20.0, (26.0, 22.0, 17.0)),
+    ):
+        image += _soft_box(direction, azimuth, elevation, half_width, half_height)[
+            ..., None
+        ] * np.array(colour, np.float32)
+    return image
+
+
+def sky(
+    height: int = 128, sun_azimuth_deg: float = -120.0, sun_elevation_deg: float = 40.0
+) -> Image:
+    """A clear sky with a sun 4° wide over grey ground `(height, 2 height, 3)`.
+
+    A gradient from a pale horizon to a blue zenith with a glow about the sun; not a physical sky
+    model. Azimuth in the world's frame, from +x towards +y.
+    """
+    direction = _directions(height)
+    up = direction[..., 2:]
+    horizon, zenith = np.array([0.9, 0.95, 1.0]), np.array([0.18, 0.34, 0.75])
+    image = horizon + (zenith - horizon) * np.sqrt(np.clip(up, 0, 1))
+    cosine = (direction * _unit(sun_azimuth_deg, sun_elevation_deg)).sum(-1, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    warm = np.array([1.0, 0.92, 0.8])
+    image = image + 1.5 * warm * np.exp(-angle / 12.0)
+    image = np.where(up < 0, np.array([0.16, 0.15, 0.13]), image)
+    image = image + 900.0 * warm * np.clip(2.0 - angle + 0.5, 0, 1)
+    return image.astype(np.float32)
+
+
+def _directions(height: int) -> NDArray[np.float64]:
+    """Unit directions `(height, 2 height, 3)` of the texels' centres; see `render.environment`."""
+    if height < 2:
+        raise ValueError(f"an environment map needs at least 2 rows, got {height}")
+    theta = np.pi * (np.arange(height) + 0.5)[:, None] / height
+    phi = 2 * np.pi * (0.5 - (np.arange(2 * height) + 0.5) / (2 * height))
+    z = np.broadcast_to(np.cos(theta), (height, 2 * height))
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), z], axis=-1)
+
+
+def _unit(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+    a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+def _soft_box(
+    direction: NDArray[np.float64],
+    azimuth_deg: float,
+    elevation_deg: float,
+    half_width_deg: float,
+    half_height_deg: float,
+) -> NDArray[np.float32]:
+    """Share `(h, w)` of a rectangle on the sphere, its edge soft over 2°."""
+    elevation = np.degrees(np.arcsin(np.clip(direction[..., 2], -1, 1)))
+    azimuth = np.degrees(np.arctan2(direction[..., 1], direction[..., 0]))
+    across = np.abs((azimuth - azimuth_deg + 180) % 360 - 180)
+    along = np.abs(elevation - elevation_deg)
+    edge_x = np.clip((half_width_deg - across) / 2 + 0.5, 0, 1)
+    edge_y = np.clip((half_height_deg - along) / 2 + 0.5, 0, 1)
+    return (edge_x * edge_y).astype(np.float32)
