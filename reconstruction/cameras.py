@@ -86,7 +86,7 @@ class Pinhole:
         """
         local = np.asarray(points, float) @ self.R.T + self.t
         z = local[..., 2]
-        xy = local[..., :2] / np.where(z == 0, np.finfo(float).tiny, z)[..., None]
+        xy = local[..., :2] / np.where(np.abs(z) < 1e-12, 1e-12, z)[..., None]
         pixels = np.stack(
             [
                 self.K[0, 0] * xy[..., 0] + self.K[0, 1] * xy[..., 1] + self.K[0, 2],

@@ -75,7 +75,8 @@ def read_obj(path: str | Path) -> Mesh:
             continue
         try:
             if words[0] == "v":
-                vertices.append([float(w) for w in words[1:4]])
+                x, y, z = (float(w) for w in words[1:4])
+                vertices.append([x, y, z])
             elif words[0] == "f":
                 index = [int(w.split("/")[0]) for w in words[1:]]
                 index = [i - 1 if i > 0 else len(vertices) + i for i in index]
@@ -88,7 +89,10 @@ def read_obj(path: str | Path) -> Mesh:
             raise ValueError(f"{path}, line {number}: {error}") from error
     if not faces:
         raise ValueError(f"{path}: no faces; expected a triangle mesh in Wavefront OBJ")
-    return Mesh(np.array(vertices), np.array(faces), np.array(scalp) if any(scalp) else None)
+    try:
+        return Mesh(np.array(vertices), np.array(faces), np.array(scalp) if any(scalp) else None)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def write_obj(path: str | Path, mesh: Mesh) -> None:

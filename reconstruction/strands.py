@@ -102,7 +102,8 @@ class Strands:
 
     def subset(self, which: ArrayLike) -> Strands:
         """The strands at the indices (or the mask) `which`, in that order."""
-        index = np.arange(len(self))[np.asarray(which)]
+        which = np.asarray(which)
+        index = np.arange(len(self))[which if which.size else which.astype(np.int64)]
         counts = np.diff(self.offsets)[index]
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[index] - offsets[:-1], counts)

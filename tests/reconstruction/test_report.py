@@ -1,0 +1,107 @@
+"""Reports: timed, saved, read back, drawn."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.report import LeftOut, Report, Series, Stage, silent
+from reconstruction.report_plots import plot_geometry, plot_report
+
+
+@pytest.fixture
+def report() -> Report:
+    cg = Series("cg", "residual", [(0.0, 1.0), (0.1, 0.1), (0.2, 1e-3), (0.3, 0.0)])
+    slow = Series("explicit_steps", "residual", [(0.01 * i, 1 / (1 + i)) for i in range(60)])
+    field = Stage("field", 3.5, {"voxels": 120}, [cg, slow], warnings=["one camera is dark"])
+    field.leave_out("motion solve", "the subject did not move", "12 s")
+    return Report([Stage("roughness_and_colour", 250.0), field])
+
+
+def test_a_stage_is_timed_and_replaced_by_name() -> None:
+    report = Report()
+    with report.stage("a") as stage:
+        stage.figures["n"] = 1
+        stage.warn("thin ice")
+        time.sleep(0.01)
+    with report.stage("b"):
+        silent("b", 0.5)
+    with report.stage("a") as stage:
+        stage.figures["n"] = 2
+    assert [s.name for s in report.stages] == ["b", "a"]
+    assert report["a"].figures == {"n": 2}
+    assert report["a"].warnings == []
+    with pytest.raises(KeyError, match=r"no stage 'c'.*'b', 'a'"):
+        report["c"]
+
+
+def test_a_stage_that_fails_is_timed_too() -> None:
+    report = Report()
+
+    def fail() -> None:
+        with report.stage("a"):
+            time.sleep(0.02)
+            raise RuntimeError("boom")
+
+    with pytest.raises(RuntimeError, match="boom"):
+        fail()
+    assert 0.02 <= report["a"].seconds < 1
+
+
+def test_read_back(report: Report, tmp_path: Path) -> None:
+    report.save(tmp_path / "report.json")
+    again = Report.load(tmp_path / "report.json")
+    assert again == report
+    assert isinstance(again["field"].left_out[0], LeftOut)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
+    assert Report.load(tmp_path / "none.json") == Report()
+
+
+def test_numbers_that_are_none_are_refused(report: Report, tmp_path: Path) -> None:
+    report["field"].figures["bad"] = float("nan")
+    with pytest.raises(ValueError, match="JSON compliant"):
+        report.save(tmp_path / "report.json")
+    assert not list(tmp_path.iterdir())
+
+
+def picture(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None, path
+    return image
+
+
+def test_plots(report: Report, tmp_path: Path) -> None:
+    files = plot_report(report, tmp_path / "plots")
+    assert [f.name for f in files] == ["seconds.png", "error_field.png", "left_out.png"]
+    for file in files:
+        image = picture(file)
+        assert image.shape[1] > 900
+        assert 0.003 < (image.min(axis=2) < 128).mean() < 0.5
+    report["field"].warnings += ["word " * 60] * 3
+    assert picture(plot_report(report, tmp_path)[2]).shape[0] > 1.3 * image.shape[0]
+
+
+def test_plots_of_little(tmp_path: Path) -> None:
+    assert plot_report(Report(), tmp_path) == []
+    nothing = Stage("a", 0.0, series=[Series("s", "error", []), Series("t", "error", [(0, 0.0)])])
+    assert [f.name for f in plot_report(Report([nothing]), tmp_path)] == ["seconds.png"]
+    start = Stage("b", 1.0, series=[Series("s", "error", [(0.0, 0.5)])])
+    assert len(plot_report(Report([start]), tmp_path)) == 2
+
+
+def test_geometry_bars(tmp_path: Path) -> None:
+    names = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
+
+    def scores(value: float) -> dict[str, dict[str, float]]:
+        return {n: dict.fromkeys(("precision", "recall", "f"), value) for n in names}
+
+    both = {"visible": scores(0.5), "all": scores(0.4)}
+    tall = picture(plot_geometry({"ours": both, "hull_vertical": both}, tmp_path / "a.png"))
+    flat = picture(plot_geometry({"ours": {"all": scores(0.0)}}, tmp_path / "b.png"))
+    assert tall.shape[0] > 1.4 * flat.shape[0]
+    with pytest.raises(ValueError, match="no results"):
+        plot_geometry({}, tmp_path / "c.png")
