@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from appearance.metrics import srgb
 from reconstruction.exr import read_exr
 
 
@@ -17,9 +18,8 @@ def png_preview(path: Path, percentile: float = 99.5) -> bytes:
     """
     image, _ = read_exr(path)
     white = float(np.percentile(image, percentile))
-    scaled = np.clip(image / white if white > 0 else image, 0.0, 1.0)
-    curved = np.where(scaled <= 0.0031308, 12.92 * scaled, 1.055 * scaled ** (1 / 2.4) - 0.055)
-    done, png = cv2.imencode(".png", np.rint(255 * curved[..., ::-1]).astype(np.uint8))
+    picture = np.rint(255 * srgb(image / white if white > 0 else image))
+    done, png = cv2.imencode(".png", picture[..., ::-1].astype(np.uint8))
     if not done:
         raise ValueError(f"{path}: OpenCV cannot encode a PNG of shape {image.shape}")
     return png.tobytes()

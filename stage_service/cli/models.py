@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
     )
     render.add_argument("model", type=Path)
     render.add_argument("--capture", type=Path, help="the capture that gives rig and head")
-    render.add_argument("--camera", help="a camera of the rig (default: the first)")
+    render.add_argument("--camera", help="a camera of the rig (default: a three-quarter view)")
     render.add_argument("--light", help="a light of the rig, instead of the environment")
     render.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
     render.add_argument("--out", type=Path, help=".png (exposed, sRGB) or .exr (linear)")

@@ -7,13 +7,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from appearance.fitted import FittedAppearance
-from appearance.metrics import srgb
-from appearance.render.environment import load_environment, render_environment, sky, studio
+from appearance.metrics import Exposure, srgb
+from appearance.pictures import write_png
+from appearance.relight import three_quarter_view
+from appearance.render.environment import render_environment
+from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.olat import render_olat
 from appearance.scene import HairScene, build_scene
 from reconstruction.cameras import Camera
@@ -22,23 +24,27 @@ from reconstruction.exr import write_exr
 from reconstruction.report import Progress
 from reconstruction.strand_files import read_strands
 
-FRONT = Camera.look_at("front", 512, 512, (0.3, -0.9, 0.15), (0.0, 0.0, 0.0), 24.0)
+SIZE = 512
+"""Pixels across, where no camera of a rig says."""
+PROCEDURAL = {"studio": studio, "sky": sky}
 
 
 def render_model(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Render what the arguments of `hairstage render` ask for; returns what was written."""
     start = time.perf_counter()
+    if args.out is not None and args.out.suffix not in (".png", ".exr"):
+        raise ValueError(f"--out {args.out}: expected .png or .exr")
     capture = Capture(args.capture) if args.capture is not None else None
     if capture is None and (args.camera is not None or args.light is not None):
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
-    camera = FRONT
-    if capture is not None:
-        rig = capture.rig
-        camera = rig.cameras[0] if args.camera is None else rig.camera(args.camera)
     progress("building the scene", 0.0)
     appearance = FittedAppearance.load(args.model)
+    strands = read_strands(args.model / "strands.npz")
+    camera = three_quarter_view(strands, SIZE)
+    if capture is not None and args.camera is not None:
+        camera = capture.rig.camera(args.camera)
     scene = build_scene(
-        read_strands(args.model / "strands.npz"),
+        strands,
         capture.head if capture is not None else None,
         hair=appearance.hair,
         skin=appearance.skin,
@@ -63,7 +69,7 @@ def render_model(args: argparse.Namespace, progress: Progress) -> dict[str, Any]
 
 
 def _environment(scene: HairScene, camera: Camera, args: argparse.Namespace) -> NDArray[np.float32]:
-    procedural = {"studio": studio, "sky": sky}.get(args.environment)
+    procedural = PROCEDURAL.get(args.environment)
     envmap = procedural() if procedural is not None else load_environment(Path(args.environment))
     return render_environment(scene, camera, envmap, spp=args.spp, seed=args.seed)
 
@@ -71,10 +77,6 @@ def _environment(scene: HairScene, camera: Camera, args: argparse.Namespace) -> 
 def _write(out: Path, image: NDArray[np.float32]) -> None:
     if out.suffix == ".exr":
         write_exr(out, image)
-        return
-    if out.suffix != ".png":
-        raise ValueError(f"{out}: expected .png or .exr")
-    white = float(np.percentile(image, 99.5))
-    picture = np.rint(255 * srgb(image / white if white > 0 else image))
-    if not cv2.imwrite(str(out), picture[..., ::-1].astype(np.uint8)):
-        raise OSError(f"{out} cannot be written")
+    else:
+        lit = image[image.sum(axis=-1) > 0]
+        write_png(out, srgb(image) if not len(lit) else Exposure.of([lit])(image))

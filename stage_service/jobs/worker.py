@@ -27,8 +27,8 @@ from stage_service.jobs.steps import STEPS, StepContext
 
 log = logging.getLogger("hairstage.worker")
 
-MOST_ATTEMPTS = 5
-"""A job that killed its worker this often is given up."""
+MOST_ATTEMPTS = 20
+"""A job whose worker died, or was stopped, this often is given up."""
 
 
 class Worker:
