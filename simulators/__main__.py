@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import os
 import signal
 import sys
 import threading
@@ -17,8 +18,8 @@ from simulators.drift import Drift
 from simulators.faults import Faults
 from simulators.frames import FrameMaker, cache_key
 from simulators.lamps import Lamps
-from simulators.render_process import RenderProcess
-from simulators.responses import MitsubaResponder, Quality
+from simulators.render_process import RenderPool
+from simulators.responses import Quality, reproducible
 from simulators.sensor import Sensor
 from simulators.stage import SimulatedStage
 from simulators.subject import Subject, check_fits, load_subject
@@ -39,8 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.state is None and args.truth_only is None:
         parser.error("--state FOLDER is required (or --truth-only FOLDER)")
-    if args.spp < 1:
-        parser.error(f"--spp must be at least 1, got {args.spp}")
+    for option in ("spp", "processes"):
+        if getattr(args, option) < 1:
+            parser.error(f"--{option} must be at least 1, got {getattr(args, option)}")
     try:
         rig_file = load_rig_file(args.rig)
         cameras = [c.name for c in rig_file.rig.cameras]
@@ -72,12 +74,13 @@ def _run(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: leave.set())
     with ExitStack() as stack:
-        make = functools.partial(MitsubaResponder, rig, subject, drift, quality, args.seed)
-        responder = RenderProcess(make)
+        make = functools.partial(reproducible, rig, subject, drift, quality, args.seed)
+        names = [c.name for c in rig.cameras]
+        responder = RenderPool(make, names, args.processes)
         key = cache_key(subject.digest(), rig.to_dict(), asdict(quality), args.seed)
         frames = FrameMaker(rig, responder, sensor, args.seed, args.cache, key)
         log = args.truth / EXPOSURES if args.truth is not None else None
-        world = World(rig, Lamps(len(rig.lights)), faults, frames.counts, log)
+        world = World(rig, Lamps(len(rig.lights)), faults, frames.counts, log, args.processes)
         free = args.ports == "auto"
         stage = SimulatedStage(world, sensor, faults, args.state, rig_file.devices, free)
         # Ends in reverse: the renderer first, so that no frame holds up the devices' end.
@@ -117,6 +120,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cache", type=Path, help="keep the lamps' responses here between runs")
     parser.add_argument(
         "--spp", type=int, default=Quality.lamps, help="paths per pixel (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--processes",
+        type=int,
+        default=min(os.cpu_count() or 1, 4),
+        help="rendering processes; frames do not depend on it (default: %(default)s)",
     )
     parser.add_argument(
         "--drift-mm", type=float, default=1.5, help="how far the subject drifts (default: 1.5)"

@@ -39,7 +39,8 @@ class FrameMaker:
     At pose 0 the lamps' responses are kept one by one, so that every light vector is a weighted
     sum; at other poses, where only the closing frames light lamps, one picture per light vector
     is rendered. Sweeps are kept for the last two poses of each camera. `cache` keeps the lamps'
-    responses on disk under `key`, which must name everything that they depend on.
+    responses on disk under `key`, which must name everything that they depend on. Threads may ask
+    for frames of different cameras at the same time.
     """
 
     def __init__(
@@ -58,7 +59,9 @@ class FrameMaker:
         self._cache = cache
         self._key = key
         self._lamps: dict[str, Response] = {}
-        self._moved: OrderedDict[Hashable, Response] = OrderedDict()
+        self._moved: dict[str, OrderedDict[Hashable, Response]] = {
+            c.name: OrderedDict() for c in rig.cameras
+        }
         self._sweeps: dict[str, OrderedDict[int, Mapping[str, Response]]] = {
             c.name: OrderedDict() for c in rig.cameras
         }
@@ -86,12 +89,11 @@ class FrameMaker:
             weights = shot.power[lit].astype(np.float32)
             flat[response.pixels] += np.tensordot(weights, response.images[lit], 1)
             return
-        key = (camera, shot.pose, shot.power.tobytes())
         response = _kept(
-            self._moved,
-            key,
+            self._moved[camera],
+            (shot.pose, shot.power.tobytes()),
             lambda: self._responder.lamps_together(camera, shot.pose, shot.power),
-            4 * len(self._rig.cameras),
+            4,
         )
         flat[response.pixels] += response.images[0]
 

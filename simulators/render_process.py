@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -72,6 +72,38 @@ class RenderProcess:
         if not fine:
             raise RenderError(str(answer))
         return answer
+
+
+class RenderPool:
+    """A `Responder` of `count` processes; each camera has its own among them.
+
+    Camera number i belongs to process i modulo `count`, as `World` deals its frames to its lanes:
+    calls for cameras of different processes run at the same time.
+    """
+
+    def __init__(self, make: Callable[[], Responder], cameras: Sequence[str], count: int) -> None:
+        self._processes = [RenderProcess(make) for _ in range(min(count, len(cameras)))]
+        self._lane = {name: i % len(self._processes) for i, name in enumerate(cameras)}
+
+    def lamps(self, camera: str) -> Response:
+        """See `Responder.lamps`; raises `RenderError`."""
+        return self._of(camera).lamps(camera)
+
+    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+        """See `Responder.lamps_together`; raises `RenderError`."""
+        return self._of(camera).lamps_together(camera, pose, power)
+
+    def sweep(self, camera: str, pose: int) -> dict[str, Response]:
+        """See `Responder.sweep`; raises `RenderError`."""
+        return self._of(camera).sweep(camera, pose)
+
+    def stop(self) -> None:
+        """End all processes at once."""
+        for process in self._processes:
+            process.stop()
+
+    def _of(self, camera: str) -> RenderProcess:
+        return self._processes[self._lane[camera]]
 
 
 def _serve(pipe: Connection, make: Callable[[], Responder]) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from appearance.backend import ensure_backend
 from reconstruction.cameras import Camera
 from reconstruction.rig import Rig
 from simulators.drift import Drift
@@ -24,9 +25,9 @@ class Quality:
     `lamps` paths serve all lamps of a camera at once, `sweep` paths all rows of a camera and pose.
     """
 
-    lamps: int = 24
-    sweep: int = 12
-    together: int = 48
+    lamps: int = 16
+    sweep: int = 8
+    together: int = 32
     depth: int = 16
     sweep_depth: int = 6
 
@@ -58,6 +59,21 @@ class Responder(Protocol):
 
     def sweep(self, camera: str, pose: int) -> Mapping[str, Response]:
         """The answer at `pose` to each row of each projector, by projector name."""
+
+
+def reproducible(
+    rig: Rig, subject: Subject, drift: Drift, quality: Quality, seed: int
+) -> MitsubaResponder:
+    """A `MitsubaResponder` that gives the same bytes every time, for a process of its own.
+
+    Dr.Jit adds floating-point numbers to the film in the order in which its threads come by; with
+    one thread that order is fixed. Several such processes use several cores.
+    """
+    ensure_backend()
+    import drjit
+
+    drjit.set_thread_count(1)
+    return MitsubaResponder(rig, subject, drift, quality, seed)
 
 
 class MitsubaResponder:

@@ -50,12 +50,19 @@ class World:
     exposure stays at its pose. The subject takes their place again, pose 0, when a new capture
     begins: when the first pulse after a reset sees no light, or a lamp alone is lit.
 
-    `make` renders and exposes; it runs on one thread, frame after frame in the order of the
-    pulses. `log`, when given, gets one JSON line a pulse with its pose.
+    `make` renders and exposes on one thread for each of `lanes`; camera number i belongs to lane
+    i modulo `lanes`, and a camera's frames are made one after the other. `log`, when given, gets
+    one JSON line a pulse with its pose.
     """
 
     def __init__(
-        self, rig: Rig, lamps: Lamps, faults: Faults, make: MakeCounts, log: Path | None = None
+        self,
+        rig: Rig,
+        lamps: Lamps,
+        faults: Faults,
+        make: MakeCounts,
+        log: Path | None = None,
+        lanes: int = 1,
     ) -> None:
         self.rig = rig
         self.lamps = lamps
@@ -70,7 +77,7 @@ class World:
         self._pose = 0
         self._rows_shown = False
         self._cameras = {c.name: _CameraState() for c in rig.cameras}
-        self._work = ThreadPoolExecutor(1, thread_name_prefix="frames")
+        self._lanes = [ThreadPoolExecutor(1, thread_name_prefix="frames") for _ in range(lanes)]
         self._began = time.monotonic()
 
     @property
@@ -98,12 +105,14 @@ class World:
             power, show = self.lamps.power(), self.projectors.show
             self._move_subject(power, show)
             shot = Snapshot(self._pulses, power, show, self._pose)
-            for name, camera in self._cameras.items():
+            for index, (name, camera) in enumerate(self._cameras.items()):
                 if camera.exposure is None:
                     continue
                 if self._faults.once("camera", "drop", self._pulses, name):
                     continue
-                self._expose(name, camera, camera.exposure, shot)
+                lane = self._lanes[index % len(self._lanes)]
+                counts = lane.submit(self._make, name, shot, camera.exposure)
+                self._queue(camera, camera.exposure, counts)
             if self._log is not None:
                 with self._log.open("a") as log:
                     log.write(json.dumps({"pulse": shot.pulse, "pose": shot.pose}) + "\n")
@@ -149,7 +158,8 @@ class World:
         with self._lock:
             for name in self._cameras:
                 self._empty(name)
-        self._work.shutdown(wait=True, cancel_futures=True)
+        for lane in self._lanes:
+            lane.shutdown(wait=True, cancel_futures=True)
 
     def _move_subject(self, power: NDArray[np.float64], show: Show) -> None:
         lit = int(np.count_nonzero(power))
@@ -162,11 +172,10 @@ class World:
         elif show.level > 0:
             self._rows_shown = True
 
-    def _expose(self, name: str, camera: _CameraState, exposure: float, shot: Snapshot) -> None:
+    def _queue(self, camera: _CameraState, exposure: float, counts: Future[Counts]) -> None:
         camera.block_id = camera.block_id % _BLOCK_IDS + 1
-        work = self._work.submit(self._make, name, shot, exposure)
         now = time.monotonic() - self._began
-        camera.queue.append(Exposed(camera.block_id, now, exposure, work))
+        camera.queue.append(Exposed(camera.block_id, now, exposure, counts))
 
     def _empty(self, camera: str) -> None:
         queue = self._cameras[camera].queue

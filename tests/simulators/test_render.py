@@ -9,7 +9,7 @@ import pytest
 
 from simulators.drift import Drift
 from simulators.render_process import RenderError, RenderProcess
-from simulators.responses import MitsubaResponder, Quality
+from simulators.responses import MitsubaResponder, Quality, reproducible
 from simulators.subject import make_subject
 
 QUALITY = Quality(lamps=16, sweep=16, together=128, depth=4, sweep_depth=2)
@@ -24,7 +24,7 @@ def subject():
 def responder(tiny_rig, subject):
     """One renderer for all tests here: kernels are compiled once."""
     drift = Drift(3, 0.0, 0)
-    make = functools.partial(MitsubaResponder, tiny_rig, subject, drift, QUALITY, 0)
+    make = functools.partial(reproducible, tiny_rig, subject, drift, QUALITY, 0)
     process = RenderProcess(make)
     yield process
     process.stop()
