@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -21,6 +22,9 @@ EXIT_CODES = {
 }
 
 FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
+
+LINE_EVERY_S = 10.0
+"""Where progress goes to a log, a line so often."""
 
 Commands = Any  # argparse does not export the type of what add_subparsers returns
 Run = Callable[[argparse.Namespace, "Output"], int]
@@ -65,7 +69,7 @@ class Output:
 
 @contextlib.contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
-    """A `Progress` that draws a bar on stderr; no terminal there: a line per new activity."""
+    """A `Progress` that draws a bar on stderr; no terminal there: now and then a line."""
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bars
@@ -91,12 +95,13 @@ def progress_bar(title: str) -> Iterator[Progress]:
 
 
 def _lines(title: str) -> Progress:
-    last = [""]
+    last = [float("-inf")]
 
     def show(what: str, share: float) -> None:
-        if what != last[0]:
+        now = time.monotonic()
+        if now - last[0] >= LINE_EVERY_S or share >= 1:
             print(f"{title}: {share:4.0%} {what}", file=sys.stderr, flush=True)
-            last[0] = what
+            last[0] = now if share < 1 else float("inf")
 
     return show
 

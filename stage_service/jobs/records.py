@@ -15,7 +15,9 @@ class JobOptions(BaseModel):
 
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may look at:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
-    against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`.
+    against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`. `reconstruct`, `fit` and
+    `assess` go to the step of that name: fields of `reconstruction.pipeline.ReconstructOptions`,
+    `appearance.fit.FitOptions` and `appearance.assess.AssessOptions`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,6 +30,8 @@ class JobOptions(BaseModel):
     truth: str | None = None
     seed: int = Field(default=0, ge=0)
     reconstruct: dict[str, Any] = Field(default_factory=dict)
+    fit: dict[str, Any] = Field(default_factory=dict)
+    assess: dict[str, Any] = Field(default_factory=dict)
 
 
 class PipelineRequest(BaseModel):

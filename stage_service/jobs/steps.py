@@ -11,13 +11,14 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from reconstruction.capture import Capture
 from reconstruction.report import Progress
 from stage_service.jobs.records import JobOptions
 
 Figures = dict[str, Any]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,11 @@ def reconstruct(context: StepContext) -> Figures:
     from reconstruction.pipeline import reconstruct as run
 
     asked = context.options
-    try:
-        options = ReconstructOptions(
-            **{"held_out": asked.held_out_cameras, "seed": asked.seed, **asked.reconstruct}
-        )
-    except TypeError as error:
-        raise ValueError(f"options.reconstruct: {error}") from error
+    options = _options(
+        ReconstructOptions,
+        "reconstruct",
+        {"held_out": asked.held_out_cameras, "seed": asked.seed, **asked.reconstruct},
+    )
     capture = Capture(context.capture)
     capture.steps = tuple(s for s in capture.steps if s.light not in asked.held_out_lights)
     run(capture, context.model, method=asked.method, options=options, progress=context.progress)
@@ -60,6 +60,7 @@ def reconstruct(context: StepContext) -> Figures:
 
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
+    from appearance.fit import FitOptions
     from appearance.fit import fit as run
     from appearance.observations import HeldOut
 
@@ -67,6 +68,7 @@ def fit(context: StepContext) -> Figures:
         Capture(context.capture),
         context.model,
         held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
+        options=_options(FitOptions, "fit", context.options.fit),
         progress=context.progress,
         seed=context.options.seed,
     )
@@ -75,6 +77,7 @@ def fit(context: StepContext) -> Figures:
 
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
+    from appearance.assess import AssessOptions
     from appearance.assess import assess as run
     from appearance.observations import HeldOut
 
@@ -83,6 +86,7 @@ def assess(context: StepContext) -> Figures:
         context.model,
         held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
         environment=context.options.environment,
+        options=_options(AssessOptions, "assess", context.options.assess),
         seed=context.options.seed,
         progress=context.progress,
     )
@@ -124,6 +128,13 @@ def results(context: StepContext) -> Figures:
     part.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
     part.replace(context.model / "results.json")
     return {"results": "results.json"}
+
+
+def _options(kind: Callable[..., T], field: str, values: dict[str, Any]) -> T:
+    try:
+        return kind(**values)
+    except TypeError as error:
+        raise ValueError(f"options.{field}: {error}") from error
 
 
 STEPS: dict[str, Callable[[StepContext], Figures]] = {

@@ -16,16 +16,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import cv2
 import httpx
 import numpy as np
 import pytest
 
 from reconstruction.mesh import Mesh, write_obj
+from reconstruction.rig import Rig
 from reconstruction.strand_files import write_strands
 from reconstruction.strands import Strands
 
 T = TypeVar("T")
-LIGHTS, CAMERAS, ROWS = 12, 3, 16
+LIGHTS, CAMERAS, ROWS = 24, 3, 16
 FRAMES = CAMERAS * (LIGHTS + ROWS + 1 + 4)  # one tracking frame, dark and all-on at both ends
 WATCHDOG_S = 1.0
 
@@ -139,6 +141,20 @@ class TinyStage:
         assert response.is_success, response.text
         return response.json()
 
+    def subject(self) -> dict[str, str]:
+        """What a user knows of the subject: the digitised head, and masks of the hair."""
+        return {"head": str(self.folder / "head.obj"), "masks": str(self.folder / "masks")}
+
+    @staticmethod
+    def pipeline(**options: Any) -> dict[str, Any]:
+        """The whole pipeline at a quality for pictures of 24 pixels."""
+        quality = {
+            "reconstruct": {"roots": 2000, "grid": 4e-3, "explicit_seconds": 0.1},
+            "fit": {"iterations": 2},
+            "assess": {"spp": 4, "relit_size": 48, "relit_spp": 4},
+        }
+        return {"name": "light_planes", "options": {**quality, **options}}
+
     def capture(self, body: dict[str, Any]) -> dict[str, Any]:
         """Make a capture and wait until it is done."""
         path = f"/captures/{self.post('/captures', body)['id']}"
@@ -195,7 +211,16 @@ def _write_subject(folder: Path) -> None:
     strands = [
         r + 0.03 * s * n + [0, 0, -0.05] * s**2 for r, n in zip(roots, outwards, strict=True)
     ]
-    write_strands(folder / "subject.npz", Strands.from_list(strands, radius=1.5e-3))
+    hair = Strands.from_list(strands, radius=1.5e-3)
+    write_strands(folder / "subject.npz", hair)
+    # At 14 mm a pixel only a person can tell hair from skin: the masks come from the user.
+    (folder / "masks").mkdir()
+    for camera in Rig.load(folder / "rig.toml").cameras:
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        front = hair.points[(hair.points - camera.center) @ camera.R[2] < np.linalg.norm(camera.t)]
+        x, y = np.rint(camera.project(front)[0]).astype(int).T
+        mask[y, x] = 255
+        cv2.imwrite(str(folder / "masks" / f"{camera.name}.png"), mask)
 
 
 @pytest.fixture

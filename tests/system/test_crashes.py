@@ -14,8 +14,8 @@ def test_a_job_outlives_its_worker(stage):
     worker = stage.work()
     capture = stage.capture(
         {
-            "head": str(stage.folder / "truth" / "head.obj"),
-            "pipeline": {"name": "light_planes", "options": {"held_out_lights": ["light_004"]}},
+            **stage.subject(),
+            "pipeline": stage.pipeline(held_out_lights=["light_004"]),
         }
     )
     path = f"/jobs/{capture['job']}"

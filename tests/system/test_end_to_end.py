@@ -15,8 +15,8 @@ def test_a_capture_becomes_relit_hair(running):
     assert cost["frames"] == running.FRAMES
     capture = running.capture(
         {
-            "head": str(running.folder / "truth" / "head.obj"),
-            "pipeline": {"name": "light_planes", "options": OPTIONS},
+            **running.subject(),
+            "pipeline": running.pipeline(**OPTIONS),
         }
     )
     assert (capture["outcome"], capture["error"]) == ("completed", None)
