@@ -12,7 +12,7 @@ from simulators.render_process import RenderError, RenderProcess
 from simulators.responses import MitsubaResponder, Quality, reproducible
 from simulators.subject import make_subject
 
-QUALITY = Quality(lamps=16, sweep=16, together=128, depth=4, sweep_depth=2)
+QUALITY = Quality(lamps=128, sweep=16, together=256, depth=4, sweep_depth=2)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_all_lamps_together_are_the_sum_of_each(responder):
     together = responder.lamps_together("cam_a", 1, power)
     assert np.array_equal(each.pixels, together.pixels)
     weighted = np.tensordot(power, each.images, 1)
-    assert together.images[0].mean() == pytest.approx(weighted.mean(), rel=0.1)
+    assert together.images[0].mean() == pytest.approx(weighted.mean(), rel=0.06)
 
 
 def test_rows_light_bands_of_the_subject(responder):
