@@ -23,12 +23,12 @@ class Quality:
     """Paths per pixel and lights per vertex: what a frame costs and how noisy the truth is.
 
     `lamps` paths serve all lamps of a camera at once, `sweep` paths all rows of a camera and pose,
-    `together` paths one light vector. The demo's capture takes about five minutes of rendering on
+    `together` paths one light vector. The demo's capture takes about four minutes of rendering on
     two cores with these numbers.
     """
 
     lamps: int = 16
-    sweep: int = 8
+    sweep: int = 16
     together: int = 24
     depth: int = 16
     sweep_depth: int = 6
@@ -36,7 +36,7 @@ class Quality:
     @classmethod
     def scaled(cls, spp: int) -> Quality:
         """The default proportions with `spp` paths for the lamps."""
-        return cls(spp, max(1, spp // 2), spp + spp // 2)
+        return cls(spp, spp, spp + spp // 2)
 
 
 @dataclass(frozen=True, eq=False)
