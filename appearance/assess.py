@@ -16,7 +16,7 @@ from appearance.metrics import LPIPS_UNAVAILABLE, psnr, relative_error, ssim
 from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
 from appearance.pictures import comparison_picture
 from appearance.relight import relight_model
-from appearance.render.smoothed import render_smoothed
+from appearance.render.smoothed import olat_smoothed
 from appearance.roughness_and_colour import fit_diffuse
 from appearance.scene import HairScene, build_scene
 from reconstruction.capture import Capture
@@ -35,12 +35,12 @@ class AssessOptions:
 
     cameras: int = 2
     lights: int = 5
-    spp: int = 36
+    spp: int = 49
     max_depth: int = 16
     baseline_pixels: int = 100
     baseline_lights: int = 48
     relit_size: int = 320
-    relit_spp: int = 256
+    relit_spp: int = 36
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def _compared(
     lights = [capture.rig.light(n) for n in names]
     device = capture.rig.camera(camera)
     ours, diffuse = (
-        render_smoothed(s, device, lights, spp=options.spp, max_depth=options.max_depth, seed=seed)
+        olat_smoothed(s, device, lights, spp=options.spp, max_depth=options.max_depth, seed=seed)
         for s in scenes
     )
     out = []

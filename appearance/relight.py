@@ -11,7 +11,8 @@ from appearance.fitted import FittedAppearance
 from appearance.metrics import Exposure
 from appearance.pictures import write_png
 from appearance.render.coverage import coverage
-from appearance.render.environment import load_environment, render_environment, sky, studio
+from appearance.render.environment_maps import load_environment, sky, studio
+from appearance.render.smoothed import environment_smoothed
 from appearance.scene import build_scene
 from reconstruction.cameras import Camera
 from reconstruction.exr import write_exr
@@ -28,7 +29,7 @@ def relight_model(
     *,
     environment: str | Path | None = None,
     size: int = 320,
-    spp: int = 256,
+    spp: int = 36,
     seed: int = 0,
 ) -> NDArray[np.float32]:
     """Render a model in three-quarter view under `environment`: radiance `(size, size, 3)`.
@@ -43,7 +44,7 @@ def relight_model(
     camera = three_quarter_view(strands, size)
     procedural = PROCEDURAL.get(str(environment or "studio"))
     envmap = procedural() if procedural else load_environment(Path(str(environment)))
-    radiance = render_environment(scene, camera, envmap, spp=spp, seed=seed)
+    radiance = environment_smoothed(scene, camera, envmap, spp=spp, seed=seed)
     share = coverage(scene, camera)
     subject = share["hair"] + share["head"] > 0.5
     write_exr(model / "relit.exr", radiance)

@@ -232,6 +232,8 @@ def _rendered(scene: HairScene, o: Observed, spp: int, max_depth: int, seed: int
         seed=seed,
         pixels=o.pixels,
         first_lights=32,
+        deep_lights=8,
+        thrift=0,
     )
     return replace(o, radiance=radiance)
 
