@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from appearance.render.paths import Surface, jittered, pixel_indices
+from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene import SCALE, HairScene
 from reconstruction.cameras import Camera
 
@@ -55,7 +55,7 @@ def visible_fibres(
     slot = lane // samples
     sample = lane - slot * samples
     pixel = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), slot)
-    ray = jittered(camera, pixel, sample, samples, mi.PCG32(count, seed))
+    ray = jittered(camera, pixel, sample, samples, stream(count, seed))
     surface = Surface(scene)
     si = surface.interact(ray, mi.Bool(True))
     hair = si.is_valid() & surface.is_hair(si)

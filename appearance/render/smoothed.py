@@ -23,6 +23,7 @@ from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
 Image = NDArray[np.float32]
+Array = NDArray[np.float64]
 
 
 def olat_smoothed(
@@ -57,14 +58,14 @@ def environment_smoothed(
 ) -> Image:
     """`render_environment` with its indirect light smoothed over `sigma` pixels: `(H, W, 3)`.
 
-    Direct light takes 4 `spp` paths a pixel: they are short, and the strands show in it.
+    Direct light takes 8 `spp` paths a pixel: they are short, and the strands show in it.
     """
     share = coverage(scene, camera, max(spp, 16), seed)
     first, whole = (
         render_environment(scene, camera, envmap, spp=spp, max_depth=depth, seed=seed)
         for depth in (1, max_depth)
     )
-    direct = render_environment(scene, camera, envmap, spp=4 * spp, max_depth=1, seed=seed + 1)
+    direct = render_environment(scene, camera, envmap, spp=8 * spp, max_depth=1, seed=seed + 1)
     return direct + smoothed((whole - first)[None], share, sigma)[0]
 
 
@@ -72,7 +73,9 @@ def smoothed(images: Image, share: dict[str, NDArray[np.float32]], sigma: float)
     """`images (L, H, W, 3)` averaged over `sigma` pixels, hair and head apart.
 
     `share` is what `coverage` returns. A pixel belongs to what covers more of it, and gets the
-    local mean of that, by area, times its own share of it. Raises `ValueError` for `sigma` <= 0.
+    local mean of that, by area, times its own share of it. Where a pixel has over three times the
+    mean over 4 `sigma`, a rare path has hit it: the excess is averaged over 4 `sigma`, so that the
+    sum is kept and no blot is left. Raises `ValueError` for `sigma` <= 0.
     """
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
@@ -80,9 +83,18 @@ def smoothed(images: Image, share: dict[str, NDArray[np.float32]], sigma: float)
     is_hair = share["hair"] >= share["head"]
     for kind, mask in (("hair", is_hair), ("head", ~is_hair)):
         weight = (share[kind] * mask).astype(np.float64)
-        area = gaussian_filter(weight, sigma, mode="constant")
-        over = np.divide(weight, area, out=np.zeros_like(area), where=weight > 0)
         light = images.astype(np.float64) * mask[..., None]
-        mixed = gaussian_filter(light, (0, sigma, sigma, 0), mode="constant")
-        out += (mixed * over[..., None]).astype(np.float32)
+        wide = _local_mean(light, weight, 4 * sigma).max(axis=-1, keepdims=True)
+        peak = np.maximum(light.max(axis=-1, keepdims=True), 1e-30)
+        usual = light * np.minimum(1.0, 3.0 * wide / peak)
+        both = _local_mean(usual, weight, sigma) + _local_mean(light - usual, weight, 4 * sigma)
+        out += both.astype(np.float32)
     return out
+
+
+def _local_mean(light: Array, weight: Array, sigma: float) -> Array:
+    """Gaussian mean of `light (L, H, W, 3)` per `weight (H, W)`, times each pixel's weight."""
+    area = gaussian_filter(weight, sigma, mode="constant")
+    over = np.divide(weight, area, out=np.zeros_like(area), where=weight > 0)
+    mixed = gaussian_filter(light, (0, sigma, sigma, 0), mode="constant")
+    return np.asarray(mixed * over[..., None])
