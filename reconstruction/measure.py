@@ -12,6 +12,7 @@ from reconstruction.capture import Capture, CaptureError
 from reconstruction.lights import Light
 from reconstruction.masks import HairMask
 from reconstruction.orientation import LogGaborBank, texture
+from reconstruction.reflection import FEWEST_LIGHTS, reflection_scores
 from reconstruction.report import Progress, Stage, silent
 from reconstruction.tangents import (
     LineEvidence,
@@ -34,16 +35,18 @@ class MeasureOptions:
     The `bank` answers to pictures under `light_groups` groups of neighbouring lights, which show
     different fibres; `candidates` directions are scored at each point, averaged over `radius`
     metres. Points closer than `thin` metres are merged first. `tolerance` (metres) is how far
-    behind a camera's own depth a point may lie and still count as seen.
+    behind a camera's own depth a point may lie and still count as seen. The scores of the
+    reflection under single lights count `reflection_weight` times those of the texture.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)  # noqa: RUF009
     texture_scale: float = 5.0
     light_groups: int = 24
-    candidates: int = 600
-    radius: float = 12e-3
+    candidates: int = 500
+    radius: float = 10e-3
     neighbours: int = 48
-    thin: float = 1.5e-3
+    thin: float = 2e-3
+    reflection_weight: float = 6.0
     tolerance: float = 4e-3
 
 
@@ -96,39 +99,68 @@ def measure_tangents(
     names = capture.olat_lights()
     if not names:
         raise CaptureError(f"{capture.path}: no OLAT frames, which the orientations come from")
-    group = light_groups([capture.rig.light(n) for n in names], options.light_groups)
+    lights = [capture.rig.light(n) for n in names]
+    group = light_groups(lights, options.light_groups)
     cameras = [c for c in capture.rig.cameras if c.name in masks and masks[c.name].hair.any()]
-    evidences = []
+    evidences, olats = [], {}
     for done, camera in enumerate(cameras):
-        progress("orientation", done / len(cameras))
+        progress("texture", done / len(cameras))
         mask = masks[camera.name].hair
         olat = capture.olat(camera.name, names).mean(axis=-1)
+        olats[camera.name] = olat
         total = np.zeros((options.bank.count, *mask.shape), np.float32)
         for g in np.unique(group):
             total += options.bank.responses(
                 texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
             )
         evidences.append(LineEvidence(camera, line_support(total), mask, depths[camera.name]))
+    points = thinned(
+        points if len(points) else np.concatenate([_lifted(e) for e in evidences]), options.thin
+    )
+    seen = np.stack([seen_by(e, points, options.tolerance) for e in evidences], axis=1)
+    points, seen = points[seen.any(axis=1)], seen[seen.any(axis=1)]
     if not len(points):
-        points = np.concatenate([_lifted(e) for e in evidences])
-    points = thinned(points, options.thin)
-    seen_any = np.zeros(len(points), bool)
-    directions = half_sphere(options.candidates)
+        raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
+    candidates = half_sphere(options.candidates)
     scores = np.zeros((len(points), options.candidates), np.float32)
-    views = np.zeros(len(points), np.int64)
-    for evidence in evidences:
-        seen = seen_by(evidence, points, options.tolerance)
-        scores += line_scores(evidence, points, directions, seen)
-        views += seen
-    seen_any = views > 0
-    points, scores, views = points[seen_any], scores[seen_any], views[seen_any]
-    tangents = decide(pool(points, options.radius, options.neighbours) @ scores, directions)
+    for k, evidence in enumerate(evidences):
+        scores += line_scores(evidence, points, candidates, seen[:, k])
+    average = pool(points, options.radius, options.neighbours)
+    scores = average @ scores
+    tangents = decide(scores, candidates)
+    if len(lights) < FEWEST_LIGHTS:
+        stage.leave_out(
+            "directions from reflection",
+            f"{len(lights)} lights, fewer than {FEWEST_LIGHTS}: highlights fall between them",
+            "the second half of this stage; directions come from texture alone",
+        )
+    else:
+        progress("reflection", 0.0)
+        more, table = reflection_scores(
+            cameras,
+            olats,
+            lights,
+            points,
+            seen,
+            candidates,
+            (tangents.directions, tangents.confidence),
+        )
+        texture_only = tangents
+        tangents = decide(scores + options.reflection_weight * (average @ more), candidates)
+        turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)
+        stage.figures["lobe_contrast"] = table.contrast
+        stage.figures["turned_by_reflection_deg"] = float(np.median(np.degrees(np.arccos(turned))))
+        if table.contrast < 1.3:
+            stage.warn(
+                f"the hair's highlight is only {table.contrast:.2f} times its surroundings: "
+                "directions from reflection are weak"
+            )
     stage.figures.update(
         points=len(points),
-        cameras_per_point={str(k): int(n) for k, n in enumerate(np.bincount(views)) if n},
-        confidence={f"p{q}": float(np.percentile(tangents.confidence, q)) for q in (10, 50, 90)}
-        if len(points)
-        else {},
+        cameras_per_point={
+            str(k): int(n) for k, n in enumerate(np.bincount(seen.sum(axis=1))) if n
+        },
+        confidence={f"p{q}": float(np.percentile(tangents.confidence, q)) for q in (10, 50, 90)},
     )
     return Measured(points, tangents.directions, tangents.confidence)
 

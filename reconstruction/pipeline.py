@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.cameras import Camera
 from reconstruction.capture import Capture, CaptureError
 from reconstruction.envelope import carve, depth_map, inside_mesh, mesh_depth
 from reconstruction.field import FieldOptions, OrientationField, solve_field
@@ -85,7 +86,7 @@ def reconstruct(
     """
     if method != "light_planes":
         raise ValueError(f"unknown method {method!r}; there is 'light_planes'")
-    capture = _without(capture, options.held_out)
+    whole, capture = capture, _without(capture, options.held_out)
     head = capture.head
     if head is None:
         raise CaptureError(f"{capture.path}: no head.obj: strands need a scalp to be rooted on")
@@ -97,10 +98,15 @@ def reconstruct(
         cloud = _points(capture, report, stage, progress)
         cloud.save(model / "points.npz")
     with report.stage("masks") as stage:
-        masks = hair_masks(capture, cloud if len(cloud) else None, head)
-        for name, mask in masks.items():
-            cv2.imwrite(str(model / "masks" / f"{name}.png"), mask.hair.astype(np.uint8) * 255)
+        # a held-out camera's mask says where to compare pictures; nothing here looks at it
+        every = hair_masks(whole, cloud if len(cloud) else None, head)
+        for name, mask in every.items():
+            for kind, pixels in (("hair", mask.hair), ("skin", mask.skin)):
+                image = pixels.astype(np.uint8) * 255
+                cv2.imwrite(str(model / "masks" / f"{name}_{kind}.png"), image)
+        masks = {k: m for k, m in every.items() if k not in options.held_out}
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
+        stage.figures["source"] = {k: m.source for k, m in masks.items()}
     with report.stage("envelope") as stage:
         envelope, depths = build_envelope(capture, cloud, masks, head, options, stage)
     with report.stage("orientation") as stage:
@@ -169,7 +175,7 @@ def build_envelope(
     cameras = [c for c in capture.rig.cameras if c.name in masks]
     bounds = _bounds(cloud, head)
     hull = visual_hull(
-        cameras, {k: m.silhouette for k, m in masks.items()}, spacing=options.grid, bounds=bounds
+        cameras, {k: m.subject for k, m in masks.items()}, spacing=options.grid, bounds=bounds
     )
     surfaces, depths = {}, {}
     for camera in cameras:
@@ -206,11 +212,8 @@ def build_envelope(
     return envelope, depths
 
 
-def depth_map_first(camera: object, envelope: VoxelGrid) -> Array:
+def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
     """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
-    from reconstruction.cameras import Camera
-
-    assert isinstance(camera, Camera)
     pixels, depth = camera.project(envelope.centers())
     ok = (depth > 0) & camera.inside(pixels)
     x, y = np.rint(pixels[ok]).astype(int).T

@@ -26,16 +26,17 @@ def supported(points: Array, neighbours: int, isolation: float) -> NDArray[np.bo
 
 
 def support(points: Array, radius: float, neighbours: int = 32) -> Array:
-    """How much other points back each of `points (N, 3)`: `(N,)` in [0, 1), 0.5 for the median.
+    """How much other points back each of `points (N, 3)`: `(N,)` in (0, 1), 0.5 for the median.
 
-    Neighbours count by a Gaussian of `radius` metres, at most `neighbours` of them.
+    Neighbours count by a Gaussian of `radius` metres, at most `neighbours` of them, and each point
+    counts for itself.
     """
-    if len(points) < 2:
-        return np.zeros(len(points))
+    if not len(points):
+        return np.zeros(0)
     k = min(neighbours, len(points) - 1) + 1
-    distance = cKDTree(points).query(points, k=k)[0][:, 1:]
+    distance = cKDTree(points).query(points, k=k)[0].reshape(len(points), k)
     score = np.exp(-0.5 * (distance / radius) ** 2).sum(axis=1)
-    return np.asarray(score / (score + max(float(np.median(score)), np.finfo(float).tiny)))
+    return np.asarray(score / (score + np.median(score)))
 
 
 def flatten(cloud: PointCloud, radius: float, roughness: float, neighbours: int = 40) -> PointCloud:

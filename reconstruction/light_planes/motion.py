@@ -23,7 +23,7 @@ class Motion:
                           translation linearly) suits people, "hold" a subject that only moves at
                           tracking frames
     still                 nothing moved by more than the noise of the measurement
-    determined            directions of motion, of 6, that the cameras determine: the least over frames
+    determined            directions of motion, of 6, that the cameras determine (the least)
     """
 
     steps: NDArray[np.int64]

@@ -16,8 +16,8 @@ class Registration:
     """A 2D rigid motion: pixel `p` of the reference is at `c + R(angle) (p - c) + shift`.
 
     `centre (2,)` and `shift (2,)` in pixels, `angle` in radians from +x towards +y. `deviation
-    (3,)` is that of shift x, shift y (pixels) and angle from the residual; `lever` (pixels) is the rms
-    distance of the used pixels from the centre, which turns angles into pixels.
+    (3,)` of the shift's x and y (pixels) and of the angle, from the residual; `lever` (pixels) is
+    the rms distance of the used pixels from the centre, which turns angles into pixels.
     """
 
     centre: Array
@@ -29,12 +29,7 @@ class Registration:
 
     def largest(self) -> float:
         """The larger of shift and rotation at the lever, pixels."""
-        return float(max(np.linalg.norm(self.shift), abs(self.angle) * self.lever))
-
-    def noise(self) -> float:
-        """Deviation of `largest`, pixels."""
-        x, y, angle = (float(v) for v in self.deviation)
-        return max(x, y, angle * self.lever)
+        return max(float(np.linalg.norm(self.shift)), abs(self.angle) * self.lever)
 
 
 class Template:
@@ -45,7 +40,7 @@ class Template:
     """
 
     def __init__(
-        self, image: NDArray[np.floating], mask: NDArray[np.bool_], sigma: float = 1.5
+        self, image: NDArray[np.floating], mask: NDArray[np.bool_], sigma: float = 1.0
     ) -> None:
         if image.shape != mask.shape or image.ndim != 2:
             raise ValueError(f"image {image.shape} and mask {mask.shape} must be the same (H, W)")
@@ -69,7 +64,7 @@ class Template:
         self.inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
 
     def register(
-        self, image: NDArray[np.floating], *, iterations: int = 30, tolerance: float = 1e-4
+        self, image: NDArray[np.floating], *, iterations: int = 30, tolerance: float = 1e-3
     ) -> Registration:
         """Register `image (H, W)` by inverse compositional Gauss-Newton (Baker and Matthews 2004).
 
@@ -87,7 +82,8 @@ class Template:
             error = sample(other, u, v) / gain - self.values
             step = self.inverse @ (self.jacobian.T @ error)
             gain *= 1 + float(np.clip(step[3], -0.5, 0.5))
-            # compose with the inverse of the step that would move the reference onto the picture
+            # compose with the inverse of the step that moves the reference onto the warped picture
+            step = -step
             angle += step[2]
             c, s = np.cos(angle), np.sin(angle)
             shift = shift + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])

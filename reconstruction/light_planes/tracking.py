@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from reconstruction.cameras import Camera
@@ -38,7 +39,7 @@ LEVER = 0.1  # metres: rotations count by what they move at this distance, so th
 class MotionOptions:
     """How the motion is solved.
 
-    `still_px`: motions under this, or under four deviations of the registration, are none.
+    `still_px`: motions under this, or within the noise of all cameras together, are none.
     `weakest`: directions whose singular value is below this share of the largest are not
     determined, and stay at zero. `points`: at most so many points a camera.
     """
@@ -93,9 +94,7 @@ def solve_motion(
     ]  # fmt: skip
     largest = max(r.largest() for frame in screened for r in frame)
     stage.figures["largest_2d_motion_px"] = largest
-    if all(
-        r.largest() <= max(options.still_px, 4 * r.noise()) for frame in screened for r in frame
-    ):
+    if not any(_moved(frame, options.still_px) for frame in screened):
         stage.leave_out(
             "motion solve",
             f"nothing moved: at most {largest:.3f} px in {len(steps)} tracking frames",
@@ -123,7 +122,7 @@ def _solve_all(
             if capture.has(step, v.camera.name)
         }
         present = [v for v in views if v.camera.name in images]
-        found = [(v, v.template.register(images[v.camera.name])) for v in present]
+        found = [(v, v.template.register(images[v.camera.name], iterations=15)) for v in present]
         pairs += len(found)
         pose, rank, residual = from_registrations(found, options.weakest)
         if options.method == "direct":
@@ -192,11 +191,11 @@ def align(
     images: dict[str, Array],
     start: tuple[Array, Array],
     weakest: float,
-    sigmas: tuple[float, ...] = (2.5, 1.2),
+    sigmas: tuple[float, ...] = (1.5,),
 ) -> tuple[tuple[Array, Array], int]:
     """The motion under which every camera's picture at the moved points equals its reference.
 
-    `images[camera] (H, W)`; coarse to fine over Gaussians of `sigmas` pixels. Returns the pose and
+    `images[camera] (H, W)`; over Gaussians of `sigmas` pixels, in this order. Returns the pose and
     how many directions are determined.
     """
     pose, rank = start, 0
@@ -226,7 +225,7 @@ def align(
                 rows.append(_flow(slope, view.camera, moved, depth) * inside[:, None])
             return np.concatenate(errors), np.concatenate(rows)
 
-        pose, rank = _gauss_newton(system, weakest, 15, pose)
+        pose, rank = _gauss_newton(system, weakest, 10, pose)
     return pose, rank
 
 
@@ -306,6 +305,8 @@ def _views(
         image = _picture(capture, reference, camera.name)
         mask = np.zeros(image.shape, bool)
         mask[tuple(np.rint(pixels[:, ::-1]).astype(int).T)] = True
+        # the contour against the dark background is the strongest feature there is
+        mask = ndimage.binary_dilation(mask, iterations=3)
         clipped = capture.saturated(reference, camera.name)
         try:
             template = Template(image, mask & ~clipped)
@@ -317,8 +318,25 @@ def _views(
 
 
 def _picture(capture: Capture, step: Step, camera: str) -> Array:
+    """The square root of the light: photon noise is then the same in highlights and shade."""
     dark = dark_frame(capture, camera, step.exposure)
-    return np.asarray(capture.response(step, camera).mean(axis=-1) - dark, np.float64)
+    image = capture.frame(step, camera).mean(axis=-1) - dark
+    return np.asarray(np.sqrt(np.maximum(image, 0) / (step.level or 1.0)), np.float64)
+
+
+def _moved(frame: list[Registration], still_px: float) -> bool:
+    """Whether the cameras' registrations of one frame together stand out of their noise.
+
+    Their squares over their variances average 1 for a still subject, with a deviation of
+    sqrt(2 / count): four of those decide.
+    """
+    if max((r.largest() for r in frame), default=0.0) <= still_px:
+        return False
+    tiny = np.finfo(float).tiny
+    squares = np.concatenate(
+        [np.array([*r.shift, r.angle]) ** 2 / np.maximum(r.deviation**2, tiny) for r in frame]
+    )
+    return float(squares.mean()) > 1 + 4 * np.sqrt(2 / len(squares))
 
 
 def _rigid_at(registration: Registration, pixel: Array) -> Array:

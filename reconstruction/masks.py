@@ -1,0 +1,245 @@
+"""Which pixels are hair and which are skin: the user's word, else geometry, else the light.
+
+Hair is wherever the user's mask says so. Without one, a pixel whose triangulated point stands off
+the head, or that shows the subject where the head is not, is hair. On the head, and without a head
+mesh everywhere, the light decides: a matte surface answers half of the lamps by `albedo n·l`, fibres
+mirror a few lamps and hide from the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture
+from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.mesh import Mesh
+from reconstruction.silhouettes import NoSilhouette, silhouette
+
+Mask = NDArray[np.bool_]
+Source = Literal["user", "geometry", "photometry", "silhouette"]
+
+STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
+MATTE_CONTRAST = 1.29  # sqrt(1/6 - 1/16) / (1/4): cosine over all directions, deviation over mean
+
+
+@dataclass(frozen=True, eq=False)
+class HairMask:
+    """One camera's pixels `(H, W) bool`: `subject` is the union of `hair` and `skin`, no overlap.
+
+    `source` says who told hair from skin; `decided` is the share of the subject that it decided,
+    the rest follows its neighbours.
+    """
+
+    subject: Mask
+    hair: Mask
+    skin: Mask
+    source: Source
+    decided: float
+
+
+def hair_masks(
+    capture: Capture,
+    points: PointCloud | None = None,
+    head: Mesh | None = None,
+    *,
+    stands_off: float = STANDS_OFF,
+) -> dict[str, HairMask]:
+    """Masks of every camera that has a user's mask or a silhouette.
+
+    `points` are in the reference pose, `head` the digitised head in the world. A camera without any
+    frame to take a silhouette from, and without a user's mask, is left out. An empty silhouette
+    gives empty masks.
+    """
+    off = None
+    if head is not None and points is not None and len(points):
+        off = distance_to(head, points.points)
+    masks = {}
+    for camera in capture.rig.cameras:
+        user = capture.mask(camera.name)
+        try:
+            subject = silhouette(capture, camera.name)
+        except NoSilhouette:
+            if user is None:
+                continue
+            subject = user
+        if user is not None:
+            masks[camera.name] = HairMask(subject | user, user, subject & ~user, "user", 1.0)
+        elif not subject.any():
+            masks[camera.name] = HairMask(subject, subject, subject, "silhouette", 0.0)
+        else:
+            masks[camera.name] = _decide(capture, camera, subject, points, head, off, stands_off)
+    return masks
+
+
+def _decide(
+    capture: Capture,
+    camera: Camera,
+    subject: Mask,
+    points: PointCloud | None,
+    head: Mesh | None,
+    off: NDArray[np.float64] | None,
+    stands_off: float,
+) -> HairMask:
+    hair, skin = np.zeros_like(subject), np.zeros_like(subject)
+    source: Source = "silhouette"
+    contrast = light_contrast(capture, camera.name, subject)
+    if head is not None:
+        source = "geometry"
+        covered = head_coverage(head, camera)
+        hair |= subject & ~ndimage.binary_dilation(covered)
+        if points is not None and off is not None:
+            standing, lying = _votes(points, camera, off, stands_off)
+            hair |= subject & (standing > lying)
+            skin |= subject & covered & (lying > standing) & ~hair
+        if contrast is not None:
+            # a point on the head may be hair that lies flat, and one may be missing: ask the light
+            level = _threshold(contrast, hair, skin)
+            asked = (skin | (subject & covered)) & ~hair
+            hair |= asked & (contrast > level)
+            skin |= asked & ~hair
+            skin &= ~hair
+    elif contrast is not None:
+        source = "photometry"
+        level = _otsu(contrast[subject])
+        hair, skin = subject & (contrast > level), subject & (contrast <= level)
+    decided = float((hair | skin).sum() / subject.sum())
+    if not (hair | skin).any():
+        # nothing told them apart: all of the subject may be hair
+        return HairMask(subject, subject, np.zeros_like(subject), source, 0.0)
+    hair = _fill(subject, hair, skin)
+    return HairMask(subject, hair, subject & ~hair, source, decided)
+
+
+def _votes(
+    points: PointCloud, camera: Camera, off: NDArray[np.float64], stands_off: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights of the points that stand off the head and that lie on it, per pixel `(H, W)`.
+
+    The camera's own points, none where it took no part in the triangulation.
+    """
+    own = points.cameras.index(camera.name) if camera.name in points.cameras else -1
+    mine = points.camera == own
+    pixels, depth = camera.project(points.points[mine])
+    seen = (depth > 0) & camera.inside(pixels)
+    x, y = np.rint(pixels[seen]).astype(int).T
+    shape = (camera.height, camera.width)
+    flat = np.clip(y, 0, shape[0] - 1) * shape[1] + np.clip(x, 0, shape[1] - 1)
+    weight = points.weight[mine][seen].astype(np.float64)
+    standing = off[mine][seen] > stands_off
+    votes = [np.zeros(shape[0] * shape[1]) for _ in range(2)]
+    np.add.at(votes[0], flat[standing], weight[standing])
+    np.add.at(votes[1], flat[~standing], weight[~standing])
+    return votes[0].reshape(shape), votes[1].reshape(shape)
+
+
+def distance_to(head: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances `(N,)` of `points (N, 3)` in front of the surface of `head`, metres.
+
+    To the nearest of samples 2 mm apart, along their normal where the point is closer than 1 cm:
+    negative inside a closed mesh whose normals point outwards.
+    """
+    samples, normals = _samples(head, 2e-3)
+    distance, index = cKDTree(samples).query(points)
+    height = np.einsum("ni,ni->n", points - samples[index], normals[index])
+    return np.where(distance < 0.01, height, distance)
+
+
+def _samples(head: Mesh, step: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points `(N, 3)` about `step` apart on every face of `head`, and their normals `(N, 3)`."""
+    corners = head.vertices[head.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    divisions = np.maximum(np.ceil(longest / step).astype(int), 1)
+    normals = head.face_normals()
+    points, faces = [], []
+    for n in np.unique(divisions):
+        of = np.flatnonzero(divisions == n)
+        i, j = np.nonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
+        u, v = (i + 1 / 3) / n, (j + 1 / 3) / n
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        points.append(np.einsum("kc,fci->fki", weights, corners[of]).reshape(-1, 3))
+        faces.append(np.repeat(of, len(weights)))
+    return np.concatenate(points), normals[np.concatenate(faces)]
+
+
+def head_coverage(head: Mesh, camera: Camera) -> Mask:
+    """Pixels `(H, W)` whose ray meets `head`."""
+    shift = 4  # OpenCV's fixed-point bits below the pixel
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    pixels, depth = camera.project(head.vertices)
+    front = (depth[head.faces] > 1e-3).all(axis=1)
+    limit = 30.0 * max(camera.width, camera.height)  # keeps the fixed-point numbers in range
+    triangles = pixels[head.faces[front]]
+    triangles = triangles[(np.abs(triangles) < limit).all(axis=(1, 2))]
+    for triangle in np.rint(triangles * (1 << shift)).astype(np.int32):
+        cv2.fillConvexPoly(image, triangle, 1, lineType=cv2.LINE_8, shift=shift)
+    return np.asarray(image > 0)
+
+
+def light_contrast(
+    capture: Capture, camera: str, subject: Mask, lights: int = 96
+) -> NDArray[np.float64] | None:
+    """How unlike a matte surface each pixel answers single lamps: log ratio `(H, W)`, 0 for matte.
+
+    The deviation over the mean of the answers to a dome of lamps is 1.29 for a matte surface in the
+    open, up to 2 with half of the lamps in its own shadow; fibres mirror few lamps and reach 3 to 7.
+    Smoothed over 3×3 pixels. None where under eight lamps were shot.
+    """
+    shot = {s.light for s in capture.of_kind("olat") if capture.has(s, camera)}
+    names = [n for n in capture.olat_lights() if n in shot]
+    if len(names) < 8:
+        return None
+    names = names[:: max(1, len(names) // lights)]
+    power = np.array([max(capture.rig.light(n).intensity.mean(), 1e-12) for n in names])
+    values = capture.olat(camera, names).mean(axis=-1) / power[:, None, None]
+    mean = np.maximum(values.mean(axis=0), 0)
+    ratio = np.divide(values.std(axis=0), mean, out=np.ones_like(mean), where=mean > 0)
+    logs = np.where(subject, np.log(np.maximum(ratio, 0.1) / MATTE_CONTRAST), 0.0)
+    near = ndimage.uniform_filter(subject.astype(np.float64), 3)
+    smooth = ndimage.uniform_filter(logs, 3) / np.where(near > 0, near, 1.0)
+    return np.asarray(np.where(subject, smooth, 0.0))
+
+
+def _threshold(contrast: NDArray[np.float64], hair: Mask, skin: Mask) -> float:
+    """The contrast above which a pixel is hair: between what sure hair and likely skin have.
+
+    Infinite, so that none is, where the two do not differ by a third or one of them is missing.
+    """
+    if not hair.any() or not skin.any():
+        return np.inf
+    sure, likely = float(np.median(contrast[hair])), float(np.median(contrast[skin]))
+    return 0.5 * (sure + likely) if sure > likely + np.log(4 / 3) else np.inf
+
+
+def _otsu(values: NDArray[np.float64]) -> float:
+    """The threshold that splits `values (N,)` into the two tightest classes (Otsu 1979)."""
+    order = np.sort(values)
+    n = len(order)
+    if n < 2:
+        return np.inf
+    k = np.arange(1, n)
+    total = np.cumsum(order)
+    low, high = total[:-1] / k, (total[-1] - total[:-1]) / (n - k)
+    return float(order[np.argmax(k * (n - k) * (high - low) ** 2)])
+
+
+def _fill(subject: Mask, hair: Mask, skin: Mask) -> Mask:
+    """Hair over all of the subject: undecided pixels follow decided ones, specks are voted out."""
+    known = (hair | skin).astype(np.float64)
+    score = np.zeros(subject.shape)
+    for sigma in (1.0, 2.0, 4.0, 8.0):
+        vote = ndimage.gaussian_filter(hair - skin.astype(np.float64), sigma)
+        weight = ndimage.gaussian_filter(known, sigma)
+        undecided = (score == 0) & (weight > 1e-3)
+        score[undecided] = vote[undecided] / weight[undecided]
+    nearest = ndimage.distance_transform_edt(known == 0, return_indices=True)[1]
+    left = score == 0
+    score[left] = np.where(hair[tuple(nearest)], 1.0, -1.0)[left]
+    return np.asarray(subject & (score > 0))
