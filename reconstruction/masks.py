@@ -2,8 +2,8 @@
 
 Hair is wherever the user's mask says so. Without one, a pixel whose triangulated point stands off
 the head, or that shows the subject where the head is not, is hair. On the head, and without a head
-mesh everywhere, the light decides: a matte surface answers half of the lamps by `albedo n·l`, fibres
-mirror a few lamps and hide from the others.
+mesh everywhere, the light decides: a matte surface answers half of the lamps by `albedo n·l`,
+fibres mirror a few lamps and hide from the others.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _decide(
             skin |= subject & covered & (lying > standing) & ~hair
         if contrast is not None:
             # a point on the head may be hair that lies flat, and one may be missing: ask the light
-            level = _threshold(contrast, hair, skin)
+            level = _threshold(contrast, subject, hair, skin)
             asked = (skin | (subject & covered)) & ~hair
             hair |= asked & (contrast > level)
             skin |= asked & ~hair
@@ -189,7 +189,7 @@ def light_contrast(
     """How unlike a matte surface each pixel answers single lamps: log ratio `(H, W)`, 0 for matte.
 
     The deviation over the mean of the answers to a dome of lamps is 1.29 for a matte surface in the
-    open, up to 2 with half of the lamps in its own shadow; fibres mirror few lamps and reach 3 to 7.
+    open, up to 2 with half of the lamps in its own shadow; fibres mirror few and reach 3 to 7.
     Smoothed over 3×3 pixels. None where under eight lamps were shot.
     """
     shot = {s.light for s in capture.of_kind("olat") if capture.has(s, camera)}
@@ -207,13 +207,14 @@ def light_contrast(
     return np.asarray(np.where(subject, smooth, 0.0))
 
 
-def _threshold(contrast: NDArray[np.float64], hair: Mask, skin: Mask) -> float:
+def _threshold(contrast: NDArray[np.float64], subject: Mask, hair: Mask, skin: Mask) -> float:
     """The contrast above which a pixel is hair: between what sure hair and likely skin have.
 
-    Infinite, so that none is, where the two do not differ by a third or one of them is missing.
+    The split of the whole subject where one of them is missing; infinite, so that none is hair,
+    where the two do not differ by a third.
     """
     if not hair.any() or not skin.any():
-        return np.inf
+        return _otsu(contrast[subject])
     sure, likely = float(np.median(contrast[hair])), float(np.median(contrast[skin]))
     return 0.5 * (sure + likely) if sure > likely + np.log(4 / 3) else np.inf
 
