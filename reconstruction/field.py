@@ -34,9 +34,9 @@ def to_tensors(directions: NDArray[np.floating]) -> Array:
 
 
 def principal(tensors: Array) -> tuple[Array, Array]:
-    """Unit eigenvectors `(N, 3)` of the largest eigenvalue, and eigenvalues `(N, 3)`, largest first.
+    """Unit eigenvectors `(N, 3)` of the largest eigenvalue, and eigenvalues `(N, 3)`.
 
-    `tensors (N, 6)` as `to_tensors` makes them.
+    `tensors (N, 6)` as `to_tensors` makes them; eigenvalues have the largest first.
     """
     full = np.empty((len(tensors), 3, 3))
     full[:, _ROWS, _COLUMNS] = tensors
@@ -45,13 +45,18 @@ def principal(tensors: Array) -> tuple[Array, Array]:
     return vectors[:, :, 2], values[:, ::-1]
 
 
+def _within(index: NDArray[np.int64], shape: tuple[int, ...]) -> Bools:
+    """Which of the voxels `index (N, 3)` lie on a grid of `shape`."""
+    return np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))
+
+
 @dataclass(frozen=True, eq=False)
 class OrientationField:
     """Undirected orientations on the voxels of an envelope.
 
     `grid` marks the envelope; its M inside voxels in C order carry `tensors (M, 6)`,
-    `directions (M, 3)` (unit, sign meaningless; 0 where `valid` is False), `coherence (M,)` (largest
-    minus second eigenvalue, 0 to 1), `measured (M,)` (a measurement fell into the voxel),
+    `directions (M, 3)` (unit, sign meaningless; 0 where `valid` is False), `coherence (M,)`
+    (largest minus second eigenvalue, 0 to 1), `measured (M,)` (a measurement fell into the voxel),
     `empty (M,)` (part of a connected piece without any data) and `degenerate (M,)` (the two largest
     eigenvalues nearly agree: there is no orientation).
     """
@@ -78,7 +83,7 @@ class OrientationField:
     def voxel(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         """The number `(N,)` of the envelope voxel that holds each point, -1 outside."""
         index = self.grid.index(points)
-        on = ((index >= 0) & (index < self.number.shape)).all(axis=1)
+        on = _within(index, self.number.shape)
         i, j, k = np.where(on[:, None], index, 0).T
         return np.where(on, self.number[i, j, k], -1).astype(np.int64)
 
@@ -93,10 +98,9 @@ class OrientationField:
         base = np.floor(q).astype(np.int64)
         f = q - base
         total = np.zeros((len(points), 3))
-        top = np.array(self.number.shape)
         for corner in np.ndindex(2, 2, 2):
             index = base + corner
-            on = ((index >= 0) & (index < top)).all(axis=1)
+            on = _within(index, self.number.shape)
             i, j, k = np.where(on[:, None], index, 0).T
             n = np.where(on, self.number[i, j, k], -1)
             d = np.where((n >= 0)[:, None], self.directions[n], 0.0)
@@ -140,7 +144,7 @@ def gather(
     best, distance = np.full(len(index), -1, np.int64), np.full(len(index), np.inf)
     for shift in np.ndindex(3, 3, 3):
         moved = index + np.array(shift) - 1
-        on = ((moved >= 0) & (moved < number.shape)).all(axis=1)
+        on = _within(moved, number.shape)
         n = np.where(on, number[tuple(np.where(on[:, None], moved, 0).T)], -1)
         far = np.linalg.norm(q - moved, axis=1)
         nearer = (n >= 0) & (far < distance)
@@ -149,7 +153,7 @@ def gather(
     voxels, member = np.unique(best[ok], return_inverse=True)
     w = np.asarray(weights, float)[ok]
     tensors = to_tensors(np.asarray(directions)[ok]) * w[:, None]
-    total = np.bincount(member, w, len(voxels))
+    total = np.bincount(member, w, len(voxels)).astype(float)
     sums = np.stack([np.bincount(member, t, len(voxels)) for t in tensors.T], axis=1)
     return voxels, sums / np.maximum(total, 1e-300)[:, None], total
 
@@ -160,7 +164,7 @@ def solve_field(
     directions: NDArray[np.floating],
     weights: NDArray[np.floating] | None = None,
     boundary: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
-    options: FieldOptions = FieldOptions(),  # noqa: B008  frozen
+    options: FieldOptions = FieldOptions(),
 ) -> tuple[OrientationField, list[Series]]:
     """Spread measured lines through the envelope: Laplace's equation for each tensor entry.
 

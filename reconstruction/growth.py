@@ -177,9 +177,10 @@ def fill_gaps(
         spent[chosen] = True
         starts = centers[chosen] + field.grid.spacing * rng.uniform(-0.4, 0.4, (len(chosen), 3))
         d = field.directions[chosen]
-        options = {"step": step, "max_length": max_length}
-        ahead = to_polylines(trace(field, starts, d, **options))
-        behind = to_polylines(trace(field, starts, -d, **options))
+        ahead, behind = (
+            to_polylines(trace(field, starts, side, step=step, max_length=max_length))
+            for side in (d, -d)
+        )
         for a, b in zip(ahead, behind, strict=True):
             path = np.concatenate([b[:0:-1], a])
             if (len(path) - 1) * step >= shortest:

@@ -86,7 +86,7 @@ def measure_tangents(
     masks: Mapping[str, HairMask],
     depths: Mapping[str, Array],
     envelope: VoxelGrid,
-    options: MeasureOptions = MeasureOptions(),  # noqa: B008  frozen
+    options: MeasureOptions = MeasureOptions(),
     stage: Stage | None = None,
     progress: Progress = silent,
 ) -> Measured:

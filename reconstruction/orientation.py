@@ -54,7 +54,7 @@ class LogGaborBank:
         return np.asarray(radial * np.exp(-(delta**2) / (2 * sigma**2)), np.float32)
 
     def responses(self, image: Images) -> NDArray[np.float32]:
-        """Magnitudes `(count, H, W)` of the answers to one `image (H, W)`, mirrored at its edges."""
+        """Magnitudes `(count, H, W)` of the answers to an `image (H, W)`, mirrored at its edges."""
         margin = int(
             min(4 * self.wavelength * max(1.0, self.count / (np.pi * self.spread * 6)), 48)
         )
@@ -81,9 +81,10 @@ class OrientationMap:
 
 
 def texture(image: Images, mask: Bools, scale: float = 4.0) -> NDArray[np.float32]:
-    """The image's relative detail `(H, W)`: over its mean within `scale` pixels in the mask, less 1.
+    """The image's relative detail `(H, W)`: over its mean near by in the mask, less 1.
 
-    It is 0 outside the mask, so the hair's outline and slow shading do not answer as lines.
+    The mean is a Gaussian one of `scale` pixels. Detail is 0 outside the mask, so the hair's
+    outline and slow shading do not answer as lines.
     """
     inside = mask.astype(np.float32)
     weight = ndimage.gaussian_filter(inside, scale)
@@ -96,13 +97,13 @@ def texture(image: Images, mask: Bools, scale: float = 4.0) -> NDArray[np.float3
 def orientations(
     images: Images,
     mask: Bools,
-    bank: LogGaborBank = LogGaborBank(),  # noqa: B008  frozen
+    bank: LogGaborBank = LogGaborBank(),
 ) -> OrientationMap:
     """The orientation at every pixel of `mask (H, W)` from `images (N, H, W)`, one per lighting.
 
-    Each lighting's winner and confidence are merged as doubled angles (Sun Eq. 2 averages π-periodic
-    angles directly; θ and θ + π would cancel), weighted by the answer's strength. A winner is
-    refined below the bank's bins by the parabola through its neighbours.
+    Each lighting's winner and confidence are merged as doubled angles (Sun Eq. 2 averages
+    π-periodic angles directly; θ and θ + π would cancel), weighted by the answer's strength. A
+    winner is refined below the bank's bins by the parabola through its neighbours.
     """
     images = np.asarray(images)
     if images.ndim == 2:

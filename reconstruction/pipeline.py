@@ -25,7 +25,7 @@ from reconstruction.light_planes import (
     triangulate,
 )
 from reconstruction.masks import HairMask, hair_masks
-from reconstruction.measure import MeasureOptions, Measured, measure_tangents
+from reconstruction.measure import Measured, MeasureOptions, measure_tangents
 from reconstruction.mesh import Mesh
 from reconstruction.report import Progress, Report, Stage, silent
 from reconstruction.rig import Rig
@@ -75,7 +75,7 @@ def reconstruct(
     model: Path,
     *,
     method: Literal["light_planes"] = "light_planes",
-    options: ReconstructOptions = ReconstructOptions(),  # noqa: B008  frozen
+    options: ReconstructOptions = ReconstructOptions(),
     progress: Progress = silent,
 ) -> Report:
     """Reconstruct the strands of `capture` into the folder `model`.
@@ -189,9 +189,9 @@ def build_envelope(
     inside = carved.inside & ~inside_mesh(hull, head)
     envelope = replace(carved, inside=inside)
     for camera in cameras:
-        depth, mask = depths[camera.name], masks[camera.name].hair
-        entry = depth_map_first(camera, envelope)
-        depths[camera.name] = np.where(mask & (depth == 0), entry, depth)
+        depth = depths[camera.name]
+        unknown = masks[camera.name].hair & (depth == 0)
+        depths[camera.name] = np.where(unknown, depth_map_first(camera, envelope), depth)
     litres = 1e3 * options.grid**3
     stage.figures.update(
         hull_litres=float(hull.inside.sum() * litres),

@@ -53,9 +53,9 @@ class Observations:
     """One camera's answers at the points it sees.
 
     `index (P,)` into the points, `response (P, L)` to each light, corrected for the light's
-    distance and intensity and divided by the mean over the lights in front; `to_light (P, L, 3)` and
-    `to_camera (P, 3)` are unit vectors, `facing (P, L)` the cosines of the lights to the surface's
-    normal.
+    distance and intensity and divided by the mean over the lights in front; `to_light (P, L, 3)`
+    and `to_camera (P, 3)` are unit vectors, `facing (P, L)` the cosines of the lights to the
+    surface's normal.
     """
 
     index: NDArray[np.int64]
@@ -73,7 +73,7 @@ def observe(
     normals: Array,
     seen: Bools,
 ) -> Observations:
-    """What `camera` saw under each light (`olat (L, H, W)`) at the `points (N, 3)` it has `seen`."""
+    """What `camera` saw under each light (`olat (L, H, W)`) at the `points (N, 3)` it sees."""
     index = np.flatnonzero(seen)
     pixels, _ = camera.project(points[index])
     x, y = np.rint(pixels).astype(int).T
@@ -127,7 +127,7 @@ class Reflection:
     def learn(
         cls, observations: Sequence[Observations], directions: Array, trusted: Bools
     ) -> Reflection:
-        """Fill the table from the points that are `trusted (N,)` to lie along `directions (N, 3)`."""
+        """Fill the table from points that are `trusted (N,)` to lie along `directions (N, 3)`."""
         total, count = np.zeros(_FACINGS), np.zeros(_FACINGS)
         for o in observations:
             cell = _facing_cell(o.facing).ravel()
@@ -202,8 +202,8 @@ def reflection_scores(
 ) -> tuple[Floats, Reflection]:
     """Scores `(N, D)` of the candidates at all points, and the table that they were read with.
 
-    `seen (N, C)` says which camera sees which point; `first` are directions `(N, 3)` and confidences
-    `(N,)` from texture: the `trusted_share` of the most confident ones teach the table.
+    `seen (N, C)` says which camera sees which point; `first` are directions `(N, 3)` and
+    confidences `(N,)` from texture: the `trusted_share` of the most confident ones teach the table.
     """
     centers = np.stack([c.center for c in cameras])
     away = seen @ centers - seen.sum(axis=1, keepdims=True) * points

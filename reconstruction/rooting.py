@@ -39,10 +39,10 @@ def root_all(
 ) -> Rooted:
     """Give every loose polyline a root; its direction in space is not changed.
 
-    An end within `near_scalp` metres of the scalp is led to it. Any other goes on beside the nearest
-    rooted strand that continues it within `turn_deg`, keeping a distance that fades towards that
-    strand's root; strands that were joined carry others in the next round. `reaches` are the
-    distances, metres, within which a neighbour is looked for, round by round.
+    An end within `near_scalp` metres of the scalp is led to it. Any other goes on beside the
+    nearest rooted strand that continues it within `turn_deg`, keeping a distance that fades
+    towards that strand's root; strands that were joined carry others in the next round.
+    `reaches` are the distances, metres, within which a neighbour is looked for, round by round.
     """
     strands = list(rooted)
     tree = cKDTree(scalp.points)

@@ -130,8 +130,8 @@ def decide(
     """The best direction for each row of `scores (N, D)` over `candidates (D, 3)`.
 
     Scores are turned into weights by a softmax whose temperature is their median spread over the
-    rows divided by `sharpness` (default 6). The direction is the main axis of the weighted structure
-    tensor of the candidates near the best one: finer than their spacing.
+    rows divided by `sharpness` (default 6). The direction is the main axis of the weighted
+    structure tensor of the candidates near the best one: finer than their spacing.
     """
     if scores.shape != (len(scores), len(candidates)):
         raise ValueError(f"scores must be (N, {len(candidates)}), got {scores.shape}")
@@ -171,8 +171,8 @@ def tangents_from_lines(
     """Directions at `points (N, 3)` from all cameras' textures, and how many cameras saw each.
 
     The paper cuts the planes of the two most frontal cameras' winners; here every camera that sees
-    the point adds its whole curve of support, neighbours within `radius` are averaged, and only then
-    is a direction chosen: an ambiguous curve is settled by the other views.
+    the point adds its whole curve of support, neighbours within `radius` are averaged, and only
+    then is a direction chosen: an ambiguous curve is settled by the other views.
     """
     directions = half_sphere(candidates)
     average = pool(points, radius)
