@@ -76,7 +76,7 @@ def find_peaks(
         scan.push(row)
     found = scan.value > 0
     layer, y, x = np.nonzero(found)
-    window = scan.window[layer, :, y, x].astype(np.float64)
+    window = scan.window[layer, y, x].astype(np.float64)
     value, at = scan.value[found].astype(np.float64), scan.at[found]
     noise = scan.noise()
     offset, deviation, correlation, amplitude = fit_stripes(window, device, noise)
@@ -173,7 +173,7 @@ class _Scan:
         self.held: deque[bool] = deque(maxlen=WINDOW)
         self.value = np.zeros((layers, *shape), np.float32)
         self.at = np.zeros((layers, *shape), np.int64)
-        self.window = np.zeros((layers, WINDOW, *shape), np.float32)
+        self.window = np.zeros((layers, *shape, WINDOW), np.float32)
         self.clipped = np.zeros((layers, *shape), bool)
         self.total = np.zeros(shape, np.float32)
         self.missing: list[int] = []
@@ -196,8 +196,8 @@ class _Scan:
             else:
                 image, clipped = self._read(step)
                 self.total += image
-        self.ring.append(image)
-        self.clip.append(clipped)
+        self.ring.append(image.ravel())
+        self.clip.append(clipped.ravel())
         self.held.append(held)
         middle = row - REACH
         if len(self.ring) == WINDOW and all(list(self.held)[REACH - 1 : REACH + 2]):
@@ -206,26 +206,28 @@ class _Scan:
     def _read(self, step: Step) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         if step.exposure not in self._dark:
             self._dark[step.exposure] = dark_frame(self.capture, self.camera, step.exposure)
-        image = self.capture.frame(step, self.camera).mean(axis=-1) - self._dark[step.exposure]
-        image /= np.float32(step.level if step.level > 0 else 1.0)
+        response, saturated = self.capture.response_and_saturated(step, self.camera)
+        dark = self._dark[step.exposure] / np.float32(step.level if step.level > 0 else 1.0)
+        image = response @ np.full(3, 1 / 3, np.float32) - dark
         if step.row is not None and step.row % 8 == 0:
             self._noises.append(background_noise(image))
-        return image, self.capture.saturated(step, self.camera)
+        return image, saturated
 
     def _insert(self, middle: int) -> None:
         """Keep the middle frame's maxima where they beat the weakest that a pixel has."""
         before, now, after = (self.ring[REACH + k] for k in (-1, 0, 1))
-        maximum = (now > before) & (now >= after) & (now > 0)
+        pixel = np.flatnonzero((now > before) & (now >= after) & (now > self.value[-1].ravel()))
         for layer in range(len(self.value)):
-            better = maximum & (now > self.value[layer])
-            if not better.any():
+            better = now[pixel] > self.value[layer].ravel()[pixel]
+            which, pixel = pixel[better], pixel[~better]
+            if not len(which):
                 continue
-            for store in (self.value, self.at, self.clipped):
-                store[layer + 1 :, better] = store[layer:-1, better]
-            self.window[layer + 1 :, :, better] = self.window[layer:-1, :, better]
-            self.value[layer][better] = now[better]
-            self.at[layer][better] = middle
+            for store in (self.value, self.at, self.clipped, self.window):
+                flat = store.reshape(len(store), self.value[0].size, *store.shape[3:])
+                flat[layer + 1 :, which] = flat[layer:-1, which]
             near = self.clip[REACH - 1] | self.clip[REACH] | self.clip[REACH + 1]
-            self.clipped[layer][better] = near[better]
-            self.window[layer][:, better] = np.stack([f[better] for f in self.ring])
-            maximum &= ~better
+            self.value[layer].ravel()[which] = now[which]
+            self.at[layer].ravel()[which] = middle
+            self.clipped[layer].ravel()[which] = near[which]
+            window = np.stack([f[which] for f in self.ring], axis=1)
+            self.window[layer].reshape(-1, WINDOW)[which] = window
