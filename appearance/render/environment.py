@@ -1,8 +1,8 @@
 """Pictures under an environment map: lat-long radiance all around the subject.
 
 Orientation: row 0 of a map `(h, w, 3)` is the zenith (+z), the last row the nadir; the middle
-column looks along +x and columns to its right turn clockwise seen from above (towards −y), so that a
-map is upright and not mirrored when seen from inside. Blender's equirectangular convention.
+column looks along +x and columns to its right turn clockwise seen from above (towards −y), so that
+a map is upright and not mirrored when seen from inside. Blender's equirectangular convention.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.paths import (
     Surface,
+    Wave,
     camera_rays,
+    each_sample,
     opaque,
     opaque_index,
-    passes,
     walk,
-    wave,
 )
 from appearance.scene import HairScene
 from reconstruction.cameras import Camera
-
-_LANES = 1 << 20
 
 
 def render_environment(
@@ -63,14 +61,15 @@ def render_environment(
     if len(index):
         pixel = mi.UInt32(index.astype(np.uint32))
         film = dr.zeros(mi.Float, 3 * len(index))
-        for first, count in passes(spp, max(1, _LANES // len(index))):
-            paths = wave(camera, pixel, len(index), first, count, spp, seed)
+
+        def trace(paths: Wave) -> None:
             if background:
                 missed = ~scene.mi_scene.ray_test(paths.rays)
                 _add(film, paths.slot, sky.radiance(paths.rays.d), missed)
             gather = _Gather(Surface(scene), film, paths.slot, sky)
             walk(gather.surface, paths.rays, paths.rng, gather, max_depth, rr_depth)
-            dr.eval(film)
+
+        each_sample(camera, pixel, len(index), spp, (seed,), trace)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
     return image.reshape(camera.height, camera.width, 3)
 

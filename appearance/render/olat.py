@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import (
     Surface,
+    Wave,
+    each_sample,
     light_from,
     opaque_index,
-    passes,
     pixel_indices,
     walk,
-    wave,
 )
 from appearance.scene import HairScene, light_arrays
 from reconstruction.cameras import Camera
@@ -25,7 +25,6 @@ from reconstruction.lights import Light
 
 _PILOT = 1024  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31
-_LANES = 1 << 20  # paths in flight: enough to fill the machine, little enough memory
 
 
 def render_olat(
@@ -78,7 +77,7 @@ def render_olat(
     if thrift > 0:
         dim = thrift * _typical(scene, camera, lights, index, plan, seed)
         plan = replace(plan, dim=dim)
-    tile = max(1, min(len(index), film_bytes // (12 * len(lights)), _LANES))
+    tile = max(1, min(len(index), film_bytes // (12 * len(lights))))
     for start in range(0, len(index), tile):
         part = index[start : start + tile]
         radiance = _render_tile(scene, camera, lights, part, spp, plan, (seed, start))
@@ -138,11 +137,13 @@ def _render_tile(
     pixel = mi.UInt32(index.astype(np.uint32))
     film = dr.zeros(mi.Float, 3 * len(lights) * len(index))
     surface = Surface(scene)
-    for first, count in passes(spp, max(1, _LANES // len(index))):
-        paths = wave(camera, pixel, len(index), first, count, spp, *seed)
-        gather = _Gather(surface, film, paths.slot, opaque_index(len(index)), bank, plan.counts)
+    slots = opaque_index(len(index))
+
+    def trace(paths: Wave) -> None:
+        gather = _Gather(surface, film, paths.slot, slots, bank, plan.counts)
         walk(surface, paths.rays, paths.rng, gather, plan.max_depth, plan.rr_depth)
-        dr.eval(film)
+
+    each_sample(camera, pixel, len(index), spp, seed, trace)
     image = np.array(film).reshape(len(lights), len(index), 3)
     return np.asarray(image / np.float32(spp), dtype=np.float32)
 

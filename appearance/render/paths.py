@@ -233,7 +233,8 @@ def stream(size: int, *seeds: int) -> Any:
     import mitsuba as mi
 
     state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
-    return mi.PCG32(size, dr.opaque(mi.UInt64, int(state[0])))
+    generator: Any = mi.PCG32  # the stubs call it a plain object
+    return generator(size, dr.opaque(mi.UInt64, int(state[0])))
 
 
 def passes(spp: int, per_pass: int) -> Iterator[tuple[int, int]]:
@@ -287,3 +288,39 @@ def wave(
     rng = stream(count * slots, *seeds, first)
     pixel = dr.gather(mi.UInt32, pixels, slot)
     return Wave(jittered(camera, pixel, sample + opaque_index(first), spp, rng), rng, slot)
+
+
+def each_sample(
+    camera: Camera,
+    pixels: Any,
+    slots: int,
+    spp: int,
+    seeds: tuple[int, ...],
+    trace: Callable[[Wave], None],
+) -> None:
+    """Call `trace` with samples 0 to `spp` of each of the `slots` Dr.Jit `pixels`, one at a time.
+
+    A loop inside the kernel: all samples of a pixel are one thread's, in order. Films are sums of
+    floats, and the same bytes on every run need the same order. `trace` is called once, with
+    symbolic variables.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    slot = dr.arange(mi.UInt32, slots)
+    size, end = opaque_index(slots), opaque_index(spp)
+    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
+    start = dr.opaque(mi.UInt64, int(state[0]))
+    generator: Any = mi.PCG32  # the stubs call it a plain object
+
+    def more(sample: Any) -> Any:
+        return sample < end
+
+    def body(sample: Any) -> Any:
+        lane = mi.UInt64(sample) * mi.UInt64(size) + mi.UInt64(slot)
+        rng = generator(1, start + lane, lane)
+        pixel = dr.gather(mi.UInt32, pixels, slot)
+        trace(Wave(jittered(camera, pixel, sample, spp, rng), rng, slot))
+        return (sample + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, slots),), more, body, label="samples of a pixel")

@@ -12,20 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import (
     Surface,
+    Wave,
+    each_sample,
     light_from,
     opaque,
     opaque_index,
     opaque_matrix,
-    passes,
     pixel_indices,
     walk,
-    wave,
 )
 from appearance.scene import SCALE, HairScene
 from reconstruction.cameras import Camera
 from reconstruction.projectors import Projector
 
-_LANES = 1 << 20
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31
 _REACH = 4.0  # standard deviations of the line's blur beyond which a row is not asked
@@ -129,26 +128,21 @@ def _render(
     films = [dr.zeros(mi.Float, 3 * len(ranges[p.name]) * n) for p in projectors]
     pixel = mi.UInt32(index.astype(np.uint32))
     surface = Surface(scene)
-    for first, count in passes(spp, max(1, _LANES // n)):
-        paths = wave(camera, pixel, n, first, count, spp, *seed)
+    slots = opaque_index(n)
+
+    def trace(paths: Wave) -> None:
         gathers = [
-            _Gather(surface, film, paths.slot, opaque_index(n), p, ranges[p.name], dim)
+            _Gather(surface, film, paths.slot, slots, p, ranges[p.name], dim)
             for p, film, dim in zip(projectors, films, plan.dim, strict=True)
         ]
 
-        def gather(
-            si: Any,
-            throughput: Any,
-            rng: Any,
-            first: bool,
-            active: Any,
-            gathers: list[_Gather] = gathers,
-        ) -> None:
+        def gather(si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
             for one in gathers:
                 one(si, throughput, rng.next_float32(), active)
 
         walk(surface, paths.rays, paths.rng, gather, plan.max_depth, plan.rr_depth)
-        dr.eval(films)
+
+    each_sample(camera, pixel, n, spp, seed, trace)
     return {
         p.name: np.array(film, dtype=np.float32).reshape(len(ranges[p.name]), n, 3)
         / np.float32(spp)
