@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -60,6 +61,16 @@ class _View:
     template: Template
     points: Array
     pixels: Array
+
+    @cached_property
+    def offsets(self) -> Array:
+        """The points' pixels from their mean `(N, 2)`."""
+        return self.pixels - self.pixels.mean(axis=0)
+
+    @cached_property
+    def spread(self) -> float:
+        """The rms distance of the points' pixels from their mean."""
+        return float(np.sqrt((self.offsets**2).sum(axis=1).mean()))
 
 
 def solve_motion(
@@ -167,19 +178,18 @@ def from_registrations(
     in pixels.
     """
     target = np.concatenate(
-        [[*_rigid_at(r, v.pixels.mean(axis=0)), r.angle * _spread(v.pixels)] for v, r in found]
+        [[*_rigid_at(r, v.pixels.mean(axis=0)), r.angle * v.spread] for v, r in found]
     )
 
     def residual(pose: tuple[Array, Array]) -> Array:
         flow = []
         for view, _ in found:
             moved, _ = view.camera.project(view.points @ pose[0].T + pose[1])
-            before = view.pixels - view.pixels.mean(axis=0)
-            after = moved - moved.mean(axis=0)
-            cross = (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).sum()
-            angle = np.arctan2(cross, (before * after).sum())
-            shift = moved.mean(axis=0) - view.pixels.mean(axis=0)
-            flow.append([*shift, angle * _spread(view.pixels)])
+            x, y = view.offsets.T
+            # offsets about their mean: the moved pixels' own mean drops out of both sums
+            angle = np.arctan2(x @ moved[:, 1] - y @ moved[:, 0], x @ moved[:, 0] + y @ moved[:, 1])
+            shift = (moved - view.pixels).mean(axis=0)
+            flow.append([*shift, angle * view.spread])
         return np.concatenate(flow) - target
 
     pose, rank = _gauss_newton(lambda p: (residual(p), _numeric(residual, p)), weakest, 12)
@@ -254,7 +264,7 @@ def _gauss_newton(
         step = -basis @ ((basis.T @ (rows.T @ (weight * error))) / values[strong])
         turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
         rotation, translation = turn @ rotation, turn @ translation + step[3:]
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < 1e-6:  # metres: a thousandth of a pixel
             break
     return (rotation, translation), rank
 
@@ -345,7 +355,3 @@ def _rigid_at(registration: Registration, pixel: Array) -> Array:
     offset = pixel - registration.centre
     turned = np.array([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]])
     return np.asarray(turned - offset + registration.shift)
-
-
-def _spread(pixels: Array) -> float:
-    return float(np.sqrt(((pixels - pixels.mean(axis=0)) ** 2).sum(axis=1).mean()))
