@@ -17,6 +17,7 @@ from reconstruction.visual_hull import VoxelGrid
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_PAD = 2
 _ROWS, _COLUMNS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 
 
@@ -68,12 +69,22 @@ class OrientationField:
     measured: Bools
     empty: Bools
     degenerate: Bools
-    number: NDArray[np.int32] = field(init=False)
+    _padded: NDArray[np.int32] = field(init=False)
+    _table: NDArray[np.float32] = field(init=False)
+    _corners: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
-        number = np.full(self.grid.inside.shape, -1, np.int32)
-        number[self.grid.inside] = np.arange(len(self.directions))
-        object.__setattr__(self, "number", number)
+        # Two voxels of nothing on each side, so that eight corners are looked up at once without
+        # asking whether they are on the grid; nothing is the row of zeros after the last voxel.
+        count = len(self.directions)
+        padded = np.full(np.array(self.grid.inside.shape) + 2 * _PAD, count, np.int32)
+        inner = padded[_PAD:-_PAD, _PAD:-_PAD, _PAD:-_PAD]
+        inner[self.grid.inside] = np.arange(count)
+        corners = np.array(list(np.ndindex(2, 2, 2))) @ self._strides(padded.shape)
+        object.__setattr__(self, "_padded", padded)
+        object.__setattr__(self, "_corners", corners)
+        table = np.concatenate([self.directions, np.zeros((1, 3))]).astype(np.float32)
+        object.__setattr__(self, "_table", table)
 
     @property
     def valid(self) -> Bools:
@@ -82,10 +93,8 @@ class OrientationField:
 
     def voxel(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         """The number `(N,)` of the envelope voxel that holds each point, -1 outside."""
-        index = self.grid.index(points)
-        on = _within(index, self.number.shape)
-        i, j, k = np.where(on[:, None], index, 0).T
-        return np.where(on, self.number[i, j, k], -1).astype(np.int64)
+        number = self._padded.ravel()[self._flat(self.grid.index(points))]
+        return np.where(number == len(self.directions), -1, number).astype(np.int64)
 
     def sample(self, points: NDArray[np.floating], along: Array) -> tuple[Array, Bools]:
         """Directions `(N, 3)` at `points (N, 3)`, each signed to turn least from `along (N, 3)`.
@@ -95,21 +104,29 @@ class OrientationField:
         says where there was anything to interpolate `(N,)`.
         """
         q = (points - self.grid.origin) / self.grid.spacing
-        base = np.floor(q).astype(np.int64)
-        f = q - base
-        total = np.zeros((len(points), 3))
-        for corner in np.ndindex(2, 2, 2):
-            index = base + corner
-            on = _within(index, self.number.shape)
-            i, j, k = np.where(on[:, None], index, 0).T
-            n = np.where(on, self.number[i, j, k], -1)
-            d = np.where((n >= 0)[:, None], self.directions[n], 0.0)
-            w = np.prod(np.where(corner, f, 1 - f), axis=1)
-            w = np.where((d * along).sum(axis=1) < 0, -w, w)
-            total += w[:, None] * d
-        norm = np.linalg.norm(total, axis=1)
-        good = norm > 1e-9
-        return np.where(good[:, None], total / np.maximum(norm, 1e-9)[:, None], 0.0), good
+        base = np.floor(q)
+        high = (q - base).astype(np.float32)
+        low = 1 - high
+        flat = self._flat(base.astype(np.int64))
+        d = self._table[self._padded.ravel()[flat[:, None] + self._corners]]
+        # (N, 8) in the order of `ndindex`: the last axis of the grid runs fastest
+        x, y, z = (np.stack([low[:, k], high[:, k]], axis=1) for k in range(3))
+        weight = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(-1, 8)
+        turned = np.einsum("nkd,nd->nk", d, along.astype(np.float32)) < 0
+        total = np.einsum("nk,nkd->nd", np.where(turned, -weight, weight), d).astype(float)
+        norm = np.sqrt(np.einsum("nd,nd->n", total, total))
+        good = norm > 1e-6
+        return np.where(good[:, None], total / np.where(good, norm, 1.0)[:, None], 0.0), good
+
+    def _flat(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Places `(N,)` in the padded volume; voxels far off the grid fall on its rim."""
+        shape = self._padded.shape
+        inside = np.clip(index + _PAD, 0, np.array(shape) - 2)
+        return np.asarray(inside @ self._strides(shape))
+
+    @staticmethod
+    def _strides(shape: tuple[int, ...]) -> NDArray[np.int64]:
+        return np.array([shape[1] * shape[2], shape[2], 1])
 
 
 @dataclass(frozen=True)

@@ -177,11 +177,11 @@ def fill_gaps(
         spent[chosen] = True
         starts = centers[chosen] + field.grid.spacing * rng.uniform(-0.4, 0.4, (len(chosen), 3))
         d = field.directions[chosen]
-        ahead, behind = (
-            to_polylines(trace(field, starts, side, step=step, max_length=max_length))
-            for side in (d, -d)
+        both = trace(
+            field, np.tile(starts, (2, 1)), np.vstack([d, -d]), step=step, max_length=max_length
         )
-        for a, b in zip(ahead, behind, strict=True):
+        paths = to_polylines(both)
+        for a, b in zip(paths[: len(chosen)], paths[len(chosen) :], strict=True):
             path = np.concatenate([b[:0:-1], a])
             if (len(path) - 1) * step >= shortest:
                 out.append(path)

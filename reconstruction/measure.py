@@ -108,12 +108,12 @@ def measure_tangents(
         mask = masks[camera.name].hair
         olat = capture.olat(camera.name, names).mean(axis=-1)
         olats[camera.name] = olat
-        total = np.zeros((options.bank.count, *mask.shape), np.float32)
-        for g in np.unique(group):
-            total += options.bank.responses(
-                texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
-            )
-        evidences.append(LineEvidence(camera, line_support(total), mask, depths[camera.name]))
+        details = [
+            texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
+            for g in np.unique(group)
+        ]
+        support = line_support(options.bank.responses(np.stack(details)))
+        evidences.append(LineEvidence(camera, support, mask, depths[camera.name]))
     points = thinned(
         points if len(points) else np.concatenate([_lifted(e) for e in evidences]), options.thin
     )

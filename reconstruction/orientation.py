@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,9 @@ from scipy import fft, ndimage
 
 Images = NDArray[np.floating]
 Bools = NDArray[np.bool_]
+
+_FAINTEST = 1e-5
+"""Relative detail that is rounding in single precision and not texture."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +40,8 @@ class LogGaborBank:
                 f"spread > 0, got {self}"
             )
 
-    def filters(self, height: int, width: int) -> NDArray[np.float32]:
-        """Transfer functions `(count, height, width)` in the layout of `fft2`.
+    def filters(self, height: int, width: int) -> Iterator[NDArray[np.float32]]:
+        """The `count` transfer functions `(height, width)`, in the layout of `fft2`.
 
         Filter k answers to lines at k · 180°/count from +x towards +y: its own frequencies are
         perpendicular to the lines.
@@ -48,23 +53,32 @@ class LogGaborBank:
         radial = np.exp(-(np.log(rho * self.wavelength) ** 2) / (2 * self.bandwidth**2))
         radial[0, 0] = 0.0
         angle = np.arctan2(fy, fx)
-        own = np.arange(self.count) * np.pi / self.count + np.pi / 2
-        delta = (angle - own[:, None, None] + np.pi) % (2 * np.pi) - np.pi
         sigma = self.spread * np.pi / self.count
-        return np.asarray(radial * np.exp(-(delta**2) / (2 * sigma**2)), np.float32)
+        for k in range(self.count):
+            own = k * np.pi / self.count + np.pi / 2
+            delta = (angle - own + np.pi) % (2 * np.pi) - np.pi
+            yield np.asarray(radial * np.exp(-(delta**2) / (2 * sigma**2)), np.float32)
 
-    def responses(self, image: Images) -> NDArray[np.float32]:
-        """Magnitudes `(count, H, W)` of the answers to an `image (H, W)`, mirrored at its edges."""
+    def responses(self, images: Images) -> NDArray[np.float32]:
+        """Magnitudes `(count, H, W)` of the answers to an image `(H, W)`, mirrored at its edges.
+
+        Of a stack `(N, H, W)`, the sum of the magnitudes: one pass over the filters serves all.
+        """
+        images = np.asarray(images, np.float32)
+        stack = images[None] if images.ndim == 2 else images
+        shape = stack.shape[1:]
         margin = int(
             min(4 * self.wavelength * max(1.0, self.count / (np.pi * self.spread * 6)), 48)
         )
-        padded = np.pad(image, margin, mode="reflect" if min(image.shape) > margin else "edge")
-        h, w = (fft.next_fast_len(n) for n in padded.shape)
-        spectrum = fft.fft2(padded.astype(np.float32), (h, w))
-        out = np.empty((self.count, *image.shape), np.float32)
-        inner = (slice(margin, margin + image.shape[0]), slice(margin, margin + image.shape[1]))
+        mode: Literal["reflect", "edge"] = "reflect" if min(shape) > margin else "edge"
+        padded = np.pad(stack, [(0, 0), (margin, margin), (margin, margin)], mode=mode)
+        h, w = (fft.next_fast_len(n) for n in padded.shape[1:])
+        spectra = fft.fft2(padded, (h, w), workers=-1)
+        out = np.empty((self.count, *shape), np.float32)
+        inner = (..., slice(margin, margin + shape[0]), slice(margin, margin + shape[1]))
         for k, transfer in enumerate(self.filters(h, w)):
-            out[k] = np.abs(fft.ifft2(spectrum * transfer))[inner]
+            answers = fft.ifft2(spectra * transfer, overwrite_x=True, workers=-1)
+            out[k] = np.abs(answers[inner]).sum(axis=0)
         return out
 
 
@@ -143,4 +157,5 @@ def _winner(responses: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArra
     phase = np.exp(2j * np.pi * np.arange(count) / count)
     total = np.tensordot(phase, responses, axes=1)
     strength = responses.sum(axis=0, dtype=float)
-    return angle, np.abs(total) / np.maximum(strength, 1e-12)
+    said = responses.max(axis=0) > _FAINTEST
+    return angle, np.where(said, np.abs(total) / np.maximum(strength, 1e-12), 0.0)

@@ -13,6 +13,9 @@ from reconstruction.scalp import Scalp
 Polyline = NDArray[np.float32]
 Array = NDArray[np.float64]
 
+_STRIDE = 4
+"""Every fourth point of a strand stands for it in the search: the growth's step is short."""
+
 
 @dataclass(frozen=True)
 class Rooted:
@@ -76,28 +79,30 @@ def _join_round(
     strands: list[Polyline], loose: list[Polyline], reach: float, least_cosine: float
 ) -> tuple[list[Polyline], list[Polyline]]:
     """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
-    points = np.concatenate(strands).astype(float)
+    points = np.concatenate(strands)
     counts = np.array([len(s) for s in strands])
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     owner = np.repeat(np.arange(len(strands)), counts)
-    rootward = np.zeros_like(points)
-    rootward[1:] = points[:-1] - points[1:]
-    rootward[first] = 0  # nothing can go on below a root
-    norm = np.linalg.norm(rootward, axis=1, keepdims=True)
-    rootward /= np.maximum(norm, 1e-12)
+    place = np.arange(len(points)) - first[owner]
+    some = np.flatnonzero((place > 0) & (place % _STRIDE == 0))  # nothing goes on below a root
+    if not len(some):
+        return [], loose
+    rootward = points[some - 1] - points[some]
+    rootward /= np.maximum(np.linalg.norm(rootward, axis=1, keepdims=True), 1e-12)
+    tree = cKDTree(points[some], balanced_tree=False, compact_nodes=False)
     ends = np.concatenate([[p[0], p[-1]] for p in loose]).astype(float)
     out = np.concatenate(
         [[p[0] - p[min(4, len(p) - 1)], p[-1] - p[-min(5, len(p))]] for p in loose]
     )
     out = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
-    distance, index = cKDTree(points).query(ends, k=np.arange(1, 17), distance_upper_bound=reach)
+    distance, index = tree.query(ends, k=np.arange(1, 17), distance_upper_bound=reach)
     found = np.isfinite(distance)
     index = np.where(found, index, 0)
     cosine = np.einsum("nkd,nd->nk", rootward[index], out)
     cost = np.where(found & (cosine >= least_cosine), distance + reach * (1 - cosine), np.inf)
     pick = cost.argmin(axis=1)
     cost = cost[np.arange(len(ends)), pick].reshape(-1, 2)
-    target = index[np.arange(len(ends)), pick].reshape(-1, 2)
+    target = some[index[np.arange(len(ends)), pick]].reshape(-1, 2)
     attached, left = [], []
     for path, c, t in zip(loose, cost, target, strict=True):
         if not np.isfinite(c.min()):
@@ -105,7 +110,7 @@ def _join_round(
             continue
         end = int(c.argmin())
         path = path if end == 0 else path[::-1]
-        guide = points[first[owner[t[end]]] : t[end] + 1]
+        guide = points[first[owner[t[end]]] : t[end] + 1].astype(float)
         attached.append(_beside(guide, path))
     return attached, left
 
