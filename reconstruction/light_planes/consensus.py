@@ -17,8 +17,11 @@ def supported(points: Array, neighbours: int, isolation: float) -> NDArray[np.bo
     """Which `points (N, 3)` are not outliers `(N,)`.
 
     A point stays whose distance to its neighbour number `neighbours` is at most `isolation` times
-    the median of that distance over all points. With too few points to tell, none stays.
+    the median of that distance over all points; with `neighbours` 0 all stay. With too few points
+    to tell, none stays.
     """
+    if neighbours < 1:
+        return np.ones(len(points), bool)
     if len(points) <= neighbours:
         return np.zeros(len(points), bool)
     distance = cKDTree(points).query(points, k=[neighbours + 1])[0][:, 0]

@@ -28,6 +28,7 @@ from reconstruction.light_planes.registration import (
     gradients,
     sample,
     smooth,
+    spline,
 )
 from reconstruction.report import Progress, Stage, silent
 from reconstruction.silhouettes import dark_frame
@@ -213,9 +214,10 @@ def align(
         prepared = []
         for view in views:
             picture = smooth(images[view.camera.name], sigma)
-            reference = smooth(view.template.raw, sigma)
+            reference = spline(smooth(view.template.raw, sigma))
             value = sample(reference, *view.pixels.T)
-            prepared.append((view, picture, gradients(picture), value))
+            gx, gy = gradients(picture)
+            prepared.append((view, spline(picture), (spline(gx), spline(gy)), value))
 
         def system(
             pose: tuple[Array, Array],
