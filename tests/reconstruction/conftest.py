@@ -53,7 +53,7 @@ def look(device: Camera, samples: int) -> tuple[NDArray[np.float64], NDArray[np.
     b = rays @ device.center
     inside = b**2 - (device.center @ device.center - RADIUS**2)
     distance = -b - np.sqrt(np.maximum(inside, 0))
-    return device.center + distance[..., None] * rays, inside > 0
+    return device.center + distance[..., None] * rays, (inside > 0) & (distance > 0)
 
 
 @dataclass
