@@ -1,0 +1,143 @@
+"""Strands along analytic fields, and their way to the scalp."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reconstruction.field import OrientationField, to_tensors
+from reconstruction.growth import Coverage, Method, fill_gaps, grow_from_roots, to_polylines, trace
+from reconstruction.mesh import Mesh
+from reconstruction.rooting import root_all
+from reconstruction.scalp import Scalp
+from reconstruction.visual_hull import VoxelGrid
+
+
+def analytic(direction, shape=(41, 41, 9), spacing=1e-3, inside=None) -> OrientationField:  # type: ignore[no-untyped-def]
+    """A field known at every voxel, about the origin; signs are scrambled as a solver's are."""
+    size = np.array(shape)
+    grid = VoxelGrid(-(size - 1) / 2 * spacing, spacing, np.ones(shape, bool))
+    if inside is not None:
+        centers = grid.centers(np.argwhere(grid.inside))
+        grid = VoxelGrid(grid.origin, spacing, inside(centers).reshape(shape))
+    centers = grid.centers()
+    d = direction(centers)
+    d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
+    d *= np.random.default_rng(0).choice([-1, 1], len(d))[:, None]
+    ones, none = np.ones(len(d)), np.zeros(len(d), bool)
+    return OrientationField(grid, to_tensors(d + 1e-15), d, ones, ~none, none, none)
+
+
+def circles(p: np.ndarray) -> np.ndarray:
+    return np.stack([-p[:, 1], p[:, 0], np.zeros(len(p))], axis=1) + np.array([1e-9, 0, 0])
+
+
+def up(p: np.ndarray) -> np.ndarray:
+    return np.tile([0, 0, 1.0], (len(p), 1))
+
+
+def drift(method: Method, step: float) -> float:
+    """How far a strand strays from its circle of 12 mm radius over half a turn, metres."""
+    field = analytic(circles, (61, 61, 5), 5e-4)
+    start, along = np.array([[12e-3, 0, 0]]), np.array([[0, 1.0, 0]])
+    paths = trace(field, start, along, step=step, max_length=np.pi * 12e-3, method=method)
+    end = paths.points[paths.counts[0] - 1, 0]
+    assert paths.counts[0] > 5
+    return abs(float(np.linalg.norm(end[:2])) - 12e-3)
+
+
+def test_higher_order_strays_less_than_euler_at_equal_cost() -> None:
+    euler, midpoint, rk4 = drift("euler", 5e-4), drift("midpoint", 1e-3), drift("rk4", 2e-3)
+    assert euler > 5e-4  # half a millimetre outwards
+    assert midpoint < 0.1 * euler
+    assert rk4 < 0.1 * euler
+
+
+def test_sign_follows_the_way_and_paths_end_at_the_envelope() -> None:
+    field = analytic(up, (5, 5, 41))
+    starts = np.zeros((2, 3))
+    paths = to_polylines(trace(field, starts, np.array([[0.2, 0, 1.0], [0.2, 0, -1.0]])))
+    assert paths[0][-1, 2] == pytest.approx(20e-3, abs=1e-3)
+    assert paths[1][-1, 2] == pytest.approx(-20e-3, abs=1e-3)
+    np.testing.assert_allclose(np.diff(paths[0][:, 2]), 5e-4, rtol=1e-3)
+
+
+def test_length_is_limited() -> None:
+    field = analytic(up, (5, 5, 41))
+    paths = trace(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), max_length=5e-3)
+    assert paths.counts[0] == 11
+    with pytest.raises(ValueError, match="step"):
+        trace(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), step=0.0)
+
+
+def test_nothing_grows_where_there_is_no_orientation() -> None:
+    field = analytic(lambda p: np.zeros((len(p), 3)), (5, 5, 41))
+    paths = trace(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]))
+    assert paths.counts[0] == 1
+
+
+def test_roots_are_led_to_an_envelope_that_stays_clear_of_the_skin() -> None:
+    field = analytic(up, (9, 9, 41))
+    low = field.grid.origin[2]
+    roots = np.array([[0, 0, low - 4e-3], [0, 0, low - 30e-3]])
+    strands = grow_from_roots(field, roots, np.tile([0, 0, 1.0], (2, 1)))
+    assert len(strands) == 1  # the second is too far below
+    np.testing.assert_allclose(strands[0][0], roots[0], atol=1e-7)
+    assert strands[0][-1, 2] > 0.019
+
+
+def test_gaps_are_filled_and_reproducibly() -> None:
+    field = analytic(up, (15, 15, 31))
+    first, second = (
+        fill_gaps(field, Coverage(field), seed=4, batch=40, rounds=60) for _ in range(2)
+    )
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    coverage = Coverage(field)
+    for path in first:
+        coverage.add(path)
+    assert len(coverage.gaps()) < 0.01 * len(field.directions)
+    assert all(np.ptp(p[:, 2]) > 0.028 for p in first)
+
+
+def flat_scalp() -> Scalp:
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.02, 0.02, 21)] * 2))
+    mesh = Mesh(
+        np.array([[-0.02, -0.02, 0], [0.02, -0.02, 0], [0, 0.02, 0]]), np.array([[0, 1, 2]])
+    )
+    points = np.stack([x, y, np.zeros_like(x)], axis=1)
+    return Scalp(mesh, points, np.tile([0, 0, 1.0], (len(x), 1)), np.ones(1), True)
+
+
+def line(a: tuple[float, ...], b: tuple[float, ...], n: int = 40) -> np.ndarray:
+    return np.linspace(a, b, n).astype(np.float32)
+
+
+def test_ends_beside_the_scalp_are_led_to_it_root_first() -> None:
+    loose = [line((0.0, 0, 0.05), (0, 0, 4e-3))]
+    result = root_all([], loose, flat_scalp())
+    assert (result.to_scalp, result.joined, result.dropped) == (1, 0, 0)
+    assert result.strands[0][0, 2] == 0
+    assert result.strands[0][-1, 2] == pytest.approx(0.05)
+
+
+def test_loose_strands_join_a_rooted_neighbour_and_chains_follow() -> None:
+    rooted = [line((0, 0, 0), (0, 0, 0.05))]
+    loose = [
+        line((2e-3, 0, 0.12), (2e-3, 0, 0.05)),  # goes on where the rooted one ends, upside down
+        line((3e-3, 0, 0.12), (3e-3, 0, 0.20)),  # goes on where that one ends
+        line((0.1, 0, 0.1), (0.1, 0, 0.15)),  # far from everything
+    ]
+    result = root_all(rooted, loose, flat_scalp())
+    assert (result.to_scalp, result.joined, result.dropped) == (0, 2, 1)
+    for strand in result.strands:
+        np.testing.assert_allclose(strand[0], 0, atol=1e-6)
+        steps = np.diff(strand, axis=0)
+        assert (steps[:, 2] > 0).all()  # no turning back, no doubled points
+    longest = max(float(s[-1, 2]) for s in result.strands)
+    assert longest == pytest.approx(0.20)
+
+
+def test_a_neighbour_across_the_way_is_no_way_to_the_root() -> None:
+    rooted = [line((-0.02, 0, 0.05), (0.02, 0, 0.05))]
+    loose = [line((0, 0, 0.052), (0, 0, 0.10))]
+    assert root_all(rooted, loose, flat_scalp()).dropped == 1
