@@ -30,14 +30,19 @@ def evaluate_geometry(
     from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
     from reconstruction.evaluation import compare_strands
     from reconstruction.strand_files import read_strands
+    from reconstruction.visibility import Visibility
 
     true = read_strands(truth)
     cameras, head = capture.rig.cameras, capture.head
+    progress("what the cameras see of the true strands", 0.0)
+    visibility = Visibility(cameras, true, head)
 
     def score(strands: Strands) -> dict[str, Any]:
-        return compare_strands(strands, true, cameras=cameras, head=head, seed=seed)
+        return compare_strands(
+            strands, true, cameras=cameras, head=head, seed=seed, visibility=visibility
+        )
 
-    progress("our strands against the true ones", 0.0)
+    progress("our strands against the true ones", 0.2)
     figures = score(read_strands(model / "strands.npz"))
     progress("control: the hull filled with vertical lines", 0.3)
     used = [c for c in cameras if c.name not in held_out_cameras]
