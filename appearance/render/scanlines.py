@@ -41,7 +41,7 @@ def render_scanlines(
     pixels: ArrayLike | None = None,
     rows: Mapping[str, range] | None = None,
     rr_depth: int = 3,
-    thrift: float = 1.0,
+    thrift: float = 0.25,
 ) -> dict[str, NDArray[np.float32]]:
     """Radiance of each row of each projector at full level, W/(sr m²).
 
