@@ -1,0 +1,203 @@
+"""Captures of a sphere whose hair runs down from its top, from frames to strands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture, CaptureError
+from reconstruction.light_planes import PointCloud
+from reconstruction.lights import Light, dome_positions
+from reconstruction.measure import MeasureOptions, light_groups, thinned
+from reconstruction.mesh import Mesh, write_obj
+from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.report import Report
+from reconstruction.strand_files import read_strands
+
+RADIUS, HEAD = 0.1, 0.09
+LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(12, 1.2, 0.0))]
+QUICK = ReconstructOptions(
+    grid=4e-3,
+    step=1e-3,
+    roots=300,
+    max_length=0.2,
+    explicit_seconds=0.05,
+    measure=MeasureOptions(light_groups=4, candidates=300),
+)
+
+
+def ball(radius: float) -> Mesh:
+    """A closed sphere whose upper half is marked as scalp."""
+    rows, columns = 24, 48
+    theta, phi = np.linspace(0, np.pi, rows + 1), np.arange(columns) * 2 * np.pi / columns
+    t, p = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
+    vertices = radius * np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=1)
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    a, b = i * columns + j, i * columns + (j + 1) % columns
+    faces = np.concatenate(
+        [np.stack([a, a + columns, b], axis=1), np.stack([b, a + columns, b + columns], axis=1)]
+    )
+    return Mesh(vertices, faces, vertices[faces][:, :, 2].mean(axis=1) > 0)
+
+
+def down(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Unit tangents of the meridians at `points (N, 3)`."""
+    n = points / np.linalg.norm(points, axis=1, keepdims=True)
+    t = np.array([0, 0, 1.0]) - n[:, 2:] * n
+    return np.asarray(t / np.linalg.norm(t, axis=1, keepdims=True))
+
+
+def hair(step: dict[str, object], camera: Camera) -> NDArray[np.float64]:
+    """Frame `(H, W)` of meridians of uneven brightness under one light."""
+    sub = (np.arange(3) + 0.5) / 3 - 0.5
+    grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    offsets = np.stack(np.meshgrid(sub, sub), axis=-1).reshape(-1, 2)
+    rays = camera.rays(grid[:, :, None] + offsets)
+    b = rays @ camera.center
+    inside = b**2 - (camera.center @ camera.center - RADIUS**2)
+    p = camera.center + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
+    azimuth = np.arctan2(p[..., 1], p[..., 0])
+    albedo = 1 + sum(0.25 * np.cos(k * azimuth + k) for k in (17, 29, 41))
+    to = next(light for light in LIGHTS if light.name == step["light"]).position - p
+    shade = (to * p).sum(axis=-1) / (np.linalg.norm(to, axis=-1) * RADIUS)
+    lit = np.where(inside > 0, albedo * (0.2 + np.maximum(shade, 0)), 0)
+    return np.asarray(lit.mean(axis=-1))
+
+
+@pytest.fixture(scope="module")
+def around(stage_camera: Callable[..., Camera]) -> list[Camera]:
+    return [stage_camera(f"c{a}", a, 15.0, size=96) for a in (0, 72, 144, 216, 288)]
+
+
+@pytest.fixture(scope="module")
+def unswept(shoot: Callable[..., Capture], around: list[Camera]) -> Capture:
+    """Five cameras around, twelve lights, no projector."""
+    capture = shoot(cameras=around, projectors=[], lights=LIGHTS, extra=hair)
+    write_obj(capture.path / "head.obj", ball(HEAD))
+    return capture
+
+
+@pytest.fixture(scope="module")
+def model(unswept: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
+    folder = tmp_path_factory.mktemp("model")
+    return folder, reconstruct(unswept, folder, options=QUICK)
+
+
+def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera]) -> None:
+    folder, report = model
+    saved = Report.load(folder / "report.json").to_dict()
+    assert json.dumps(saved) == json.dumps(report.to_dict())
+    assert len(PointCloud.load(folder / "points.npz")) == 0
+    sizes = {s: len(read_strands(folder / f"strands.{s}")) for s in ("npz", "hair", "usdc")}
+    assert len(set(sizes.values())) == 1
+    for camera in around:
+        for kind in ("hair", "skin"):
+            image = cv2.imread(str(folder / "masks" / f"{camera.name}_{kind}.png"), 0)
+            assert image is not None
+            assert image.shape == (96, 96)
+
+
+def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:
+    strands = read_strands(model[0] / "strands.npz")
+    assert len(strands) > 300
+    distance = np.linalg.norm(strands.roots, axis=1)
+    assert np.abs(distance - HEAD).max() < 1e-3
+    radius = np.linalg.norm(strands.points, axis=1)
+    outer = (radius > 0.096) & (np.abs(strands.points[:, 2]) < 0.07)
+    along = (strands.tangents()[outer] * down(strands.points[outer])).sum(axis=1)
+    turned = np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))
+    assert np.median(turned) < 6
+    assert (turned < 20).mean() > 0.85
+
+
+def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
+    report = model[1]
+    assert [s.name for s in report.stages] == [
+        "triangulation",
+        "masks",
+        "envelope",
+        "orientation",
+        "field",
+        "strands",
+    ]
+    assert [x.why for x in report["triangulation"].left_out] == ["the rig has no projector"]
+    assert any("12 lights" in x.why for x in report["orientation"].left_out)
+    names = [s.name for s in report["field"].series]
+    assert names == ["multigrid conjugate gradients", "explicit steps"]
+    # between a ball and a head a tenth smaller: 1.1 litres, and the hull's corners
+    assert 1.0 < report["envelope"].figures["envelope_litres"] < 2.0
+
+
+def test_same_seed_same_strands(
+    unswept: Capture, model: tuple[Path, Report], tmp_path: Path
+) -> None:
+    reconstruct(unswept, tmp_path, options=QUICK)
+    first, second = (read_strands(p / "strands.npz") for p in (model[0], tmp_path))
+    np.testing.assert_array_equal(first.points, second.points)
+
+
+def test_a_sweep_is_triangulated(
+    shoot: Callable[..., Capture],
+    stage_camera: Callable[..., Camera],
+    tmp_path: Path,
+) -> None:
+    cameras = [stage_camera(n, a, 10.0, size=96) for n, a in (("left", -40), ("right", 35))]
+    capture = shoot(cameras=cameras, lights=LIGHTS, extra=hair)
+    write_obj(capture.path / "head.obj", ball(HEAD))
+    report = reconstruct(capture, tmp_path, options=QUICK)
+    assert not report["triangulation"].left_out
+    assert report["motion"].seconds > 0
+    points = PointCloud.load(tmp_path / "points.npz").points
+    assert len(points) > 500
+    assert np.median(np.abs(np.linalg.norm(points, axis=1) - RADIUS)) < 1e-3
+    assert len(read_strands(tmp_path / "strands.npz")) > 20
+
+
+def test_no_sweep_is_said(
+    shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
+) -> None:
+    capture = shoot(cameras=around[:3], sweep=False, lights=LIGHTS, extra=hair)
+    write_obj(capture.path / "head.obj", ball(HEAD))
+    report = reconstruct(capture, tmp_path, options=QUICK)
+    assert [x.why for x in report["triangulation"].left_out] == ["no sweep was shot"]
+
+
+def test_what_cannot_be_done_without_is_named(
+    shoot: Callable[..., Capture], around: list[Camera], unswept: Capture, tmp_path: Path
+) -> None:
+    bare = shoot(cameras=around[:2], projectors=[])
+    with pytest.raises(CaptureError, match=r"no head\.obj"):
+        reconstruct(bare, tmp_path, options=QUICK)
+    write_obj(bare.path / "head.obj", ball(HEAD))
+    with pytest.raises(CaptureError, match="no OLAT frames"):
+        reconstruct(Capture(bare.path), tmp_path, options=QUICK)
+    few = ReconstructOptions(held_out=("c0", "c72", "c144", "c216"))
+    with pytest.raises(CaptureError, match="1 cameras are left, at least 2"):
+        reconstruct(unswept, tmp_path, options=few)
+    with pytest.raises(KeyError, match="no camera 'c9'"):
+        reconstruct(unswept, tmp_path, options=ReconstructOptions(held_out=("c9",)))
+    with pytest.raises(ValueError, match="unknown method 'guess'"):
+        reconstruct(unswept, tmp_path, method="guess")  # type: ignore[arg-type]
+
+
+def test_light_groups_are_neighbours() -> None:
+    lights = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(120, 1.0))]
+    group = light_groups(lights, 12)
+    assert sorted(set(group)) == list(range(12))
+    positions = np.stack([light.position for light in lights])
+    for k in range(12):
+        apart = positions[group == k] @ positions[group == k].T
+        assert np.degrees(np.arccos(apart.clip(-1, 1).min())) < 75
+    assert len(set(light_groups(lights[:5], 12))) == 5
+
+
+def test_thinning_keeps_the_mean_of_a_cell() -> None:
+    points = np.array([[1e-4, 0, 0], [3e-4, 0, 0], [5e-3, 0, 0]])
+    np.testing.assert_allclose(thinned(points, 1e-3), [[2e-4, 0, 0], [5e-3, 0, 0]])
