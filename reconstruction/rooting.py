@@ -48,15 +48,18 @@ def root_all(
     `reaches` are the distances, metres, within which a neighbour is looked for, round by round.
     """
     strands = list(rooted)
-    tree = cKDTree(scalp.points)
+    if not loose:
+        return Rooted(strands, 0, 0, 0)
+    distance, nearest = cKDTree(scalp.points).query(_ends(loose))
     waiting: list[Polyline] = []
-    for path in loose:
-        distance, _ = tree.query(path[[0, -1]])
-        if distance.min() > near_scalp:
+    for k, path in enumerate(loose):
+        if distance[k].min() > near_scalp:
             waiting.append(path)
             continue
-        path = path if distance[0] <= distance[1] else path[::-1]
-        strands.append(_lead_to_scalp(path, scalp, tree))
+        end = int(distance[k].argmin())
+        root = scalp.points[nearest[k, end]].astype(np.float32)
+        path = path if end == 0 else path[::-1]
+        strands.append(path if distance[k, end] < 5e-4 else np.concatenate([root[None], path]))
     to_scalp = len(strands) - len(rooted)
     joined = 0
     for reach in reaches:
@@ -68,11 +71,9 @@ def root_all(
     return Rooted(strands, to_scalp, joined, len(waiting))
 
 
-def _lead_to_scalp(path: Polyline, scalp: Scalp, tree: cKDTree) -> Polyline:
-    root = scalp.points[tree.query(path[0])[1]].astype(np.float32)
-    if np.linalg.norm(root - path[0]) < 5e-4:
-        return path
-    return np.concatenate([root[None], path])
+def _ends(paths: list[Polyline]) -> Array:
+    """First and last points `(N, 2, 3)`."""
+    return np.stack([[p[0] for p in paths], [p[-1] for p in paths]], axis=1).astype(float)
 
 
 def _join_round(
@@ -90,10 +91,9 @@ def _join_round(
     rootward = points[some - 1] - points[some]
     rootward /= np.maximum(np.linalg.norm(rootward, axis=1, keepdims=True), 1e-12)
     tree = cKDTree(points[some], balanced_tree=False, compact_nodes=False)
-    ends = np.concatenate([[p[0], p[-1]] for p in loose]).astype(float)
-    out = np.concatenate(
-        [[p[0] - p[min(4, len(p) - 1)], p[-1] - p[-min(5, len(p))]] for p in loose]
-    )
+    ends = _ends(loose).reshape(-1, 3)
+    before = [[p[min(4, len(p) - 1)] for p in loose], [p[-min(5, len(p))] for p in loose]]
+    out = ends - np.stack(before, axis=1).reshape(-1, 3)
     out = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
     distance, index = tree.query(ends, k=np.arange(1, 17), distance_upper_bound=reach)
     found = np.isfinite(distance)
