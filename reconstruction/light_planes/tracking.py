@@ -50,7 +50,7 @@ class MotionOptions:
     between: Between = "interpolate"
     still_px: float = 0.03
     weakest: float = 0.02
-    points: int = 3000
+    points: int = 12000
     seed: int = 0
 
 
