@@ -95,14 +95,15 @@ def grow_from_roots(
     max_length: float = 0.3,
     lift: float = 12e-3,
     shortest: float = 5e-3,
+    to_measured: bool = False,
     method: Method = "midpoint",
 ) -> list[NDArray[np.float32]]:
     """Strands from `roots (N, 3)`, setting out along the scalp's `normals (N, 3)`.
 
     A root whose envelope stays clear of the skin is led to it along the normal, by at most `lift`
-    metres. As in Photobooth §3.4 a strand ends at the last measured voxel that it passed; one that
-    stays inside keeps its length instead of being deleted, since what it passes is hair as well.
-    Those shorter than `shortest` metres are not kept.
+    metres. `to_measured` ends a strand at the last measured voxel that it passes and keeps none
+    that passes none, as Photobooth §3.4 does; without it they go on, since what a strand passes
+    inside the envelope is hair as well. Those shorter than `shortest` metres are not kept.
     """
     roots = np.asarray(roots, float)
     starts, found = roots.copy(), np.zeros(len(roots), bool)
@@ -124,11 +125,19 @@ def grow_from_roots(
     )
     out = []
     for i, path in zip(which, paths, strict=True):
+        if to_measured:
+            path = path[: _last_measured(field, path) + 1]
         if (len(path) - 1) * step < shortest:
             continue
         root = roots[i].astype(np.float32)
         out.append(path if np.linalg.norm(root - path[0]) < step else np.vstack([root[None], path]))
     return out
+
+
+def _last_measured(field: OrientationField, path: NDArray[np.float32]) -> int:
+    """Index of the path's last point in a measured voxel, 0 where there is none."""
+    number = field.voxel(path)
+    return int(np.flatnonzero((number >= 0) & field.measured[number]).max(initial=0))
 
 
 class Coverage:

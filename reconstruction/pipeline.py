@@ -50,7 +50,8 @@ class ReconstructOptions:
     in metres; `roots` strands are grown from the scalp, and gaps are filled at `fill` metres.
     `max_length` (metres) is the hair's, which the user knows. `margin` (metres) is how far in
     front of the seen surface the envelope reaches. `scalp_normals` holds the field to the scalp's
-    normals as the paper does; hair that lies flat on the head is bent wrongly by that. `radius` of
+    normals as the paper does; hair that lies flat on the head is bent wrongly by that.
+    `to_measured` ends strands from the scalp at their last measured voxel. `radius` of
     the strands in metres; None takes the one that keeps a head of hair's coverage.
     `explicit_seconds` of explicit diffusion are run beside the solver for the report.
     """
@@ -63,6 +64,7 @@ class ReconstructOptions:
     margin: float = 2e-3
     least_confidence: float = 0.1
     scalp_normals: bool = False
+    to_measured: bool = False
     spacing: float = 2e-3
     radius: float | None = None
     seed: int = 0
@@ -282,7 +284,12 @@ def grow(
     roots, normals = sample_roots(scalp, options.roots, options.seed)
     progress("growing strands", 0.1)
     rooted = grow_from_roots(
-        field, roots, normals, step=options.step, max_length=options.max_length
+        field,
+        roots,
+        normals,
+        step=options.step,
+        max_length=options.max_length,
+        to_measured=options.to_measured,
     )
     coverage = Coverage(field)
     for path in rooted:
