@@ -33,7 +33,7 @@ def load_environment(path: str | Path) -> Image:
 
 
 def check_environment(envmap: NDArray[np.floating], name: str) -> Image:
-    """`envmap` as float32; raises `ValueError` unless it is `(h, w, 3)`, finite and not negative."""
+    """`envmap` as float32; `ValueError` unless `(h, w, 3)`, finite and not negative."""
     image = np.asarray(envmap, np.float32)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"{name}: expected a map of shape (h, w, 3), got {image.shape}")
