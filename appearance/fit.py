@@ -43,10 +43,10 @@ BETA_N = 0.2
 class FitOptions:
     """How much of a capture a fit looks at: pixels a camera, and samples a pixel when rendering."""
 
-    hair_pixels: int = 300
-    skin_pixels: int = 80
+    hair_pixels: int = 1000
+    skin_pixels: int = 200
     roughness_cameras: int = 4
-    roughness_spp: int = 16
+    roughness_spp: int = 12
     colour_spp: int = 16
     iterations: int = 5
     max_depth: int = 16
@@ -211,7 +211,7 @@ class _Fitting:
         channel = int(np.argmin(mean))
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
-        first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"), 3)
+        first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"), 2)
         series = Series("roughness", "|log β_M measured − log β_M of the rendering|")
         stage.series.append(series)
 
@@ -274,10 +274,12 @@ class _Fitting:
             "sigma_a": list(result.hair.sigma_a),
             "sigma_a_of_first_guess": absorption_of_colour(result.first, BETA_N).tolist(),
             "skin": list(result.skin),
-            "relative_error": result.errors[-1],
+            "relative_error": min(result.errors),
         }
-        if result.errors[-1] > 0.05:
-            stage.warn(f"the mean colour is off by {result.errors[-1]:.0%}: is the geometry whole?")
+        if min(result.errors) > 0.05:
+            stage.warn(
+                f"the mean colour is off by {min(result.errors):.0%}: is the geometry whole?"
+            )
         return result
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:

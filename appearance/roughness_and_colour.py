@@ -53,7 +53,8 @@ def fit_lobe(bins: LobeBins) -> Lobe:
     Sun's Eq. 10 has no floor and reads twice the variance where multiple scattering adds a fifth of
     the peak. Gain and floor are solved for each v; v by a grid in log v and Brent's method.
     """
-    weight = 1.0 / np.maximum(bins.error, 0.02 * np.abs(bins.value).mean())
+    # not the bins' own errors: a bin that missed its rare bright samples has a small error too
+    weight = np.sqrt(bins.count / bins.count.mean())
 
     def solve(log_v: float) -> tuple[Array, float]:
         design = np.stack([bins.lobe(float(np.exp(log_v))), np.ones_like(bins.value)], axis=1)
@@ -135,7 +136,7 @@ def fit_colour(
     start: Array | None = None,
     iterations: int = 5,
     tolerance: float = 0.01,
-    spp: int = 16,
+    spp: int = 32,
     max_depth: int = 16,
     seed: int = 0,
     told: Callable[[float], None] = lambda error: None,
@@ -146,7 +147,8 @@ def fit_colour(
     single lights. `scene` gives geometry, roughness and first skin albedo, `start` the first C. An
     iteration renders the observed pixels, fits R = aC + b per channel (Eq. 12) and takes Eq. 11's
     sigma of the next C. The skin's albedo follows by the ratio of captured to rendered. Ends when
-    the hair's mean colour is within `tolerance`, or after `iterations`; the last update is kept.
+    the hair's mean colour is within `tolerance`, or after `iterations` with one more update. Every
+    rendering draws other random numbers, so that the fit averages their noise.
     """
     if not isinstance(scene.hair, HairAppearance):
         raise TypeError("fit_colour needs a scene with HairAppearance, not diffuse fibres")
@@ -160,12 +162,12 @@ def fit_colour(
     for step in range(iterations):
         current = _with_colour(scene.hair, colour, beta_n)
         lit = scene.with_hair(current).with_skin(np.clip(albedo, 0, 1))
-        seen = _mean_colour([_rendered(lit, o, spp, max_depth, seed) for o in hair])
+        seen = _mean_colour([_rendered(lit, o, spp, max_depth, seed + step) for o in hair])
         errors.append(float(np.linalg.norm(seen - target) / np.linalg.norm(target)))
         told(errors[-1])
         pairs.append((colour, seen))
         if skin_target is not None and step < 3:
-            skin_seen = _mean_colour([_rendered(lit, o, spp, max_depth, seed) for o in skin])
+            skin_seen = _mean_colour([_rendered(lit, o, spp, max_depth, seed + step) for o in skin])
             albedo = np.clip(albedo * skin_target / np.maximum(skin_seen, 1e-12), 0.005, 0.98)
         if errors[-1] < tolerance and step > 0:
             break
@@ -175,7 +177,7 @@ def fit_colour(
 
 
 def fit_diffuse(
-    scene: HairScene, hair: Sequence[Observed], *, iterations: int = 3, spp: int = 16, seed: int = 0
+    scene: HairScene, hair: Sequence[Observed], *, iterations: int = 3, spp: int = 32, seed: int = 0
 ) -> tuple[float, float, float]:
     """The albedo of Lambertian fibres on the same strands that gives the captured mean colour.
 
@@ -184,9 +186,11 @@ def fit_diffuse(
     target = _mean_colour(hair)
     albedo = np.clip(_as_albedo(hair), 0.02, 0.98)
     pairs: list[tuple[Array, Array]] = []
-    for _ in range(iterations):
+    for step in range(iterations):
         lit = scene.with_hair(DiffuseHair(_rgb(albedo)))
-        pairs.append((albedo, _mean_colour([_rendered(lit, o, spp, 16, seed) for o in hair])))
+        pairs.append(
+            (albedo, _mean_colour([_rendered(lit, o, spp, 16, seed + step) for o in hair]))
+        )
         albedo = next_colour(pairs, target)
     return _rgb(albedo)
 
@@ -194,22 +198,25 @@ def fit_diffuse(
 def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
     """The next C of Algorithm 1 from the pairs (C, R) so far, each `(3,)`, and the captured R.
 
-    The first step scales C by the ratio of captured to rendered; later ones solve Eq. 12's line
-    through the two pairs nearest the target, which is Algorithm 1's fit while there are two pairs
-    and follows the curve's bend afterwards. Kept in [0.005, 0.995] and within a factor of 4.
+    The first step scales C by the ratio of captured to rendered; later ones solve Eq. 12's line,
+    fitted to all pairs, for the captured R. Pairs weigh more the nearer the target they are, so
+    that the line follows the curve's bend. A step stays within a factor of 2 of the nearest pair,
+    and C in [0.005, 0.995].
     """
     c, r = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     out = np.empty(3)
     for k in range(3):
-        order = np.argsort(np.abs(r[:, k] - target[k]), kind="stable")
-        nearest = order[0]
+        off = np.abs(r[:, k] - target[k]) / max(target[k], 1e-12)
+        nearest = int(np.argmin(off))
         value = c[nearest, k] * target[k] / max(r[nearest, k], 1e-12)
-        if len(pairs) > 1:
-            dc = c[order[1], k] - c[nearest, k]
-            slope = (r[order[1], k] - r[nearest, k]) / dc if dc else 0.0
+        if np.ptp(c[:, k]) > 1e-3 * c[nearest, k]:
+            weight = 1.0 / (off + 0.02)
+            middle, level = np.average(c[:, k], weights=weight), np.average(r[:, k], weights=weight)
+            spread = np.sum(weight * (c[:, k] - middle) ** 2)
+            slope = np.sum(weight * (c[:, k] - middle) * (r[:, k] - level)) / spread
             if slope > 0:  # noise may turn it between two colours that are all but equal
-                value = c[nearest, k] + (target[k] - r[nearest, k]) / slope
-        out[k] = np.clip(value, 0.25 * c[nearest, k], 4.0 * c[nearest, k])
+                value = middle + (target[k] - level) / slope
+        out[k] = np.clip(value, 0.5 * c[nearest, k], 2.0 * c[nearest, k])
     return np.clip(out, 0.005, 0.995)
 
 
@@ -231,8 +238,8 @@ def _rendered(scene: HairScene, o: Observed, spp: int, max_depth: int, seed: int
         max_depth=max_depth,
         seed=seed,
         pixels=o.pixels,
-        first_lights=32,
-        deep_lights=8,
+        first_lights=8,
+        deep_lights=4,
         thrift=0,
     )
     return replace(o, radiance=radiance)
