@@ -47,7 +47,7 @@ class ReconstructOptions:
     """What the reconstruction is asked for.
 
     `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both
-    in metres; `roots` strands are grown from the scalp, and gaps are filled at `fill` metres.
+    in metres; `roots` strands are grown from the scalp, then gaps are filled.
     `max_length` (metres) is the hair's, which the user knows. `margin` (metres) is how far in
     front of the seen surface the envelope reaches. `scalp_normals` holds the field to the scalp's
     normals as the paper does; hair that lies flat on the head is bent wrongly by that.

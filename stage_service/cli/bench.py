@@ -6,6 +6,7 @@ import argparse
 import json
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,6 @@ from stage_service.cli.output import (
     progress_bar,
 )
 
-NAMES = ("olat",)
-
 
 def add(commands: Commands) -> None:
     """Add the command."""
@@ -31,7 +30,7 @@ def add(commands: Commands) -> None:
         "olat: our renderer of many lights against Mitsuba's own path integrator, light by light. "
         "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
     )
-    bench.add_argument("name", choices=[*NAMES, "all"])
+    bench.add_argument("name", choices=[*BENCHES, "all"])
     bench.add_argument("--out", type=Path, default=Path("runs/bench"))
     bench.add_argument("--subject", default="wavy", help="wavy, straight, curly or a strand file")
     bench.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
@@ -41,9 +40,9 @@ def add(commands: Commands) -> None:
 
 def run_bench(args: argparse.Namespace, output: Output) -> int:
     """Run one benchmark, or all."""
-    names = NAMES if args.name == "all" else (args.name,)
+    names = list(BENCHES) if args.name == "all" else [args.name]
     args.out.mkdir(parents=True, exist_ok=True)
-    output.result({name: {"olat": _olat}[name](args) for name in names})
+    output.result({name: BENCHES[name](args) for name in names})
     return 0
 
 
@@ -72,6 +71,9 @@ def _olat(args: argparse.Namespace) -> dict[str, Any]:
             lights=rig.lights,
             seed=args.seed,
         )
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {"olat": _olat}
 
 
 def _write_truth(args: argparse.Namespace, folder: Path) -> None:
