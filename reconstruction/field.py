@@ -140,7 +140,7 @@ class FieldOptions:
 
     tolerance: float = 1e-4
     explicit_seconds: float = 0.0
-    least_coherence: float = 0.02
+    least_coherence: float = 0.5
 
 
 def gather(
