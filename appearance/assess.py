@@ -101,7 +101,7 @@ def assess(
             group: {name: _scores(images, name, fitted) for name in METHODS}
             for group, images in groups.items()
         }
-        _judge(result, stage)
+        judge(result, stage)
         stage.figures |= {**result, "diffuse_albedo": list(albedo), "lpips": LPIPS_UNAVAILABLE}
         progress("relighting", 0.8)
         comparison_picture(model / "comparison.png", _rows(groups, fitted), COLUMNS)
@@ -231,7 +231,7 @@ def _scores(images: Sequence[_Compared], method: str, fitted: FittedAppearance) 
     return {name: float(np.mean(v)) for name, v in values.items()}
 
 
-def _judge(result: dict[str, Any], stage: Stage) -> None:
+def judge(result: dict[str, Any], stage: Stage) -> None:
     """Warn where a trivial baseline is not beaten."""
     for group, rows in result.items():
         for baseline in ("mean_colour", "diffuse"):

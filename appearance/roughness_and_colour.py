@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar, nnls
+from scipy.stats import theilslopes
 
 from appearance.hair_appearance import DiffuseHair, HairAppearance
 from appearance.longitudinal import (
@@ -92,22 +93,25 @@ def match_roughness(
     """The β_M whose renderings read `measured` when they are measured as the capture was.
 
     `measured` and `rendered(β_M)` are roughnesses by the same estimator, so that its bias cancels.
-    Three renderings around `start` give a line in log β_M, a fourth where that says the answer is:
-    readings scatter by a few per cent, which a secant through two would amplify. Returns β_M and
-    the pairs (β_M, rendered(β_M)) looked at.
+    Three renderings around `start` give a line in log β_M, a fourth where that says the answer is.
+    Readings scatter by a few per cent and one may be far off: the line is Theil and Sen's, through
+    medians, and the answer stays within a factor of 2 of `start`. Returns β_M and the pairs (β_M,
+    rendered(β_M)) looked at.
     """
     pairs: list[tuple[float, float]] = []
-    beta = start
+    lowest, highest = (
+        float(np.clip(start * factor, LEAST_ROUGHNESS, GREATEST_ROUGHNESS)) for factor in (0.5, 2.0)
+    )
     for factor in (1.0, 0.75, 1.3):
-        near = float(np.clip(start * factor, LEAST_ROUGHNESS, GREATEST_ROUGHNESS))
+        near = float(np.clip(start * factor, lowest, highest))
         pairs.append((near, rendered(near)))
+    beta = start
     for last in (False, True):
         x, y = np.log(np.array(pairs)).T
-        slope = np.polyfit(x, y, 1)[0]
         # an estimator that hardly answers to β_M must not throw the answer out of range
-        slope, middle = float(np.clip(slope, 0.33, 3.0)), float(x.mean())
-        step = (np.log(measured) - float(y.mean())) / slope
-        beta = float(np.clip(np.exp(middle + step), LEAST_ROUGHNESS, GREATEST_ROUGHNESS))
+        slope = float(np.clip(theilslopes(y, x)[0], 0.4, 1.5))
+        wanted = (np.log(measured) - float(np.median(y - slope * x))) / slope
+        beta = float(np.clip(np.exp(wanted), lowest, highest))
         if not last:
             pairs.append((beta, rendered(beta)))
     return beta, pairs

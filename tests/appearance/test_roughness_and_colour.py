@@ -81,6 +81,12 @@ def test_matching_cancels_the_bias_of_the_estimator():
     assert len(pairs) == 4
 
 
+def test_matching_survives_one_reading_that_is_far_off():
+    readings = iter([0.33, 0.24, 0.02, 0.28])
+    beta, _ = match_roughness(0.3, lambda beta: next(readings), 0.3)
+    assert 0.2 < beta < 0.5
+
+
 def test_colour_iteration_solves_a_line_in_three_steps():
     slope, offset = np.array([0.5, 0.3, 0.2]), np.array([0.02, 0.01, 0.0])
     target = slope * np.array([0.3, 0.4, 0.6]) + offset
