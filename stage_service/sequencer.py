@@ -13,7 +13,7 @@ from reconstruction.capture_writer import CaptureWriter
 from stage_service.accounting import FrameAccount, PulseAccount
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera, Frame
-from stage_service.devices.errors import Cancelled
+from stage_service.devices.errors import Cancelled, DeviceError
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.devices.stage import Stage
 from stage_service.safety import Blackout, blackout, check_interlocks
@@ -226,11 +226,27 @@ class Sequencer:
         self._sleep(0)
         self._light(step)
         self._sleep(self.stage.config.lights.settle_s)
-        fired = time.monotonic()
         self._pulses.fired(self.stage.trigger.pulse(step.exposure))
-        self._sleep(fired + step.exposure - time.monotonic())
+        # From the box's answer, which never comes before the pulse: the light stays long enough.
+        self._sleep(step.exposure)
+        self._check_lit(step)
         self._dark(step)
         return self._pulses.count
+
+    def _check_lit(self, step: Step) -> None:
+        """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
+        lights = self.stage.lights
+        if step.kind not in ("olat", "all_on") or not lights.can_read_back:
+            return
+        lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
+        if lit != expected:
+            raise DeviceError(
+                lights.name,
+                f"looking after the exposure of step {step.index}",
+                expected=f"{expected} lamps lit",
+                received=f"{lit} lit",
+                todo="Watchdog, interlock or emergency stop put them off: clear the cause.",
+            )
 
     def _sleep(self, seconds: float) -> None:
         if self._cancel.wait(max(0.0, seconds)):

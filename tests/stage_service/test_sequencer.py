@@ -128,6 +128,22 @@ def test_trouble_fails_the_capture_dark_and_named(rig_file, world, tmp_path, fau
     assert manifest["blackout"]["safe"]
 
 
+def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, tmp_path):
+    run = sequencer(rig_file, tmp_path / "c")
+    pulse = run.stage.trigger.pulse
+
+    def cut(exposure: float) -> int:
+        count = pulse(exposure)
+        if count == 3:
+            world.lit = set()
+        return count
+
+    run.stage.trigger.pulse = cut  # type: ignore[method-assign]
+    assert run.run() == "failed"
+    assert "after the exposure of step 2: expected 1 lamps lit, received 0 lit" in str(run.error)
+    assert max(step for step, _ in Capture(tmp_path / "c").records) == 1
+
+
 def test_lamps_that_stay_lit_are_unknown_and_unsafe(rig_file, world, tmp_path):
     events: list[Any] = []
     run = sequencer(rig_file, tmp_path / "c", events)
