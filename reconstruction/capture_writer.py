@@ -91,14 +91,7 @@ class CaptureWriter:
     def reopen(cls, path: str | Path) -> Self:
         """Continue a capture that was interrupted: a torn last journal line is cut off, the
         manifest, if there is one, is removed until `finish` writes it anew."""
-        journal = Path(path) / "journal.jsonl"
-        if journal.is_file():
-            data = journal.read_bytes()
-            whole = data[: data.rfind(b"\n") + 1]
-            if len(whole) < len(data):
-                with journal.open("r+b") as file:
-                    file.truncate(len(whole))
-                    os.fsync(file.fileno())
+        _cut_torn_line(Path(path) / "journal.jsonl")
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
         return cls(capture)
@@ -259,6 +252,7 @@ def compress(path: str | Path, progress: Progress = silent) -> int:
     capture = Capture(path)
     if capture.manifest is None:
         raise CaptureError(f"{path}: not finished; compress a capture after its manifest is there")
+    _cut_torn_line(capture.path / "journal.jsonl")
     todo = [r for r in capture.records.values() if r.file and not r.file.endswith(".zip.exr")]
     saved = 0
     with (capture.path / "journal.jsonl").open("ab") as journal:
@@ -278,6 +272,18 @@ def compress(path: str | Path, progress: Progress = silent) -> int:
             progress("compressing frames", (i + 1) / len(todo))
     _write_json(capture.path / "manifest.json", {**capture.manifest, **_checksums(capture.path)})
     return saved
+
+
+def _cut_torn_line(journal: Path) -> None:
+    """Cut off what a crash or a full disk left of a last line, before anything is appended."""
+    if not journal.is_file():
+        return
+    data = journal.read_bytes()
+    whole = data[: data.rfind(b"\n") + 1]
+    if len(whole) < len(data):
+        with journal.open("r+b") as file:
+            file.truncate(len(whole))
+            os.fsync(file.fileno())
 
 
 def append_lines(journal: BinaryIO, records: Sequence[FrameRecord]) -> None:

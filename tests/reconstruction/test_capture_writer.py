@@ -202,6 +202,13 @@ def test_compression_saves_bytes_and_survives_a_crash_between_frames(tmp_path, m
     assert Capture(tmp_path / "c").saturated(STEPS[0], "cam_0").sum() == 0
 
 
+def test_compression_does_not_append_to_a_torn_line(path):
+    with (path / "journal.jsonl").open("a") as journal:
+        journal.write('{"step": 0, "cam')  # a full disk ended an earlier compression
+    compress(path)
+    assert verify(path) == []
+
+
 def test_compression_does_not_bless_damage(path):
     frame = path / "frames/00001/cam_0.exr"
     data = bytearray(frame.read_bytes())
