@@ -119,7 +119,7 @@ class CaptureManager:
                 target=self._run, args=(run,), name=f"capture-{capture_id}", daemon=True
             )
             self._running = run
-        run.thread.start()
+            run.thread.start()
         return capture_id
 
     def get(self, capture_id: str) -> CaptureStatus:
@@ -196,12 +196,15 @@ class CaptureManager:
         """Stop what runs, lights off, wait for the thread; the manager starts nothing any more."""
         with self._lock:
             self._closed = True
-        self._stop()
+        run = self._stop()
+        if run is not None and run.sequencer.blackout is None:  # its thread is stuck somewhere
+            blackout(run.sequencer.stage)
         self._stay_on_exit()
 
     def _stop(self) -> _Run | None:
         """Stop the running capture within its step, and wait until it has ended in order."""
-        run = self._running
+        with self._lock:  # until `start` has started its thread
+            run = self._running
         if run is None or run.thread is None:
             return None
         run.sequencer.stop_now()
