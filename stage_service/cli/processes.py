@@ -111,8 +111,13 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
 
 
 def exit_on_sigterm() -> None:
-    """Make SIGTERM end the process as `sys.exit` does: every `finally` runs."""
+    """Make SIGTERM end the process as `sys.exit` does: every `finally` runs.
+
+    SIGHUP, a terminal that is closed, counts as SIGTERM unless it is ignored (nohup).
+    """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
 
 
 def _log_to_stderr() -> None:

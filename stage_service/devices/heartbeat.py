@@ -6,7 +6,6 @@ import threading
 from types import TracebackType
 from typing import Self
 
-from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.interface import LightBank
 
 
@@ -20,7 +19,7 @@ class Heartbeat:
         self._bank = bank
         self._interval = interval_s
         self._stop = threading.Event()
-        self._error: DeviceError | None = None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
@@ -47,5 +46,5 @@ class Heartbeat:
             try:
                 self._bank.heartbeat()
                 self._error = None
-            except DeviceError as error:
+            except Exception as error:  # whatever it is, the thread goes on and `check` tells
                 self._error = error
