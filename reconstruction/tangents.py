@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from reconstruction.cameras import Camera
@@ -158,35 +157,3 @@ def _full(tensors: NDArray[np.floating]) -> Array:
     for n, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
         full[:, i, j] = full[:, j, i] = tensors[:, n]
     return full
-
-
-def tangents_from_lines(
-    points: NDArray[np.floating],
-    evidences: Sequence[LineEvidence],
-    *,
-    candidates: int = 600,
-    radius: float = 3e-3,
-    tolerance: float = 4e-3,
-) -> tuple[Tangents, NDArray[np.int64]]:
-    """Directions at `points (N, 3)` from all cameras' textures, and how many cameras saw each.
-
-    The paper cuts the planes of the two most frontal cameras' winners; here every camera that sees
-    the point adds its whole curve of support, neighbours within `radius` are averaged, and only
-    then is a direction chosen: an ambiguous curve is settled by the other views.
-    """
-    directions = half_sphere(candidates)
-    average = pool(points, radius)
-    scores = np.zeros((len(points), candidates), np.float32)
-    views = np.zeros(len(points), np.int64)
-    for evidence in evidences:
-        seen = seen_by(evidence, points, tolerance)
-        views += seen
-        scores += line_scores(evidence, points, directions, seen)
-    return decide(average @ scores, directions), views
-
-
-def smooth_support(evidence: NDArray[np.float32], mask: Bools, sigma: float) -> NDArray[np.float32]:
-    """Support averaged over neighbouring pixels of the mask (Gaussian of `sigma` pixels)."""
-    weight = ndimage.gaussian_filter(mask.astype(np.float32), sigma)
-    total = ndimage.gaussian_filter(evidence * mask, (0, sigma, sigma))
-    return np.where(mask, total / np.maximum(weight, 1e-6), 0).astype(np.float32)
