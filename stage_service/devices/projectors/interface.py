@@ -8,7 +8,7 @@ from typing import Protocol
 class ProjectorController(Protocol):
     """Shows scanlines. Every call raises `DeviceError`.
 
-    `can_read_back` says that `showing` asks the device, so that a blackout can be verified.
+    `can_read_back` says that `is_dark` asks the device, so that a blackout can be verified.
     """
 
     name: str
