@@ -264,8 +264,8 @@ def _field(
     if not options.scalp_normals:
         stage.leave_out(
             "scalp normals as boundary data",
-            "hair that lies on the head leaves the scalp almost flat: on Sintel's groom the "
-            "normals raise the inner error from 7 to 12 degrees",
+            "hair that lies on the head leaves the scalp almost flat, not along its normals; the "
+            "option scalp_normals puts them in",
             "nothing in time",
         )
     if field.empty.any():
