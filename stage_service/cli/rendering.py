@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from appearance.fitted import FittedAppearance
 from appearance.metrics import Exposure, srgb
 from appearance.pictures import write_png
-from appearance.relight import three_quarter_view
+from appearance.relight import PROCEDURAL, three_quarter_view
 from appearance.render.environment import render_environment
-from appearance.render.environment_maps import load_environment, sky, studio
+from appearance.render.environment_maps import load_environment
 from appearance.render.olat import render_olat
 from appearance.scene import HairScene, build_scene
 from reconstruction.cameras import Camera
@@ -26,7 +26,6 @@ from reconstruction.strand_files import read_strands
 
 SIZE = 512
 """Pixels across, where no camera of a rig says."""
-PROCEDURAL = {"studio": studio, "sky": sky}
 
 
 def render_model(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
