@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.capture import CaptureError
 from reconstruction.capture_writer import CaptureWriter, utc_now
 from reconstruction.mesh import Mesh
 from stage_service.capture_status import CaptureStatus, read_status
@@ -70,7 +69,8 @@ class CaptureManager:
         self._closed = False
         self._done: dict[str, CaptureStatus] = {}
         for plan in sorted(self.folder.glob("*/plan.json")):
-            with suppress(CaptureError):  # a folder that is no capture is nobody's capture
+            # a folder that is no capture, or a damaged one, must not keep the service from starting
+            with suppress(ValueError, LookupError, OSError):
                 self._done[plan.parent.name] = read_status(plan.parent)
         self._stay_on_exit = off_on_exit(self.close)
 

@@ -136,6 +136,10 @@ def test_an_interrupted_capture_is_listed_after_a_restart(manager, rig_file, wor
     manager.wait(capture_id, 20)
     (manager.path(capture_id) / "manifest.json").unlink()
     (manager.folder / "not a capture").mkdir()
+    damaged = manager.folder / "damaged"
+    damaged.mkdir()
+    (damaged / "plan.json").write_text("{")
+    (damaged / "rig.json").write_text("{")
     again = CaptureManager(rig_file, manager.folder.parent)
     (status,) = again.list()
     assert (status.state, status.outcome) == ("done", "interrupted")
