@@ -152,7 +152,7 @@ def _curves(strands: Strands) -> Any:
     """
     import mitsuba as mi
 
-    points, segments = spline_control_points(strands)
+    points, segments = _guarded(*spline_control_points(strands))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "curve.txt"
         file.write_text("0 0 0 1\n0 0 1 1\n0 0 2 1\n0 0 3 1\n")
@@ -163,6 +163,23 @@ def _curves(strands: Strands) -> Any:
     parameters["control_points"] = mi.Float((points * SCALE).astype(np.float32).ravel())
     parameters.update()
     return shape
+
+
+def _guarded(
+    points: NDArray[np.float64], segments: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The curves and copies of their last segment, thin inside it, where no ray meets them.
+
+    Mitsuba finds a hit's segment back from one float32 coordinate over all segments. Rounding
+    takes a hit near the end of the last one past the end of its array (seen at a million segments:
+    a read out of bounds); it now finds the copy, which has the same axis.
+    """
+    copies = 1 + int(np.ceil(len(segments) * np.finfo(np.float32).eps))
+    last = points[segments[-1] : segments[-1] + 4] * (1, 1, 1, 1e-3)
+    return (
+        np.concatenate([points, last]),
+        np.concatenate([segments, np.full(copies, len(points))]),
+    )
 
 
 def _mesh(head: Mesh) -> Any:

@@ -7,7 +7,7 @@ from appearance.curves import spline_control_points
 from appearance.hair_appearance import DiffuseHair, HairAppearance
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
-from appearance.scene import SCALE, build_scene
+from appearance.scene import SCALE, _guarded, build_scene
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 from reconstruction.strands import Strands
@@ -155,3 +155,13 @@ def test_albedos_out_of_range_are_refused(small):
 def test_the_scene_is_in_centimetres(small):
     scene = build_scene(small.no_hair, small.ball(), hair=HAIR)
     assert scene.mi_scene.bbox().max.z == pytest.approx(0.08 * SCALE, rel=1e-3)
+
+
+def test_no_hit_reads_past_the_last_segment():
+    points = np.array([[0, 0, 0], [0, 0, 0.1]], np.float32)
+    control, segments = spline_control_points(Strands(points, np.array([0, 2]), 1e-3))
+    guarded, indices = _guarded(control, np.repeat(segments, 2_000_000))
+    rounded = np.nextafter(np.float32(1), np.float32(0)) * np.float32(2_000_000)
+    assert int(np.ceil(rounded)) < len(indices)
+    np.testing.assert_allclose(guarded[indices[-1] :, :3], control[segments[-1] :][:4, :3])
+    assert guarded[indices[-1] :, 3].max() < 0.01 * control[:, 3].min()
