@@ -210,13 +210,17 @@ def light_contrast(
 def _threshold(contrast: NDArray[np.float64], subject: Mask, hair: Mask, skin: Mask) -> float:
     """The contrast above which a pixel is hair: between what sure hair and likely skin have.
 
-    The split of the whole subject where one of them is missing; infinite, so that none is hair,
-    where the two do not differ by a third.
+    The split of the whole subject where one of them is missing. Where the two do not differ by a
+    third, likely skin is hair that lies flat on the head if sure hair is far from matte: what
+    equals it is hair, too. Else the light cannot tell: infinite, so that none is hair.
     """
     if not hair.any() or not skin.any():
         return _otsu(contrast[subject])
+    third = np.log(4 / 3)
     sure, likely = float(np.median(contrast[hair])), float(np.median(contrast[skin]))
-    return 0.5 * (sure + likely) if sure > likely + np.log(4 / 3) else np.inf
+    if sure > likely + third:
+        return 0.5 * (sure + likely)
+    return sure - third if sure > 2 * third else np.inf
 
 
 def _otsu(values: NDArray[np.float64]) -> float:

@@ -12,7 +12,13 @@ from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
 from reconstruction.light_planes import PointCloud, triangulate
 from reconstruction.lights import Light, dome_positions
-from reconstruction.masks import distance_to, hair_masks, head_coverage, light_contrast
+from reconstruction.masks import (
+    _threshold,
+    distance_to,
+    hair_masks,
+    head_coverage,
+    light_contrast,
+)
 from reconstruction.mesh import Mesh
 from reconstruction.silhouettes import NoSilhouette, background_noise, silhouette
 
@@ -165,3 +171,14 @@ def test_distances_to_a_ball() -> None:
 def test_the_head_covers_its_outline(stage_camera: Callable[..., Camera]) -> None:
     device = stage_camera("c", 0.0)
     assert iou(head_coverage(ball(0.1, 40), device), upper(device)[0]) > 0.93
+
+
+def test_hair_that_lies_flat_on_the_head_is_hair_where_the_light_says_so():
+    contrast = np.array([[1.2, 1.3, 1.1, 1.2, 0.1]])
+    subject = np.ones_like(contrast, bool)
+    hair, flat = np.zeros_like(subject), np.zeros_like(subject)
+    hair[0, :2], flat[0, 2:] = True, True
+    level = _threshold(contrast, subject, hair, flat)
+    np.testing.assert_array_equal((contrast > level)[0], [True, True, True, True, False])
+    # nothing is far from matte: the points' word, that it lies on the head, stands
+    assert _threshold(0.2 * contrast, subject, hair, flat) == np.inf
