@@ -67,6 +67,8 @@ def _darken(device: _Dark, is_dark: Callable[[], bool], attempts: int) -> str:
             problem = f" {device.name}: still lit after off."
         except DeviceError as error:
             problem = f" {error}"
+        except Exception as error:  # whatever it is, the next device must still be darkened
+            problem = f" {device.name}: {type(error).__name__}: {error}"
     return problem
 
 

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from stage_service.cli.output import BAD_INPUT, UNREACHABLE, CommandError
 
-GRACE_S = 15.0
+GRACE_S = 40.0
 """How long a child may take to end by itself: the service puts the lights off in that time."""
 
 
