@@ -16,7 +16,7 @@ from simulators.sensor import Sensor
 from simulators.serial_peer import SerialPeer
 from simulators.trigger_box import TriggerBox
 from simulators.world import World
-from stage_service.config import DevicesConfig
+from stage_service.config import DevicesConfig, ModbusTcpConfig
 
 HOST = "127.0.0.1"
 DEVICES_FILE = "devices.toml"
@@ -66,7 +66,9 @@ class SimulatedStage:
         self._state.mkdir(parents=True, exist_ok=True)
         world, wires = self._world, self._configured
         fixed = None if self._free_ports else wires
-        light_host, light_port = (fixed.lights.host, fixed.lights.port) if fixed else (HOST, 0)
+        light_host, light_port = HOST, 0
+        if fixed and isinstance(fixed.lights, ModbusTcpConfig):
+            light_host, light_port = fixed.lights.host, fixed.lights.port
         camera_host, camera_port = (fixed.cameras.host, fixed.cameras.port) if fixed else (HOST, 0)
         stack.callback(world.stop)
         lights = LedBank(world.lamps, light_host, light_port, world.hanging)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from reconstruction.rig import Rig, RigError
 
@@ -21,6 +21,7 @@ Exposure = Annotated[float, Field(ge=1e-6, le=10.0)]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Seconds = Annotated[float, Field(gt=0.0)]
+Address = Annotated[int, Field(ge=0, le=65535)]
 
 
 class Strict(BaseModel):
@@ -29,15 +30,79 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class LightBankConfig(Strict):
-    """`[devices.lights]`: a Modbus TCP light bank. `settle_s` passes between lamp and pulse."""
+class LightRegisters(Strict):
+    """`[devices.lights.registers]`: Modbus addresses; the defaults are those of docs/wire.md.
+
+    Holding registers, then input registers; `levels`, `coils` and `table` are the first of many.
+    None: the bank has no such register. Without `selector` lamps are put on by coils; without
+    `heartbeat` and `watchdog` there is no dead-man, without `lit` no read-back, without `sequence`
+    and `table` no hardware stepping. `signature` is (address, value), checked at `connect`.
+    """
+
+    coils: Address = 0
+    levels: Address | None = 0
+    level_full: int = Field(default=65535, ge=1, le=65535)
+    selector: Address | None = 1000
+    heartbeat: Address | None = 1001
+    watchdog: Address | None = 1002
+    sequence: Address | None = 1003
+    table: Address | None = 2000
+    status: Address | None = 0
+    lit: Address | None = 1
+    count: Address | None = 2
+    signature: tuple[Address, Address] | None = (3, 0x4853)
+    position: Address | None = 4
+
+
+class _LightBank(Strict):
+    """What every light bank has. `settle_s` passes between lamp and pulse.
+
+    A bank without read-back or dead-man cannot guarantee a blackout; it is refused unless the
+    operator accepts that here.
+    """
+
+    timeout_s: Seconds = 1.0
+    settle_s: float = Field(default=0.0, ge=0.0, le=1.0)
+    accept_unverified_blackout: bool = False
+
+
+class ModbusTcpConfig(_LightBank):
+    """`[devices.lights]`: a light bank on Modbus TCP."""
 
     kind: Literal["modbus_tcp"] = "modbus_tcp"
     host: str = "127.0.0.1"
     port: Port = 502
     unit: int = Field(default=1, ge=0, le=255)
-    timeout_s: Seconds = 1.0
-    settle_s: float = Field(default=0.0, ge=0.0, le=10.0)
+    registers: LightRegisters = LightRegisters()
+
+
+class ModbusRtuConfig(_LightBank):
+    """`[devices.lights]`: a light bank on Modbus RTU, 8 data bits."""
+
+    kind: Literal["modbus_rtu"]
+    port: str = Field(min_length=1)
+    baud: int = Field(default=115200, ge=300)
+    parity: Literal["N", "E", "O"] = "E"
+    stop_bits: Literal[1, 2] = 1
+    unit: int = Field(default=1, ge=1, le=247)
+    registers: LightRegisters = LightRegisters()
+
+
+class DmxConfig(_LightBank):
+    """`[devices.lights]`: lamps on DMX channels `first_channel` … through an Enttec USB Pro."""
+
+    kind: Literal["dmx_enttec"]
+    port: str = Field(min_length=1)
+    first_channel: int = Field(default=1, ge=1, le=512)
+
+
+def _modbus_tcp_by_default(table: Any) -> Any:
+    return {"kind": "modbus_tcp", **table} if isinstance(table, dict) else table
+
+
+LightBankConfig = Annotated[
+    ModbusTcpConfig | ModbusRtuConfig | DmxConfig, Field(discriminator="kind")
+]
 
 
 class SerialConfig(Strict):
@@ -54,6 +119,7 @@ class CamerasConfig(Strict):
 
     `timeout_s` bounds each answer, `busy_s` how long a camera may say that its frame is not ready.
     `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are for predictions.
+    `buffers` is how many frames a camera holds unread; it bounds a hardware-stepped run.
     """
 
     kind: Literal["link"] = "link"
@@ -63,14 +129,20 @@ class CamerasConfig(Strict):
     busy_s: Seconds = 60.0
     readout_s: float = Field(default=0.02, ge=0.0)
     bytes_per_s: float = Field(default=100e6, gt=0.0)
+    buffers: int = Field(default=64, ge=1)
 
 
 class DevicesConfig(Strict):
-    """`[devices]`: how to reach the stage. Without `projectors` there are no sweeps."""
+    """`[devices]`: how to reach the stage. Without `projectors` there are no sweeps.
 
+    `hardware_stepping` says that the trigger box's gates are wired to the light bank and to the
+    projectors, so that the box can clock a sequence by itself.
+    """
+
+    hardware_stepping: bool = False
     heartbeat_s: Seconds = 0.5
     watchdog_s: float = Field(default=2.0, ge=0.1, le=60.0)
-    lights: LightBankConfig
+    lights: Annotated[LightBankConfig, BeforeValidator(_modbus_tcp_by_default)]
     trigger: SerialConfig
     projectors: SerialConfig | None = None
     cameras: CamerasConfig
@@ -117,6 +189,23 @@ class CaptureDefaults(Strict):
     level: Levels = Levels()
 
 
+class SafetyLimits(Strict):
+    """`[safety]`: what the lamps may do, checked in the plan and while running.
+
+    One lamp is lit for at most `max_on_s` at a time and `max_duty` of any `duty_window_s`; at most
+    `max_lamps` are lit at once, and `max_power_w` drawn at `lamp_power_w` a lamp at full level.
+    None: no limit. With `living_subject`, flashes of 3 to 30 Hz need recorded consent.
+    """
+
+    max_on_s: Seconds = 12.0
+    max_duty: float = Field(default=1.0, gt=0.0, le=1.0)
+    duty_window_s: Seconds = 60.0
+    max_lamps: int | None = Field(default=None, ge=1)
+    max_power_w: float | None = Field(default=None, gt=0.0)
+    lamp_power_w: Seconds = 10.0
+    living_subject: bool = True
+
+
 @dataclass(frozen=True, eq=False)
 class RigFile:
     """A rig file, read: `devices` is None where the file describes geometry alone."""
@@ -125,11 +214,13 @@ class RigFile:
     rig: Rig
     devices: DevicesConfig | None
     capture: CaptureDefaults
+    safety: SafetyLimits
 
 
 class _Tables(Strict):
     devices: DevicesConfig | None = None
     capture: CaptureDefaults = CaptureDefaults()
+    safety: SafetyLimits = SafetyLimits()
 
 
 GEOMETRY = {"name", "dome", "cameras", "lights", "projectors"}
@@ -153,7 +244,7 @@ def load_rig_file(path: str | Path, devices: str | Path | None = None) -> RigFil
         _validate(path, {k: v for k, v in tables.items() if k != "devices"})
         merged = _merge(tables.get("devices", {}), override["devices"])
         read = _validate(devices, {**tables, "devices": merged})
-    return RigFile(path, rig, read.devices, read.capture)
+    return RigFile(path, rig, read.devices, read.capture, read.safety)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -166,14 +257,19 @@ def _read(path: Path) -> dict[str, Any]:
         raise RigError(f"{path}: {error}") from error
 
 
+def _place(loc: tuple[int | str, ...]) -> str:
+    """The field's place in the file; pydantic adds the kind of the table."""
+    return ".".join(str(p) for p in loc if p not in _KINDS)
+
+
+_KINDS = ("modbus_tcp", "modbus_rtu", "dmx_enttec")
+
+
 def _validate(path: Path, tables: dict[str, Any]) -> _Tables:
     try:
         return _Tables.model_validate(tables)
     except ValidationError as error:
-        problems = [
-            f"{'.'.join(str(p) for p in e['loc'])}: {e['msg']}, got {e['input']!r}"
-            for e in error.errors()
-        ]
+        problems = [f"{_place(e['loc'])}: {e['msg']}, got {e['input']!r}" for e in error.errors()]
         raise RigError(f"{path}: " + "; ".join(problems)) from error
 
 

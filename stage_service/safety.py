@@ -30,7 +30,6 @@ class Blackout:
 
 class _Dark(Protocol):
     name: str
-    can_read_back: bool
 
     def off(self) -> None: ...
 
@@ -41,18 +40,23 @@ def blackout(stage: Stage, attempts: int = ATTEMPTS) -> Blackout:
     A device that fails is tried again on a new connection. What cannot be verified is reported
     as "unknown, unsafe".
     """
-    problems = _darken(stage.lights, lambda: stage.lights.status().lit == 0, attempts)
+    problems = _darken(
+        stage.lights,
+        stage.lights.capabilities.reads_back,
+        lambda: stage.lights.status().lit == 0,
+        attempts,
+    )
     if problems:
         problems += f" Its watchdog puts the lamps off within {stage.config.watchdog_s:g} s."
     beams = stage.projectors
     if beams is not None:
-        problems += _darken(beams, beams.is_dark, attempts)
+        problems += _darken(beams, beams.capabilities.reads_back, beams.is_dark, attempts)
     if problems:
         return Blackout(False, f"unknown, unsafe: {problems.strip()}")
     return Blackout(True, "every lamp and projector was read back dark")
 
 
-def _darken(device: _Dark, is_dark: Callable[[], bool], attempts: int) -> str:
+def _darken(device: _Dark, reads_back: bool, is_dark: Callable[[], bool], attempts: int) -> str:
     """Empty when the device was read back dark, else what went wrong the last time."""
     problem = ""
     for attempt in range(attempts):
@@ -60,7 +64,7 @@ def _darken(device: _Dark, is_dark: Callable[[], bool], attempts: int) -> str:
             time.sleep(0.05 * attempt)
         try:
             device.off()
-            if not device.can_read_back:
+            if not reads_back:
                 return f" {device.name}: off was sent, but cannot be read back."
             if is_dark():
                 return ""

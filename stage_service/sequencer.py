@@ -58,7 +58,9 @@ class Sequencer:
         self._lamp = {light.name: i for i, light in enumerate(writer.rig.lights)}
         self._armed: float | None = None
         self._pulses = PulseAccount(stage.trigger.name)
-        self._accounts = {c.name: FrameAccount(c.name, c.block_wrap) for c in stage.cameras}
+        self._accounts = {
+            c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in stage.cameras
+        }
 
     @property
     def state(self) -> State:
@@ -236,7 +238,7 @@ class Sequencer:
     def _check_lit(self, step: Step) -> None:
         """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
         lights = self.stage.lights
-        if step.kind not in ("olat", "all_on") or not lights.can_read_back:
+        if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
             return
         lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
         if lit != expected:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, Self
 
 from reconstruction.rig import RigError
-from stage_service.config import DevicesConfig, RigFile
+from stage_service.config import DevicesConfig, LightBankConfig, ModbusTcpConfig, RigFile
 from stage_service.devices.cameras.interface import Camera
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
@@ -44,7 +44,7 @@ class Stage:
             projectors = SerialProjectorController(config.projectors, names)
         return cls(
             config,
-            ModbusLightBank(config.lights, len(rig.lights)),
+            _light_bank(config.lights, len(rig.lights)),
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(LinkCamera(config.cameras, c) for c in rig.cameras),
@@ -88,6 +88,14 @@ class Stage:
     def _all(self) -> tuple[Device, ...]:
         beams = (self.projectors,) if self.projectors is not None else ()
         return (self.lights, *beams, self.trigger, *self.cameras)
+
+
+def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
+    match config:
+        case ModbusTcpConfig():
+            return ModbusLightBank(config, lamps)
+        case _:
+            raise RigError(f"devices.lights: {config.kind} is not there yet")
 
 
 def _info(camera: Camera) -> dict[str, Any]:

@@ -9,7 +9,7 @@ class Broken:
     """A light bank whose driver has a fault of its own."""
 
     name = "lights"
-    can_read_back = True
+    capabilities = SimpleNamespace(reads_back=True)
 
     def off(self):
         raise ZeroDivisionError("a fault of the driver")
@@ -17,7 +17,7 @@ class Broken:
 
 class Beams:
     name = "projectors"
-    can_read_back = True
+    capabilities = SimpleNamespace(reads_back=True)
     lit = True
 
     def off(self):

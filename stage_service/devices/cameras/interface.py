@@ -45,14 +45,26 @@ class Frame:
         return float((np.float32(info.full_scale) - np.float32(info.black)) * scale)
 
 
-class Camera(Protocol):
-    """One camera that waits for hardware triggers. Every call raises `DeviceError`.
+@dataclass(frozen=True)
+class CameraCapabilities:
+    """What camera and link can do.
 
-    `block_wrap` is the last block id before they begin again at 1.
+    `buffers`: frames that it holds unread. `hardware_trigger`: pulses reach it by wire.
+    `timestamps`: its clock tells frames apart. `block_wrap`: the last block id
+    before they begin again at 1.
     """
 
-    name: str
+    buffers: int
+    hardware_trigger: bool
+    timestamps: bool
     block_wrap: int
+
+
+class Camera(Protocol):
+    """One camera that waits for hardware triggers. Every call raises `DeviceError`."""
+
+    name: str
+    capabilities: CameraCapabilities
 
     @property
     def info(self) -> CameraInfo:

@@ -13,7 +13,7 @@ import numpy as np
 
 from reconstruction.cameras import Camera as CameraGeometry
 from stage_service.config import CamerasConfig
-from stage_service.devices.cameras.interface import CameraInfo, Frame
+from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import (
     Cancelled,
     DeviceError,
@@ -21,6 +21,7 @@ from stage_service.devices.errors import (
     DeviceUnreachable,
 )
 
+BLOCK_WRAP = 65535
 LONGEST_HEADER = 1 << 20
 LONGEST_PAYLOAD = 1 << 30
 POLL_S = (0.001, 0.05)
@@ -30,9 +31,8 @@ POLL_S = (0.001, 0.05)
 class LinkCamera:
     """Implements `Camera` on a TCP connection of its own; see there for the contract."""
 
-    block_wrap = 65535
-
     def __init__(self, config: CamerasConfig, geometry: CameraGeometry) -> None:
+        self.capabilities = CameraCapabilities(config.buffers, True, True, BLOCK_WRAP)
         self.name = geometry.name
         self.device = f"camera {geometry.name} ({config.host}:{config.port})"
         self.config = config

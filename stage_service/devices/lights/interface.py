@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
+
+Lit = int | Literal["all", "none"]
+"""What an entry of a sequence puts on: one lamp by number, every lamp, or none."""
+
+
+@dataclass(frozen=True)
+class LightCapabilities:
+    """What link and device can do.
+
+    `reads_back`: a blackout can be verified. `dead_man`: the lamps go off by themselves when
+    heartbeats stop. `table`: entries of its sequence table; 0 where it has none.
+    """
+
+    reads_back: bool
+    dead_man: bool
+    table: int
 
 
 @dataclass(frozen=True)
@@ -19,17 +36,15 @@ class LightStatus:
 class LightBank(Protocol):
     """Lamps `0 … count - 1` in the order of the rig. Safe to call from several threads.
 
-    Flags say what the link can do: `can_read_back` that a blackout can be verified, `has_watchdog`
-    that the lamps go off by themselves when heartbeats stop. Every call raises `DeviceError`.
+    Every call raises `DeviceError`; what the capabilities exclude raises it, too.
     """
 
     name: str
-    can_read_back: bool
-    has_watchdog: bool
+    capabilities: LightCapabilities
 
     @property
     def count(self) -> int:
-        """Number of lamps; known after `connect`."""
+        """Number of lamps, as the rig file has it and `connect` has confirmed it."""
         ...
 
     def connect(self) -> None:
@@ -41,15 +56,15 @@ class LightBank(Protocol):
         ...
 
     def select(self, lamp: int) -> None:
-        """Put exactly this lamp on, and confirm that one lamp is lit."""
+        """Put exactly this lamp on, and confirm that one lamp is lit where the link can."""
         ...
 
     def all_on(self) -> None:
-        """Put every lamp on, and confirm it."""
+        """Put every lamp on, and confirm it where the link can."""
         ...
 
     def off(self) -> None:
-        """Put every lamp off, and confirm it where the link can."""
+        """Put every lamp off and leave a sequence; confirm it where the link can."""
         ...
 
     def set_level(self, level: float) -> None:
@@ -66,4 +81,12 @@ class LightBank(Protocol):
 
     def status(self) -> LightStatus:
         """Read the status back."""
+        ...
+
+    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
+        """Upload (what, level) per step, verify and arm it: all dark until the gate opens."""
+        ...
+
+    def position(self) -> int:
+        """How many steps of the armed sequence are over."""
         ...

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 from pymodbus import ModbusException
 from pymodbus.client import ModbusTcpClient
 
-from stage_service.config import LightBankConfig
+from stage_service.config import ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
-from stage_service.devices.lights.interface import LightStatus
+from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
 
 SELECTOR, HEARTBEAT, WATCHDOG = 1000, 1001, 1002
 ALL_ON, ALL_OFF = 65535, 0
@@ -22,10 +23,9 @@ SIGNATURE = 0x4853
 class ModbusLightBank:
     """Implements `LightBank` with pymodbus; see there for the contract."""
 
-    can_read_back = True
-    has_watchdog = True
+    capabilities = LightCapabilities(reads_back=True, dead_man=True, table=0)
 
-    def __init__(self, config: LightBankConfig, lamps: int) -> None:
+    def __init__(self, config: ModbusTcpConfig, lamps: int) -> None:
         self.name = f"light bank ({config.host}:{config.port})"
         self.config = config
         self._lamps = lamps
@@ -114,6 +114,14 @@ class ModbusLightBank:
         """Read status bits and the number of lamps that are lit."""
         bits, lit = self._read_input(0, 2, "reading the status")
         return LightStatus(bool(bits & 1), bool(bits & 2), bool(bits & 4), lit)
+
+    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
+        """Not there yet."""
+        raise NotImplementedError
+
+    def position(self) -> int:
+        """Not there yet."""
+        raise NotImplementedError
 
     def _command(self, selector: int, lit: int, doing: str) -> None:
         with self._lock:

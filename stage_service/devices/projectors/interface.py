@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 
-class ProjectorController(Protocol):
-    """Shows scanlines. Every call raises `DeviceError`.
+@dataclass(frozen=True)
+class ProjectorCapabilities:
+    """`reads_back`: a blackout can be verified. `sequences`: it steps with the trigger box."""
 
-    `can_read_back` says that `is_dark` asks the device, so that a blackout can be verified.
-    """
+    reads_back: bool
+    sequences: bool
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What one step of a sequence shows at `level`, 0 to 1: a row, or everything (no projector)."""
+
+    level: float
+    projector: str | None = None
+    row: int = 0
+
+
+class ProjectorController(Protocol):
+    """Shows scanlines. Every call raises `DeviceError`."""
 
     name: str
-    can_read_back: bool
+    capabilities: ProjectorCapabilities
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -36,9 +52,17 @@ class ProjectorController(Protocol):
         ...
 
     def off(self) -> None:
-        """Put every projector dark."""
+        """Put every projector dark and leave a sequence."""
         ...
 
     def is_dark(self) -> bool:
         """Read back whether every projector is dark."""
+        ...
+
+    def load_sequence(self, patterns: Sequence[Pattern]) -> None:
+        """Upload one pattern per step, verify and arm it: all dark until the gate opens."""
+        ...
+
+    def position(self) -> int:
+        """How many patterns of the armed sequence are over."""
         ...

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from stage_service.config import SerialConfig
 from stage_service.devices.errors import DeviceError
+from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities
 from stage_service.devices.serial_lines import SerialLines
 
 FULL_LEVEL = 65535
@@ -14,7 +16,7 @@ FULL_LEVEL = 65535
 class SerialProjectorController:
     """Implements `ProjectorController`; see there for the contract."""
 
-    can_read_back = True
+    capabilities = ProjectorCapabilities(reads_back=True, sequences=False)
 
     def __init__(self, config: SerialConfig, expected: tuple[str, ...]) -> None:
         identity = re.compile(r"HAIRSTAGE-PROJECTORS (\S*)")
@@ -62,6 +64,14 @@ class SerialProjectorController:
     def is_dark(self) -> bool:
         """Ask the controller what it shows."""
         return self._lines.ask("SHOW?", "SHOW (.+)", "reading what is shown")[1] == "OFF"
+
+    def load_sequence(self, patterns: Sequence[Pattern]) -> None:
+        """Not there yet."""
+        raise NotImplementedError
+
+    def position(self) -> int:
+        """Not there yet."""
+        raise NotImplementedError
 
 
 def _level(level: float) -> int:

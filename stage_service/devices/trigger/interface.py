@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 
 @dataclass(frozen=True)
@@ -14,10 +15,40 @@ class TriggerStatus:
     estop_pressed: bool
 
 
+@dataclass(frozen=True)
+class TableRow:
+    """`repeat` steps alike of a hardware-stepped sequence; times in seconds.
+
+    `gates` open ("L" light bank, "P" projectors), `settle_s` later the cameras fire, after
+    `exposure_s` the gates close; the next step begins `period_s` after this one at the earliest.
+    """
+
+    repeat: int
+    gates: Literal["L", "P", "LP", "-"]
+    settle_s: float
+    exposure_s: float
+    period_s: float
+
+
+@dataclass(frozen=True)
+class TableProgress:
+    """Where a table is: `steps` and `pulses` since `go`; `reason` says why it stopped, or "-"."""
+
+    state: Literal["idle", "armed", "running", "done", "stopped"]
+    steps: int
+    pulses: int
+    reason: str
+
+
 class TriggerBox(Protocol):
     """Fires all cameras at once and counts its pulses. Every call raises `DeviceError`."""
 
     name: str
+
+    @property
+    def table_rows(self) -> int:
+        """Rows of its table, 0 where it has none; known after `connect`."""
+        ...
 
     def connect(self) -> None:
         """Open the link and check that the right device answers."""
@@ -42,4 +73,21 @@ class TriggerBox(Protocol):
 
     def status(self) -> TriggerStatus:
         """Read the safety inputs."""
+        ...
+
+    def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
+        """Upload a table, verify its checksum, and arm it; it stops by itself when nobody asks
+        for `watchdog_s` seconds."""
+        ...
+
+    def go(self) -> None:
+        """Run the armed table from its first step."""
+        ...
+
+    def progress(self) -> TableProgress:
+        """Where the table is; feeds the box's watchdog."""
+        ...
+
+    def stop(self) -> int:
+        """Close the gates at once; returns the steps that were done."""
         ...

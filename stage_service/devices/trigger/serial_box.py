@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from stage_service.config import SerialConfig
 from stage_service.devices.serial_lines import SerialLines
-from stage_service.devices.trigger.interface import TriggerStatus
+from stage_service.devices.trigger.interface import TableProgress, TableRow, TriggerStatus
 
 
 class SerialTriggerBox:
     """Implements `TriggerBox`; see there for the contract."""
 
     def __init__(self, config: SerialConfig) -> None:
-        self._lines = SerialLines("trigger box", config, re.compile(r"HAIRSTAGE-TRIGGER 1"))
+        self._lines = SerialLines(
+            "trigger box", config, re.compile(r"HAIRSTAGE-TRIGGER (?:1|2 \d+)")
+        )
         self.name = self._lines.name
 
     def connect(self) -> None:
@@ -44,3 +47,24 @@ class SerialTriggerBox:
         reply = r"STATUS interlock=([01]) estop=([01])"
         match = self._lines.ask("STATUS?", reply, "reading the safety inputs")
         return TriggerStatus(match[1] == "1", match[2] == "1")
+
+    @property
+    def table_rows(self) -> int:
+        """Not there yet."""
+        return 0
+
+    def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
+        """Not there yet."""
+        raise NotImplementedError
+
+    def go(self) -> None:
+        """Not there yet."""
+        raise NotImplementedError
+
+    def progress(self) -> TableProgress:
+        """Not there yet."""
+        raise NotImplementedError
+
+    def stop(self) -> int:
+        """Not there yet."""
+        raise NotImplementedError
