@@ -16,8 +16,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from reconstruction.rig import Rig, RigError
 
-Exposure = Annotated[float, Field(ge=1e-6, le=10.0)]
-"""Seconds; the limits are the trigger box's."""
+SHORTEST_S, LONGEST_S = 1e-6, 10.0
+"""Exposures that the trigger box makes."""
+Exposure = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Seconds = Annotated[float, Field(gt=0.0)]

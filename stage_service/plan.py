@@ -10,12 +10,21 @@ from pydantic import BaseModel, ConfigDict, Field
 from reconstruction.capture import Step, StepKind
 from reconstruction.projectors import Projector
 from reconstruction.rig import Rig
-from stage_service.config import CaptureDefaults, Exposure, Level, RigFile
+from stage_service.config import (
+    LONGEST_S,
+    SHORTEST_S,
+    CaptureDefaults,
+    Exposure,
+    Level,
+    RigFile,
+)
+from stage_service.stepping import LATENCY_S, Run, limited_by, runs, seconds_by_cause
 
-LATENCY_S = 0.002
-"""Time that the command, the confirmation and the pulse of one step take on the wires."""
 EXR_HEADER_BYTES = 700
 """What an EXR file holds beside 12 bytes a pixel, not counting its table of lines."""
+
+
+Bracket = Annotated[float, Field(gt=0.0, le=1000.0)]
 
 
 class _Model(BaseModel):
@@ -61,9 +70,10 @@ class PlanCost(_Model):
     """What a plan takes, retries apart.
 
     `frames` counts pictures (steps times cameras), `bytes` what the capture folder gets while
-    shooting, `seconds` includes exposure, settling, readout, link and storage. `lamp_seconds` sums
-    level times on-time over lamps; `dose` is the radiant exposure at the head's centre, J/m² per
-    channel, lamps and projectors together.
+    shooting, `seconds` includes exposure, settling, readout, link and storage; `limited_by` names
+    what takes most of it. `stepping` counts the steps that the service and the trigger box clock,
+    and `stepping_why` says why. `lamp_seconds` sums level times on-time over lamps; `dose` is the
+    radiant exposure at the head's centre, J/m² per channel, lamps and projectors together.
     """
 
     steps: int
@@ -72,6 +82,9 @@ class PlanCost(_Model):
     bytes: int
     seconds: float
     seconds_by_cause: dict[str, float]
+    limited_by: str
+    stepping: dict[str, int]
+    stepping_why: str
     lamp_seconds: float
     dose: tuple[float, float, float]
     left_out: tuple[LeftOutWork, ...]
@@ -88,6 +101,10 @@ class PlanError(ValueError):
 class CapturePlan(_Model):
     """What to shoot. The order is: dark, all on; each light alone; the sweep; dark, all on.
 
+    `brackets` are factors on the exposure of a light alone: all lights at the first factor, then
+    all at the next, so that cameras are armed once for each. `rate_hz` is the most steps a second.
+    `stepping` says who clocks the steps; "auto" lets the trigger box do it where it can.
+
     In the sweep a tracking frame stands before every full group of `tracking_every` scanlines of
     a projector, floor(rows / tracking_every) of them and at least one: 76 for 768 rows, 6 for 64.
     The rows that are left over follow the last full group. 0 means no tracking frames.
@@ -97,6 +114,9 @@ class CapturePlan(_Model):
     projectors: Literal["all"] | tuple[str, ...] = "all"
     rows: Rows = Rows()
     sentinels: bool = True
+    brackets: Annotated[tuple[Bracket, ...], Field(min_length=1, max_length=8)] = (1.0,)
+    stepping: Literal["auto", "software", "hardware"] = "auto"
+    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
     tracking_every: Annotated[int, Field(ge=0)] | None = None
     retries: Annotated[int, Field(ge=0, le=20)] | None = None
     exposure: KindExposures = KindExposures()
@@ -114,6 +134,21 @@ class CapturePlan(_Model):
                     f"rows {self.rows.first} to {last}: projector {p.name} has rows 0 to "
                     f"{p.height - 1}"
                 )
+        if len(set(self.brackets)) < len(self.brackets):
+            problems.append(f"brackets: {list(self.brackets)} has a factor twice")
+        olat = self._exposure("olat", rig_file.capture)
+        for factor in self.brackets:
+            if not SHORTEST_S <= factor * olat <= LONGEST_S:
+                problems.append(
+                    f"brackets: {factor:g} times {olat:g} s is an exposure of {factor * olat:g} s; "
+                    f"the trigger box makes {SHORTEST_S:g} to {LONGEST_S:g} s"
+                )
+        devices = rig_file.devices
+        if self.stepping == "hardware" and (devices is None or not devices.hardware_stepping):
+            problems.append(
+                "stepping: the rig file does not say that the trigger box's gates are wired; set "
+                "hardware_stepping in [devices], or let the service step"
+            )
         if self.projectors != "all" and self.projectors and _no_controller(rig_file):
             problems.append("projectors: the rig file has no [devices.projectors]")
         if not problems and not self.steps(rig_file):
@@ -132,7 +167,11 @@ class CapturePlan(_Model):
         ends = [{"kind": "dark"}, {"kind": "all_on"}] if self.sentinels else []
         todo += ends
         names = [x.name for x in rig_file.rig.lights] if self.lights == "all" else self.lights
-        todo += [{"kind": "olat", "light": name} for name in names]
+        todo += [
+            {"kind": "olat", "light": name, "bracket": factor}
+            for factor in self.brackets
+            for name in names
+        ]
         every = defaults.tracking_every if self.tracking_every is None else self.tracking_every
         for projector in self._swept(rig_file):
             rows = self._rows(projector)
@@ -145,12 +184,16 @@ class CapturePlan(_Model):
         return tuple(
             Step(
                 index=i,
-                exposure=self._exposure(t["kind"], defaults),
+                exposure=self._exposure(t["kind"], defaults) * t.pop("bracket", 1.0),
                 level=self._level(t["kind"], defaults),
                 **t,
             )
             for i, t in enumerate(todo)
         )
+
+    def runs(self, rig_file: RigFile, steps: tuple[Step, ...]) -> tuple[list[Run], str]:
+        """The plan's steps, or those of them that are left, in runs; and why they are so."""
+        return runs(steps, rig_file, self.stepping)
 
     def left_out(self, rig_file: RigFile) -> tuple[LeftOutWork, ...]:
         """What "all" does not contain on this rig, and why."""
@@ -176,7 +219,14 @@ class CapturePlan(_Model):
         kinds: dict[str, int] = {}
         for step in steps:
             kinds[step.kind] = kinds.get(step.kind, 0) + cameras
-        causes = _seconds(rig_file, steps, wire_bytes=6 * pixels, folder_bytes=folder)
+        parts, why = self.runs(rig_file, steps)
+        causes = seconds_by_cause(
+            parts,
+            rig_file,
+            wire_bytes=6 * pixels,
+            folder_bytes=folder,
+            rate_hz=self.rate_hz,
+        )
         lamp_seconds, dose = _dose(rig, steps, causes["settle"] / len(steps) + LATENCY_S)
         return PlanCost(
             steps=len(steps),
@@ -185,6 +235,12 @@ class CapturePlan(_Model):
             bytes=len(steps) * folder,
             seconds=sum(causes.values()),
             seconds_by_cause=causes,
+            limited_by=limited_by(causes),
+            stepping={
+                kind: sum(len(p.steps) for p in parts if p.stepping == kind)
+                for kind in ("software", "hardware")
+            },
+            stepping_why=why,
             lamp_seconds=lamp_seconds,
             dose=dose,
             left_out=self.left_out(rig_file),
@@ -225,24 +281,6 @@ def _unknown(kind: str, chosen: Literal["all"] | tuple[str, ...], known: list[st
 
 def _no_controller(rig_file: RigFile) -> bool:
     return rig_file.devices is not None and rig_file.devices.projectors is None
-
-
-def _seconds(
-    rig_file: RigFile, steps: tuple[Step, ...], *, wire_bytes: int, folder_bytes: int
-) -> dict[str, float]:
-    """Seconds by cause. Writing goes on beside shooting: only what it lags behind is counted."""
-    n = len(steps)
-    exposure = sum(s.exposure for s in steps)
-    devices = rig_file.devices
-    causes = {"exposure": exposure, "latency": n * LATENCY_S, "settle": 0.0}
-    if devices is not None:
-        causes["settle"] = n * devices.lights.settle_s
-        causes["readout"] = n * devices.cameras.readout_s
-        causes["link"] = n * wire_bytes / devices.cameras.bytes_per_s
-    shooting = sum(causes.values())
-    writing = n * folder_bytes / rig_file.capture.storage_bytes_per_s
-    causes["storage"] = max(0.0, writing - shooting)
-    return causes
 
 
 def _dose(
