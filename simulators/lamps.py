@@ -1,4 +1,4 @@
-"""The lamps of the light bank: what was commanded, and the watchdog over it."""
+"""The lamps of the light bank: what was commanded, the sequence, and the watchdog over both."""
 
 from __future__ import annotations
 
@@ -13,10 +13,19 @@ FULL = 65535
 ALL_ON = 65535
 COILS_WERE_WRITTEN = 65534
 WATCHDOG_MS = (100, 60_000)
+ENTRIES = 4096
+
+
+class NotNow(Exception):
+    """The command is refused while a sequence is armed."""
 
 
 class Lamps:
-    """On/off and level of `count` lamps. Safe to call from several threads.
+    """On/off and level of `count` lamps, and their sequence. Safe to call from several threads.
+
+    While a sequence is armed its entries are lit by `gate`, and the watchdog runs in the dark, too:
+    flashes shorter than its time must not keep it from tripping. Watchdog, interlock and emergency
+    stop leave the sequence.
 
     The watchdog needs no thread of its own: whoever looks at the lamps first puts them off where
     the deadline has passed, so nobody ever sees them lit after it. `clock` is monotonic seconds.
@@ -35,6 +44,11 @@ class Lamps:
         self._watchdog_ms = 2000
         self._fed = clock()
         self._tripped = False
+        self._table = np.zeros((ENTRIES, 2), np.uint16)
+        self._armed = 0
+        self._position = 0
+        self._gate = False
+        self._stuck = np.zeros(count, bool)
         self._cut: Callable[[], tuple[bool, bool]] = lambda: (False, False)
 
     def cut_by(self, safety: Callable[[], tuple[bool, bool]]) -> None:
@@ -48,16 +62,16 @@ class Lamps:
         """Share of full intensity `(count,)` that each lamp gives right now, 0 to 1."""
         with self._lock:
             self._look()
-            return np.where(self._on, self._level / FULL, 0.0)
+            return np.where(self._on | self._stuck, self._level / FULL, 0.0)
 
     def status(self) -> tuple[int, int]:
         """The status bits and the number of lit lamps, as the input registers give them."""
         with self._lock:
             self._look()
             interlock, estop = self._cut()
-            lit = int(np.count_nonzero(self._on & (self._level > 0)))
+            lit = int(np.count_nonzero((self._on | self._stuck) & (self._level > 0)))
             bits = self._tripped | interlock << 1 | estop << 2 | (lit > 0) << 3
-            return int(bits), lit
+            return int(bits | (self._armed > 0) << 4), lit
 
     def coils(self) -> list[bool]:
         """Which lamps are on."""
@@ -76,8 +90,9 @@ class Lamps:
             return self._selector, self._heartbeat, self._watchdog_ms
 
     def switch(self, first: int, on: Sequence[bool]) -> None:
-        """Put lamps on or off from lamp `first`."""
+        """Put lamps on or off from lamp `first`; raises `NotNow`."""
         with self._lock:
+            self._refuse_while_armed()
             wanted = self._on.copy()
             wanted[first : first + len(on)] = on
             self._set(wanted)
@@ -89,16 +104,72 @@ class Lamps:
             self._level[first : first + len(levels)] = levels
 
     def select(self, command: int) -> bool:
-        """The selector's command; False, and nothing happens, where there is no such lamp."""
+        """The selector's command; False, and nothing happens, where there is no such lamp.
+
+        Raises `NotNow`.
+        """
         with self._lock:
-            if command == ALL_ON:
-                self._set(np.ones(self.count, bool))
-            elif command <= self.count:
-                self._set(np.arange(self.count) == command - 1)
-            else:
+            self._refuse_while_armed()
+            if command > self.count and command != ALL_ON:
                 return False
+            self._set(self._chosen(command))
             self._selector = command
             return True
+
+    def load(self, first: int, words: Sequence[int]) -> None:
+        """Write words of the sequence table from word `first`: per entry what to light, level."""
+        with self._lock:
+            self._table.reshape(-1)[first : first + len(words)] = words
+
+    def table(self) -> list[int]:
+        """The words of the sequence table."""
+        with self._lock:
+            return [int(word) for word in self._table.reshape(-1)]
+
+    def arm(self, entries: int) -> bool:
+        """All lamps off; arm that many entries of the table from the first, or leave it with 0.
+
+        False, and nothing happens, where the table has fewer or one names a lamp that is not there.
+        """
+        with self._lock:
+            what = self._table[:entries, 0]
+            if entries > ENTRIES or np.any((what > self.count) & (what != ALL_ON)):
+                return False
+            self._set(np.zeros(self.count, bool))
+            self._selector = 0
+            self._armed = entries
+            if entries:
+                self._position, self._fed = 0, self._clock()
+            return True
+
+    def sequence(self) -> tuple[int, int]:
+        """How many entries are armed, and how often the gate has closed since then."""
+        with self._lock:
+            self._look()
+            return self._armed, self._position
+
+    def gate(self, is_open: bool) -> None:
+        """The wire from the trigger box: entry k is lit while it is open, then k + 1 is next."""
+        with self._lock:
+            self._look()
+            closes = self._gate and not is_open
+            self._gate = is_open
+            if not self._armed:
+                return
+            if closes:
+                self._position += 1
+                self._set(np.zeros(self.count, bool))
+            elif is_open and self._position < self._armed:
+                what, level = (int(word) for word in self._table[self._position])
+                chosen = self._chosen(what)
+                self._level[chosen] = level
+                self._set(chosen)
+
+    def stick(self) -> None:
+        """A fault: the lamps that are lit now cannot be put off any more."""
+        with self._lock:
+            self._look()
+            self._stuck |= self._on
 
     def beat(self, value: int) -> None:
         """A heartbeat: feeds the watchdog and clears its bit; lamps that went off stay off."""
@@ -117,20 +188,28 @@ class Lamps:
             self._watchdog_ms = milliseconds
             return True
 
+    def _refuse_while_armed(self) -> None:
+        self._look()
+        if self._armed:
+            raise NotNow
+
+    def _chosen(self, command: int) -> NDArray[np.bool_]:
+        return (np.arange(self.count) == command - 1) | (command == ALL_ON)
+
     def _set(self, wanted: NDArray[np.bool_]) -> None:
         self._look()
         if any(self._cut()):
             wanted = np.zeros(self.count, bool)
-        if wanted.any() and not self._on.any():
+        if wanted.any() and not self._on.any() and not self._armed:
             # The time without a heartbeat counts only while a lamp is lit.
             self._fed = max(self._fed, self._clock())
         self._on = wanted
 
     def _look(self) -> None:
-        if not self._on.any():
+        if not self._on.any() and not self._armed:
             return
-        if self._clock() - self._fed > self._watchdog_ms / 1000:
+        late = self._clock() - self._fed > self._watchdog_ms / 1000
+        self._tripped |= late
+        if late or any(self._cut()):
             self._on = np.zeros(self.count, bool)
-            self._tripped = True
-        if any(self._cut()):
-            self._on = np.zeros(self.count, bool)
+            self._armed = 0
