@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+SERIAL = ("silent", "garbage", "nak", "late", "noise", "unplug")
+"""What can go wrong on a serial line; see `Fault`."""
 _KINDS = {
     "camera": ("drop", "mute"),
-    "trigger": ("silent", "garbage", "interlock", "estop"),
-    "projectors": ("silent", "garbage"),
+    "trigger": (
+        *SERIAL,
+        *("interlock", "estop", "double", "dropped", "uncounted", "late_trigger"),
+    ),
+    "projectors": (*SERIAL, "blank"),
     "lights": ("hang",),
 }
 
@@ -24,16 +30,26 @@ class Fault:
     """One fault. `pulse` is the trigger box's count from which, or at which, it shows.
 
     camera drop: no frame of `camera` for that pulse, once. camera mute: `camera` answers nothing
-    from that pulse on. trigger silent or garbage: that pulse fires, its reply is lost or broken,
-    once. trigger interlock or estop: open or pressed after that pulse, for good. projectors silent
-    or garbage: the first reply after that pulse is lost or broken, once. lights hang: the bank
-    answers nothing after that pulse, and its watchdog goes on.
+    from that pulse on. trigger interlock or estop: open or pressed after that pulse, for good.
+    trigger double: fires twice, counts once; dropped: counts, does not fire; uncounted: fires, does
+    not count; late_trigger: fires `seconds` late. projectors blank: after that pulse no pattern
+    comes up any more, for good. lights hang: the bank answers nothing after that pulse, and its
+    watchdog goes on.
+
+    Serial faults strike once, at the first request from that pulse on that begins with `request`;
+    without it any of the projectors, and PULSE of the trigger box. silent: carried out, not
+    answered. garbage: carried out, the reply is broken. nak: not carried out, answered with an
+    error. late: carried out, answered `seconds` later. noise: carried out, a line of garbage comes
+    before the reply. unplug: the port goes away before it is carried out, and comes back
+    after `seconds`.
     """
 
     device: str
     kind: str
     pulse: int
     camera: str | None = None
+    request: str | None = None
+    seconds: float = 1.5
 
     def __post_init__(self) -> None:
         if self.device not in _KINDS or self.kind not in _KINDS[self.device]:
@@ -43,6 +59,10 @@ class Fault:
             raise FaultError(f"pulse must be a whole number >= 0, got {self.pulse!r}")
         if (self.device == "camera") != (self.camera is not None):
             raise FaultError(f"the field camera belongs to camera faults: {asdict(self)}")
+        if self.request is not None and self.kind not in SERIAL:
+            raise FaultError(f"the field request belongs to serial faults: {asdict(self)}")
+        if not isinstance(self.seconds, int | float) or not 0 < self.seconds <= 60:
+            raise FaultError(f"seconds must be over 0 and at most 60, got {self.seconds!r}")
 
 
 class Faults:
@@ -69,7 +89,10 @@ class Faults:
                 not isinstance(entry, dict)
                 or not {"device", "kind", "pulse"} <= set(entry) <= known
             ):
-                raise FaultError(f"{where}: expected device, kind, pulse[, camera], got {entry}")
+                optional = ", ".join(sorted(known - {"device", "kind", "pulse"}))
+                raise FaultError(
+                    f"{where}: expected device, kind, pulse[, {optional}], got {entry}"
+                )
             try:
                 fault = Fault(**entry)
             except FaultError as error:
@@ -81,14 +104,35 @@ class Faults:
 
     def once(self, device: str, kind: str, pulse: int, camera: str | None = None) -> bool:
         """Whether this fault shows at exactly `pulse`; it is then used up."""
+        return self.at(device, kind, pulse, camera) is not None
+
+    def at(self, device: str, kind: str, pulse: int, camera: str | None = None) -> Fault | None:
+        """The fault that shows at exactly `pulse`, which is then used up."""
+        wanted = (device, kind, pulse, camera)
+        return self._use(lambda f: (f.device, f.kind, f.pulse, f.camera) == wanted)
+
+    def on_request(self, device: str, request: str, pulse: int) -> Fault | None:
+        """The serial fault that strikes at this request, which is then used up."""
+        any_request = {"trigger": "PULSE"}.get(device, "")
+
+        def strikes(fault: Fault) -> bool:
+            word = any_request if fault.request is None else fault.request
+            return (
+                fault.device == device
+                and fault.kind in SERIAL
+                and fault.pulse <= pulse
+                and request.startswith(word)
+            )
+
+        return self._use(strikes)
+
+    def _use(self, strikes: Callable[[Fault], bool]) -> Fault | None:
         with self._lock:
             for fault in self._left:
-                if (fault.device, fault.kind, fault.camera) == (device, kind, camera) and (
-                    fault.pulse == pulse
-                ):
+                if strikes(fault):
                     self._left.remove(fault)
-                    return True
-        return False
+                    return fault
+        return None
 
     def since(self, device: str, kind: str, pulse: int, camera: str | None = None) -> bool:
         """Whether this fault has begun by `pulse`; it stays."""
