@@ -166,8 +166,7 @@ def _compared(
     seed: int,
 ) -> list[_Compared]:
     """The frames of one camera under the lights `names`, by every method."""
-    steps = {s.light: s for s in capture.of_kind("olat")}
-    names = [n for n in names if capture.has(steps[n], camera)]
+    names = [n for n in names if capture.has_light(n, camera)]
     if not names or not mask.any():
         return []
     lights = [capture.rig.light(n) for n in names]
@@ -178,7 +177,7 @@ def _compared(
     )
     out = []
     for i, name in enumerate(names):
-        captured = capture.response(steps[name], camera)
+        captured = capture.light(name, camera)[0]
         near = three_nearest(capture, camera, capture.rig.light(name), held_out)
         frames = {
             "captured": captured,
@@ -197,11 +196,10 @@ def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut
     Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
     distance to what `light` would give. `light` itself is never among the three.
     """
-    steps = {s.light: s for s in capture.of_kind("olat")}
     others = [
         capture.rig.light(n)
         for n in held_out.training_lights(capture)
-        if n != light.name and capture.has(steps[n], camera)
+        if n != light.name and capture.has_light(n, camera)
     ]
     positions = np.array([o.position for o in others])
     distance = np.linalg.norm(positions, axis=1)
@@ -215,7 +213,7 @@ def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut
     for k, weight in zip(nearest, weights, strict=True):
         gain = light.intensity / np.maximum(others[k].intensity, 1e-12)
         gain *= (distance[k] / own) ** 2
-        total = total + weight * gain * capture.response(steps[others[k].name], camera)
+        total = total + weight * gain * capture.light(others[k].name, camera)[0]
     return np.asarray(total)
 
 

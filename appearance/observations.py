@@ -75,13 +75,12 @@ def observe(
     capture: Capture, camera: str, lights: Sequence[str], pixels: NDArray[np.int64]
 ) -> Observed:
     """Read the frames of `camera` under each of `lights` and keep `pixels (P,)` of them."""
-    steps = {s.light: s for s in capture.of_kind("olat")}
     radiance = np.zeros((len(lights), len(pixels), 3), np.float32)
     valid = np.zeros((len(lights), len(pixels)), bool)
     for i, name in enumerate(lights):
-        if name not in steps or not capture.has(steps[name], camera):
+        if not capture.has_light(name, camera):
             continue
-        image, saturated = capture.response_and_saturated(steps[name], camera)
+        image, saturated = capture.light(name, camera)
         radiance[i] = image.reshape(-1, 3)[pixels]
         valid[i] = ~saturated.ravel()[pixels]
     return Observed(

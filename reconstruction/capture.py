@@ -155,6 +155,47 @@ class Capture:
         saturated = np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))
         return (image if step.level in (0, 1) else image / np.float32(step.level)), saturated
 
+    def count_scale(self, step: Step, camera: str) -> float:
+        """Radiance of one count of the sensor in this frame; 0 where it was not quantised."""
+        return float(self._read(step, camera)[1].get("countScale", 0.0))
+
+    def has_light(self, light: str, camera: str) -> bool:
+        """Whether a frame of this light alone was written, at any exposure."""
+        return any(self.has(s, camera) for s in self._of_light.get(light, ()))
+
+    def light(self, light: str, camera: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Response `(H, W, 3)` to one light alone, and where `(H, W)` it is saturated.
+
+        Where the light was shot with several exposures, their mean with the weight of exposure
+        (the photons counted), without saturated pixels; saturated is what even the shortest
+        exposure saturates. Raises `MissingFrame` where none of them came.
+        """
+        steps = self._of_light.get(light)
+        if steps is None:
+            raise MissingFrame(f"{self.path}: the plan has no frame for the light {light!r}")
+        steps = [s for s in steps if self.has(s, camera)] or steps[:1]
+        if len(steps) == 1:
+            return self.response_and_saturated(steps[0], camera)
+        total = np.zeros((*self._shape(camera), 3), np.float32)
+        weight = np.zeros(self._shape(camera), np.float32)
+        by_exposure = sorted(steps, key=lambda s: s.exposure)
+        shortest, clipped = self.response_and_saturated(by_exposure[0], camera)
+        for step in by_exposure:
+            image, saturated = self.response_and_saturated(step, camera)
+            used = np.float32(step.exposure) * ~saturated
+            total += used[..., None] * image
+            weight += used
+        merged = total / np.maximum(weight, np.finfo(np.float32).tiny)[..., None]
+        return np.where(weight[..., None] > 0, merged, shortest), clipped
+
+    @cached_property
+    def _of_light(self) -> dict[str, list[Step]]:
+        out: dict[str, list[Step]] = {}
+        for step in self.of_kind("olat"):
+            assert step.light is not None
+            out.setdefault(step.light, []).append(step)
+        return out
+
     def _read(self, step: Step, camera: str) -> tuple[NDArray[np.float32], dict[str, float | str]]:
         record = self.records.get((step.index, camera))
         if record is None or record.file is None:
@@ -171,22 +212,18 @@ class Capture:
 
         Raises `MissingFrame` when one of them was not shot.
         """
-        steps = {s.light: s for s in self.of_kind("olat")}
-        names = (
-            lights if lights is not None else [n.name for n in self.rig.lights if n.name in steps]
-        )
-        absent = [n for n in names if n not in steps]
+        names = self.olat_lights() if lights is None else lights
+        absent = [n for n in names if n not in self._of_light]
         if absent:
             raise MissingFrame(f"{self.path}: the plan has no frame for the lights {absent[:5]}")
         out = np.empty((len(names), *self._shape(camera), 3), np.float32)
         for i, name in enumerate(names):
-            out[i] = self.response(steps[name], camera)
+            out[i] = self.light(name, camera)[0]
         return out
 
     def olat_lights(self) -> list[str]:
         """Names of the lights that were shot one at a time, in rig order."""
-        shot = {s.light for s in self.of_kind("olat")}
-        return [light.name for light in self.rig.lights if light.name in shot]
+        return [light.name for light in self.rig.lights if light.name in self._of_light]
 
     def mask(self, camera: str) -> NDArray[np.bool_] | None:
         """The user's hair mask `(H, W)` (half grey and above), or None when there is none."""

@@ -192,8 +192,7 @@ def light_contrast(
     open, up to 2 with half of the lamps in its own shadow; fibres mirror few and reach 3 to 7.
     Smoothed over 3×3 pixels. None where under eight lamps were shot.
     """
-    shot = {s.light for s in capture.of_kind("olat") if capture.has(s, camera)}
-    names = [n for n in capture.olat_lights() if n in shot]
+    names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
     if len(names) < 8:
         return None
     names = names[:: max(1, len(names) // lights)]

@@ -96,3 +96,38 @@ def test_a_broken_line_inside_the_journal_is_an_error(capture):
     journal.write_text("\n".join([lines[0], "{torn", *lines[2:]]) + "\n")
     with pytest.raises(CaptureError, match=r"journal.jsonl, line 2"):
         Capture(capture.path)
+
+
+def test_brackets_of_a_light_are_merged_without_what_is_saturated(tmp_path):
+    exposures = (0.02, 0.002, 0.08)
+    steps = [Step(i, "olat", t, 0.5, light="light_2") for i, t in enumerate(exposures)]
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": steps})
+    # Left to right: in range of all, saturated in the longest, in all but the shortest, in all.
+    true = np.array([1.0, 5.0, 20.0, 200.0])
+    for step in steps:
+        full = 2.0 * 0.08 / step.exposure
+        seen = np.minimum(true + step.exposure, full)
+        image = np.broadcast_to(np.repeat(seen, 2)[None, :, None], (6, 8, 3))
+        writer.write_frame(step, "cam_0", image.astype(np.float32), full_scale=full)
+    writer.close()
+    response, saturated = Capture(tmp_path / "c").light("light_2", "cam_0")
+    seen = [
+        (1 + np.average(exposures, weights=exposures)),
+        (5 + np.average(exposures[:2], weights=exposures[:2])),
+        20.002,
+        80.0,
+    ]
+    np.testing.assert_allclose(response[0, ::2, 0], 2 * np.array(seen), rtol=1e-5)
+    np.testing.assert_array_equal(saturated[0, ::2], [False, False, False, True])
+
+
+def test_a_lost_bracket_leaves_the_others(tmp_path):
+    steps = [Step(i, "olat", t, light="light_2") for i, t in enumerate((0.01, 0.02))]
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": steps})
+    writer.write_frame(steps[1], "cam_0", np.full((6, 8, 3), 3, np.float32))
+    writer.record_missing(steps[0], "cam_0", reason="mute")
+    writer.close()
+    capture = Capture(tmp_path / "c")
+    assert capture.has_light("light_2", "cam_0")
+    np.testing.assert_array_equal(capture.light("light_2", "cam_0")[0], 3)
+    assert not capture.has_light("light_0", "cam_0")
