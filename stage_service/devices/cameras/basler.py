@@ -1,0 +1,426 @@
+"""A Basler camera through pylon, triggered by wire; see `docs/wire.md`.
+
+What a camera can do is asked of its node map, not of its model's name.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator
+
+from reconstruction.cameras import Camera as CameraGeometry
+from stage_service.config import Seconds, Strict
+from stage_service.devices.cameras import pixel_formats
+from stage_service.devices.cameras.block_counter import BlockCounter
+from stage_service.devices.cameras.genicam_nodes import Nodes
+from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
+from stage_service.devices.errors import (
+    Cancelled,
+    DeviceError,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
+
+SLICE_S = 0.05
+"""How long a wait for a frame does not look at `cancel`."""
+BLOCK_WRAP = (1 << 63) - 1
+"""Block ids are handed on unwrapped."""
+EXPOSURE_TOLERANCE = 0.01
+"""Cameras round exposures to their line time; beyond this they cannot expose as asked."""
+EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
+"""Microseconds; the second on cameras older than SFNC 2."""
+QUIET: tuple[tuple[str, str | float | bool], ...] = (
+    ("AcquisitionMode", "Continuous"),
+    ("AcquisitionFrameRateEnable", False),
+    ("ExposureAuto", "Off"),
+    ("ExposureMode", "Timed"),
+    ("GainAuto", "Off"),
+    ("BalanceWhiteAuto", "Off"),
+    ("Gamma", 1.0),
+)
+"""What would otherwise pace the camera by itself or bend its response; not every model has all."""
+CHUNKS = ("ExposureTime", "Framecounter", "FrameID", "FrameTriggerIgnoredCounter")
+"""Asked for with every frame, where the camera offers them."""
+STATISTICS = tuple(
+    f"Statistic_{name}_Count"
+    for name in (
+        "Total_Buffer",
+        "Failed_Buffer",
+        "Buffer_Underrun",
+        "Missed_Frame",
+        "Failed_Packet",
+        "Resend_Request",
+    )
+)
+OURS = {
+    *(name for name, _ in QUIET),
+    *EXPOSURES,
+    *("PixelFormat", "ChunkModeActive", "ChunkSelector", "ChunkEnable"),
+    *("TriggerSelector", "TriggerMode", "TriggerSource", "TriggerActivation", "TriggerOverlap"),
+    *("TriggerDelay", "TriggerDelayAbs", "LineSelector", "LineMode"),
+}
+"""Nodes that the driver sets: not for `features`."""
+
+
+class BaslerConfig(Strict):
+    """`[devices.cameras]`: Basler cameras, found by serial number.
+
+    `serials` maps each camera of the rig file to its number. `gain` is counts per
+    (W/(sr m²) · s) and `black` counts: calibrated, the camera knows neither. `features` are written
+    to the camera in their order after its default settings are loaded: region of interest, analog
+    gain, black level, packet size. `timeout_s` bounds arming; a frame may come `frame_s` later than
+    its exposure takes. `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are
+    for predictions. `buffers` is how many frames are held unread.
+    """
+
+    kind: Literal["basler"]
+    serials: dict[str, Annotated[str, Field(min_length=1)]]
+    gain: float = Field(gt=0.0)
+    black: float = Field(default=0.0, ge=0.0)
+    pixel_format: str = Field(
+        default="BayerRG12", pattern="^(Mono|Bayer(RG|GR|GB|BG))(8|10|12|16)$"
+    )
+    trigger_line: str = Field(default="Line1", pattern=r"^Line\d+$")
+    features: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    timeout_s: Seconds = 2.0
+    frame_s: Seconds = 0.5
+    readout_s: float = Field(default=0.02, ge=0.0)
+    bytes_per_s: float = Field(default=100e6, gt=0.0)
+    buffers: int = Field(default=16, ge=1)
+
+    @field_validator("serials")
+    @classmethod
+    def _one_camera_each(cls, serials: dict[str, str]) -> dict[str, str]:
+        if len(set(serials.values())) < len(serials):
+            raise ValueError("two cameras have the same serial number")
+        return serials
+
+
+class BaslerCamera:
+    """Implements `Camera` on pylon; see there for the contract.
+
+    `capabilities.timestamps` is known after `connect`.
+    """
+
+    def __init__(self, config: BaslerConfig, geometry: CameraGeometry) -> None:
+        self.name = geometry.name
+        self.serial = config.serials.get(geometry.name)
+        self.device = f"camera {geometry.name} (Basler {self.serial})"
+        self.config = config
+        self.geometry = geometry
+        self.capabilities = CameraCapabilities(config.buffers, True, False, BLOCK_WRAP)
+        self._info: CameraInfo | None = None
+        self._pylon: Any = None
+        self._genicam: Any = None
+        self._camera: Any = None
+        self._blocks = BlockCounter(1, BLOCK_WRAP)
+        self._ticks_per_s = 0.0
+        self._exposure: float | None = None
+        self._counters: dict[str, int] = {}
+
+    @property
+    def info(self) -> CameraInfo:
+        """Size from the camera, `gain` and `black` from the rig file."""
+        if self._info is None:
+            raise RuntimeError(f"{self.device}: not connected")
+        return self._info
+
+    def connect(self) -> None:
+        """Find the camera by its serial number and set it up for triggers on its line.
+
+        Raises `DeviceError` where it lacks a setting or has another size than the rig file's.
+        """
+        self.close()
+        self._pylon, self._genicam = _pypylon(self.device)
+        with self._told("connecting"):
+            factory = self._pylon.TlFactory.GetInstance()
+            there = {d.GetSerialNumber(): d for d in factory.EnumerateDevices()}
+            if self.serial not in there:
+                raise DeviceUnreachable(
+                    self.device,
+                    "connecting",
+                    expected=f"a camera with serial number {self.serial}",
+                    received=", ".join(sorted(there)) or "no camera at all",
+                    todo="Check power, cable and serials in [devices.cameras].",
+                )
+            self._camera = self._pylon.InstantCamera(factory.CreateDevice(there[self.serial]))
+            self._camera.Open()
+        try:
+            self._set_up()
+        except DeviceError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Stop and let go of the camera."""
+        if self._camera is not None:
+            self._camera.Close()
+        self._camera = None
+        self._exposure = None
+
+    def arm(self, exposure: float) -> None:
+        """Answer the next pulses with `exposure` seconds; returns when the camera waits for them.
+
+        Frames not read are dropped, but counted in the block ids.
+        """
+        doing = f"arming for {exposure:g} s"
+        with self._told(doing):
+            camera = self._open(doing)
+            self._stop(camera)
+            nodes = self._nodes()
+            name = next(n for n in EXPOSURES if nodes.has(n))
+            nodes.write(name, exposure * 1e6)
+            actual = (nodes.number(name) or 0.0) * 1e-6
+            self._check_exposure(actual, exposure, doing)
+            camera.StartGrabbing(self._pylon.GrabStrategy_OneByOne)
+            self._blocks.restart()
+            self._counters = {}
+            # Pulses before the camera waits for them are ignored, and leave no gap in its ids.
+            ready = not camera.CanWaitForFrameTriggerReady() or camera.WaitForFrameTriggerReady(
+                round(self.config.timeout_s * 1e3), self._pylon.TimeoutHandling_Return
+            )
+        if not ready:
+            raise DeviceTimeout(
+                self.device,
+                doing,
+                expected="the camera waiting for a trigger",
+                received="a camera that is busy",
+                deadline_s=self.config.timeout_s,
+                todo="Check that nothing else triggers it, or raise timeout_s.",
+            )
+        self._exposure = actual
+
+    def disarm(self) -> None:
+        """Answer no more pulses; frames not read are dropped."""
+        with self._told("disarming"):
+            self._stop(self._open("disarming"))
+
+    def read(self, cancel: threading.Event) -> Frame | None:
+        """The oldest frame not read, or None: none within its exposure and `frame_s`, or one that
+        was damaged on its way."""
+        doing = "reading a frame"
+        with self._told(doing):
+            camera = self._open(doing)
+            if self._exposure is None:
+                return None
+            deadline = time.monotonic() + self._exposure + self.config.frame_s
+            while True:
+                left = deadline - time.monotonic()
+                result = self._retrieve(camera, min(max(left, 0.0), SLICE_S))
+                if result.IsValid():
+                    with result:
+                        return self._frame(result, self._exposure, doing)
+                if camera.IsCameraDeviceRemoved():
+                    raise self._gone(doing)
+                if left <= 0:
+                    return None
+                if cancel.is_set():
+                    raise Cancelled(f"{self.device}: {doing} was given up")
+
+    def statistics(self) -> dict[str, int]:
+        """Buffers, failures and losses since arming, as far as camera and link count them.
+
+        `FrameTriggerIgnoredCounter` counts pulses that came too early: those leave no gap in the
+        block ids.
+        """
+        with self._told("reading statistics"):
+            camera = self._open("reading statistics")
+            nodes = Nodes(self.device, camera.GetStreamGrabberNodeMap(), self._genicam)
+            counts = {name: nodes.number(name) for name in STATISTICS}
+        return {k: int(v) for k, v in counts.items() if v is not None} | self._counters
+
+    def _set_up(self) -> None:
+        doing = "setting up"
+        if ours := sorted(OURS & self.config.features.keys()):
+            raise self._error(
+                doing,
+                "features that the driver does not set itself",
+                ", ".join(ours),
+                "Take them out of [devices.cameras.features].",
+            )
+        with self._told(doing):
+            camera, nodes, config = self._open(doing), self._nodes(), self.config
+            nodes.write_if_there("UserSetSelector", "Default")
+            nodes.execute_if_there("UserSetLoad")
+            nodes.write("PixelFormat", config.pixel_format)
+            for name, value in config.features.items():
+                nodes.write(name, value)
+            for name, value in QUIET:
+                nodes.write_if_there(name, value)
+            self._set_trigger(nodes)
+            self._set_chunks(nodes)
+            camera.MaxNumBuffer.Value = config.buffers
+            self._blocks = BlockCounter(*_block_ids(camera, nodes))
+            self._ticks_per_s = _ticks_per_s(nodes)
+            size = (nodes.number("Width"), nodes.number("Height"))
+        expected = (self.geometry.width, self.geometry.height)
+        if size != expected:
+            raise self._error(
+                doing,
+                f"{expected[0]}x{expected[1]} pixels as in the rig file",
+                f"{size[0]}x{size[1]}",
+                "Set OffsetX, OffsetY, Width and Height in [devices.cameras.features], or "
+                "calibrate the rig for this size.",
+            )
+        self.capabilities = replace(self.capabilities, timestamps=self._ticks_per_s > 0)
+        full_scale = pixel_formats.full_scale(config.pixel_format)
+        self._info = CameraInfo(*expected, full_scale, config.black, config.gain)
+
+    def _set_trigger(self, nodes: Nodes) -> None:
+        line = self.config.trigger_line
+        for selector in nodes.symbols("TriggerSelector"):
+            nodes.write("TriggerSelector", selector)
+            nodes.write_if_there("TriggerMode", "Off")
+        nodes.write_if_there("LineSelector", line)
+        nodes.write_if_there("LineMode", "Input")
+        nodes.write("TriggerSelector", "FrameStart")
+        nodes.write("TriggerSource", line)
+        nodes.write("TriggerActivation", "RisingEdge")
+        nodes.write_if_there("TriggerDelay", 0.0)
+        nodes.write_if_there("TriggerDelayAbs", 0.0)
+        nodes.write_if_there("TriggerOverlap", "ReadOut")
+        nodes.write("TriggerMode", "On")
+
+    def _set_chunks(self, nodes: Nodes) -> None:
+        offered = [chunk for chunk in CHUNKS if chunk in nodes.symbols("ChunkSelector")]
+        nodes.write_if_there("ChunkModeActive", bool(offered))
+        for chunk in offered:
+            nodes.write("ChunkSelector", chunk)
+            nodes.write("ChunkEnable", True)
+
+    def _stop(self, camera: Any) -> None:
+        self._exposure = None
+        while camera.IsGrabbing() and (result := self._retrieve(camera, 0.0)).IsValid():
+            with result:
+                self._blocks.take(result.GetBlockID())
+        camera.StopGrabbing()
+
+    def _retrieve(self, camera: Any, seconds: float) -> Any:
+        milliseconds = round(seconds * 1e3)
+        return camera.RetrieveResult(milliseconds, self._pylon.TimeoutHandling_Return)
+
+    def _frame(self, result: Any, exposure: float, doing: str) -> Frame | None:
+        block_id = self._blocks.take(result.GetBlockID())
+        if not result.GrabSucceeded():
+            return None  # pylon counts it in Statistic_Failed_Buffer_Count
+        if block_id is None:
+            raise self._error(
+                doing,
+                f"a block id from {self._blocks.first}",
+                f"{result.GetBlockID()}",
+                "The camera does not number its frames: losses would go unseen.",
+            )
+        info, pixel_format = self.info, self.config.pixel_format
+        kind = getattr(self._pylon, f"PixelType_{pixel_format}")
+        size = (result.GetWidth(), result.GetHeight())
+        if (*size, result.GetPixelType()) != (info.width, info.height, kind):
+            raise self._error(
+                doing,
+                f"{info.width}x{info.height} pixels, type {kind:#x} ({pixel_format})",
+                f"{size[0]}x{size[1]}, type {result.GetPixelType():#x}",
+                "Another program changed the camera's settings: close it and start again.",
+            )
+        chunks = Nodes(self.device, result.GetChunkDataNodeMap(), self._genicam)
+        values = {chunk: chunks.number(f"Chunk{chunk}") for chunk in CHUNKS}
+        if (told := values.pop("ExposureTime")) is not None:
+            self._check_exposure(told * 1e-6, exposure, doing)
+        self._counters = {k: int(v) for k, v in values.items() if v is not None}
+        ticks = result.GetTimeStamp()
+        timestamp = ticks / self._ticks_per_s if self._ticks_per_s else 0.0
+        counts = pixel_formats.rgb(result.GetArray(), pixel_format)
+        return Frame(counts, block_id, timestamp, exposure)
+
+    def _check_exposure(self, actual: float, asked: float, doing: str) -> None:
+        if abs(actual - asked) > EXPOSURE_TOLERANCE * asked:
+            raise self._error(
+                doing,
+                f"an exposure of {asked:g} s",
+                f"{actual:g} s",
+                "The camera cannot expose so: choose an exposure that it has.",
+            )
+
+    def _nodes(self) -> Nodes:
+        return Nodes(self.device, self._camera.GetNodeMap(), self._genicam)
+
+    def _open(self, doing: str) -> Any:
+        if self._camera is None:
+            raise DeviceUnreachable(
+                self.device,
+                doing,
+                expected="an open camera",
+                received="a closed one",
+                todo="Connect again; what the camera held is lost.",
+            )
+        return self._camera
+
+    @contextmanager
+    def _told(self, doing: str) -> Iterator[None]:
+        """What pylon raises, as a `DeviceError`."""
+        try:
+            yield
+        except self._generic_exception() as error:
+            if self._camera is not None and self._camera.IsCameraDeviceRemoved():
+                raise self._gone(doing) from error
+            raise self._error(
+                doing,
+                "pylon to carry it out",
+                str(error),
+                "Check power and cable, and that no other program holds the camera.",
+            ) from error
+
+    def _generic_exception(self) -> type[Exception] | tuple[()]:
+        return () if self._genicam is None else self._genicam.GenericException
+
+    def _gone(self, doing: str) -> DeviceUnreachable:
+        self.close()
+        return DeviceUnreachable(
+            self.device,
+            doing,
+            expected="the camera",
+            received="a camera that was unplugged or lost power",
+            todo="Check power and cable, and start again.",
+        )
+
+    def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
+        return DeviceError(self.device, doing, expected=expected, received=received, todo=todo)
+
+
+def _pypylon(device: str) -> tuple[Any, Any]:
+    """The modules `pylon` and `genicam`, loaded when the first camera is connected."""
+    try:
+        with warnings.catch_warnings():
+            # Its generated types warn while they are made; made an error, that ends the process.
+            warnings.simplefilter("ignore")
+            from pypylon import genicam, pylon
+    except ImportError as error:
+        raise DeviceUnreachable(
+            device,
+            "connecting",
+            expected="the library pypylon",
+            received=str(error),
+            todo="Install it: pip install 'hairstage[basler]'.",
+        ) from error
+    return pylon, genicam
+
+
+def _block_ids(camera: Any, nodes: Nodes) -> tuple[int, int]:
+    """First and last block id: GigE Vision counts from 1 in 16 bits unless told otherwise."""
+    if not camera.IsGigE():
+        return 0, BLOCK_WRAP
+    extended = {nodes.text(f"{by}GevGVSPExtendedIDMode") for by in ("", "Bsl")}
+    return 1, BLOCK_WRAP if "On" in extended else 65535
+
+
+def _ticks_per_s(nodes: Nodes) -> float:
+    """The rate of the camera's clock; nanoseconds by SFNC 2, 0 for a camera without one."""
+    frequency = nodes.number("GevTimestampTickFrequency")
+    if frequency is None:
+        return 1e9 if nodes.has("TimestampLatch") else 0.0
+    return float(frequency)
