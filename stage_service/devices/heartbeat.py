@@ -1,29 +1,40 @@
-"""Feeding the light bank's watchdog while lamps may be lit."""
+"""Feeding the watchdogs of light bank and projectors while something may be lit."""
 
 from __future__ import annotations
 
 import threading
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
-from stage_service.devices.lights.interface import LightBank
+
+class Fed(Protocol):
+    """A device with a watchdog."""
+
+    name: str
+
+    def heartbeat(self) -> None:
+        """Tell the watchdog that somebody is there."""
+        ...
 
 
 class Heartbeat:
-    """A context in which the bank gets a heartbeat every `interval_s` seconds.
+    """A context in which the device gets a heartbeat every `interval_s` seconds.
 
-    One failed beat is tried again at the next; `check` raises it as long as the newest failed.
+    One failed beat is tried again at the next; `check` raises it as long as the newest failed. Each
+    device needs its own: one that does not answer must not keep the others waiting.
     """
 
-    def __init__(self, bank: LightBank, interval_s: float) -> None:
-        self._bank = bank
+    def __init__(self, device: Fed, interval_s: float) -> None:
+        self._device = device
         self._interval = interval_s
         self._stop = threading.Event()
         self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name=f"heartbeat of {device.name}", daemon=True
+        )
 
     def __enter__(self) -> Self:
-        self._bank.heartbeat()
+        self._device.heartbeat()
         self._thread.start()
         return self
 
@@ -44,7 +55,7 @@ class Heartbeat:
     def _run(self) -> None:
         while not self._stop.wait(self._interval):
             try:
-                self._bank.heartbeat()
+                self._device.heartbeat()
                 self._error = None
             except Exception as error:  # whatever it is, the thread goes on and `check` tells
                 self._error = error

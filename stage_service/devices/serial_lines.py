@@ -18,13 +18,15 @@ from stage_service.devices.errors import (
 
 LONGEST_LINE = 4096
 REFUSED_BY_SAFETY = 3
+WATCHDOG_S = (0.1, 60.0)
 
 
 class SerialLines:
     """One request at a time, each with a deadline; safe to call from several threads.
 
-    After a missed deadline the port is closed; the next request opens it, drains what came late
-    and reads on until the device has identified itself, so no late reply answers a later request.
+    After a missed deadline or a broken reply the port is closed; the next request opens it, drains
+    what came late and reads on until the device has identified itself, so no late reply answers a
+    later request.
     """
 
     def __init__(self, name: str, config: SerialConfig, identity: re.Pattern[str]) -> None:
@@ -52,6 +54,7 @@ class SerialLines:
                     "opening the serial port",
                     expected="a free serial port",
                     received=str(error),
+                    deadline_s=self.config.timeout_s,
                     todo="Check the cable, the path in the rig file and who else has it open.",
                 ) from error
             self._port = port
@@ -74,17 +77,23 @@ class SerialLines:
             if self._port is None:
                 self.connect()
             self._send(request, doing)
-            line = self._line(time.monotonic() + self.config.timeout_s, doing)
-        match = re.fullmatch(reply, line)
-        if match is not None:
-            return match
-        error = re.fullmatch(r"ERR (\d+) ?(.*)", line)
+            deadline = time.monotonic() + self.config.timeout_s
+            line = self._line(deadline, doing)
+            while self._identity.fullmatch(line):  # came late, after its deadline
+                line = self._line(deadline, doing)
+            match = re.fullmatch(reply, line)
+            if match is not None:
+                return match
+            error = re.fullmatch(r"ERR (\d+) ?(.*)", line)
+            if error is None:
+                self.close()  # the true reply may still be on its way
         if error is not None and int(error[1]) == REFUSED_BY_SAFETY:
             raise SafetyRefusal(
                 self.name,
                 doing,
                 expected=f"an answer to {request!r}",
                 received=f"a refusal: {error[2] or line}",
+                deadline_s=self.config.timeout_s,
                 todo="Close the interlock and release the emergency stop at the stage.",
             )
         raise DeviceError(
@@ -92,11 +101,13 @@ class SerialLines:
             doing,
             expected=f"an answer to {request!r} like {reply!r}",
             received=repr(line),
+            deadline_s=self.config.timeout_s,
             todo="Check that the device follows docs/wire.md and that nobody else uses the port.",
         )
 
     def _identify(self) -> re.Match[str]:
-        self._send("ID?", "identifying")
+        # "?" ends what a device may hold of a request that was cut off; the two make no request.
+        self._send("?\nID?", "identifying")
         deadline = time.monotonic() + self.config.timeout_s
         seen: list[str] = []
         while True:
@@ -157,5 +168,14 @@ class SerialLines:
             doing,
             expected="an open serial port",
             received=str(error),
+            deadline_s=self.config.timeout_s,
             todo="The device was unplugged or its port closed: plug it in and start again.",
         )
+
+
+def milliseconds(device: str, watchdog_s: float) -> int:
+    """A watchdog time for the wire; raises `ValueError` beyond what devices take."""
+    low, high = WATCHDOG_S
+    if not low <= watchdog_s <= high:
+        raise ValueError(f"{device}: a watchdog time is {low:g} to {high:g} s, got {watchdog_s}")
+    return round(watchdog_s * 1000)

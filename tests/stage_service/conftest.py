@@ -175,6 +175,8 @@ def projectors(world: World, line: str) -> str:
         return "HAIRSTAGE-PROJECTORS left,right"
     if line == "SHOW?":
         return f"SHOW {world.show}"
+    if line.split()[0] not in ("LINE", "ON", "OFF"):
+        return "ERR 1 unknown command"
     if line.startswith("LINE") and line.split()[1] not in ("left", "right"):
         return "ERR 2 unknown projector"
     world.show = line

@@ -131,7 +131,7 @@ def test_a_late_serial_reply_never_answers_the_next_request(stage, world):
         stage.trigger.count()
     status = stage.trigger.status()
     assert not status.estop_pressed
-    assert world.requests[-3:] == ["COUNT?", "ID?", "STATUS?"]
+    assert world.requests[-4:] == ["COUNT?", "?", "ID?", "STATUS?"]
 
 
 @pytest.mark.parametrize("garbage", [b"\xff\x00", b"noise\n"])
@@ -140,6 +140,7 @@ def test_garbage_on_the_serial_line_is_shown(stage, world, garbage):
     with pytest.raises(DeviceError, match="reading the pulse count") as error:
         stage.trigger.count()
     assert repr(garbage.decode("ascii", "backslashreplace").strip())[1:-1] in str(error.value)
+    assert not stage.trigger.status().estop_pressed  # the count came after it, and is not taken
 
 
 def test_serial_ports_that_are_not_there_or_another_device(rig_file, world):

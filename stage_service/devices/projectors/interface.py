@@ -9,10 +9,20 @@ from typing import Protocol
 
 @dataclass(frozen=True)
 class ProjectorCapabilities:
-    """`reads_back`: a blackout can be verified. `sequences`: it steps with the trigger box."""
+    """What link and device can do.
+
+    `reads_back`: a blackout can be verified. `dead_man`: the projectors go dark by themselves when
+    nobody asks. `table`: entries of its sequence, which steps with the trigger box; 0: no sequence.
+    """
 
     reads_back: bool
-    sequences: bool
+    dead_man: bool
+    table: int
+
+    @property
+    def sequences(self) -> bool:
+        """Whether it steps with the trigger box."""
+        return self.table > 0
 
 
 @dataclass(frozen=True)
@@ -25,10 +35,14 @@ class Pattern:
 
 
 class ProjectorController(Protocol):
-    """Shows scanlines. Every call raises `DeviceError`."""
+    """Shows scanlines. Safe to call from several threads.
+
+    Every call raises `DeviceError`; what the capabilities exclude raises it, too.
+    """
 
     name: str
     capabilities: ProjectorCapabilities
+    """Known after `connect`; nothing is promised before."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -64,5 +78,14 @@ class ProjectorController(Protocol):
         ...
 
     def position(self) -> int:
-        """How many patterns of the armed sequence are over."""
+        """How many patterns of the armed sequence are over. Raises when none is armed any more:
+        a command left it, or the watchdog did."""
+        ...
+
+    def set_watchdog(self, seconds: float) -> None:
+        """Set after how long without a request the projectors go dark and leave a sequence."""
+        ...
+
+    def heartbeat(self) -> None:
+        """Tell the watchdog that somebody is there."""
         ...

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Sequence
 
 from stage_service.config import SerialConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities
-from stage_service.devices.serial_lines import SerialLines
+from stage_service.devices.serial_lines import SerialLines, milliseconds
 
 FULL_LEVEL = 65535
 
@@ -16,13 +17,12 @@ FULL_LEVEL = 65535
 class SerialProjectorController:
     """Implements `ProjectorController`; see there for the contract."""
 
-    capabilities = ProjectorCapabilities(reads_back=True, sequences=False)
-
     def __init__(self, config: SerialConfig, expected: tuple[str, ...]) -> None:
-        identity = re.compile(r"HAIRSTAGE-PROJECTORS (\S*)")
+        identity = re.compile(r"HAIRSTAGE-PROJECTORS (?:2 (\d+) )?(\S*)")
         self._lines = SerialLines("projector controller", config, identity)
         self._expected = expected
         self._names: tuple[str, ...] = ()
+        self.capabilities = ProjectorCapabilities(reads_back=True, dead_man=False, table=0)
         self.name = self._lines.name
 
     @property
@@ -32,7 +32,10 @@ class SerialProjectorController:
 
     def connect(self) -> None:
         """Open the port; raises `DeviceError` where a projector of the rig file is not driven."""
-        self._names = tuple(n for n in self._lines.connect()[1].split(",") if n)
+        identity = self._lines.connect()
+        second = identity[1] is not None
+        self.capabilities = ProjectorCapabilities(True, second, int(identity[1] or 0))
+        self._names = tuple(n for n in identity[2].split(",") if n)
         absent = [n for n in self._expected if n not in self._names]
         if absent:
             raise DeviceError(
@@ -66,12 +69,76 @@ class SerialProjectorController:
         return self._lines.ask("SHOW?", "SHOW (.+)", "reading what is shown")[1] == "OFF"
 
     def load_sequence(self, patterns: Sequence[Pattern]) -> None:
-        """Not there yet."""
-        raise NotImplementedError
+        """Upload in runs of rows, compare checksum and number of patterns with our own, and leave
+        the controller armed."""
+        entries = [_text(run) for run in _runs(patterns)]
+        if not 1 <= len(entries) <= self.capabilities.table:
+            raise DeviceError(
+                self.name,
+                "uploading a sequence",
+                expected=f"1 to {self.capabilities.table} entries, which the controller holds",
+                received=f"{len(entries)} entries",
+                todo="Shoot in shorter runs, or step by software.",
+            )
+        count = len(entries)
+        self._lines.ask(f"SEQ {count}", f"OK SEQ {count}", "beginning a sequence")
+        for i, entry in enumerate(entries):
+            doing = f"uploading entry {i} of the sequence"
+            self._lines.ask(f"ENTRY {i} {entry}", f"OK ENTRY {i}", doing)
+        crc = zlib.crc32("".join(f"{entry}\n" for entry in entries).encode("ascii"))
+        self._lines.ask("ARM", f"OK ARM {len(patterns)} {crc:08x}", "arming the sequence")
 
     def position(self) -> int:
-        """Not there yet."""
-        raise NotImplementedError
+        """How often the gate has closed since the sequence was armed."""
+        doing = "reading the sequence's position"
+        match = self._lines.ask("SEQ?", r"SEQ (armed|idle|watchdog) (\d+)", doing)
+        if match[1] != "armed":
+            tripped = match[1] == "watchdog"
+            raise DeviceError(
+                self.name,
+                doing,
+                expected="an armed sequence",
+                received=f"{match[1]}, after {match[2]} patterns",
+                todo="It got no request for the watchdog time and put the projectors dark."
+                if tripped
+                else "Load the sequence first; line, all_on and off leave it.",
+            )
+        return int(match[2])
+
+    def set_watchdog(self, seconds: float) -> None:
+        """Set the watchdog time, 0.1 to 60 s; version 1 of the controller refuses it."""
+        request = f"WATCHDOG {milliseconds(self.name, seconds)}"
+        self._lines.ask(request, f"OK {request}", "setting the watchdog")
+
+    def heartbeat(self) -> None:
+        """Any request counts; this one changes nothing."""
+        self._lines.ask("SHOW?", "SHOW .+", "feeding the watchdog")
+
+
+def _runs(patterns: Sequence[Pattern]) -> list[list[Pattern]]:
+    """Neighbours that one entry describes: rows of a projector at equal steps and one level."""
+    runs: list[list[Pattern]] = []
+    for pattern in patterns:
+        run = runs[-1] if runs else []
+        alike = (
+            run
+            and pattern.projector is not None
+            and (run[0].projector, run[0].level) == (pattern.projector, pattern.level)
+            and (len(run) == 1 or pattern.row - run[-1].row == run[1].row - run[0].row)
+        )
+        if alike:
+            run.append(pattern)
+        else:
+            runs.append([pattern])
+    return runs
+
+
+def _text(run: list[Pattern]) -> str:
+    first, level = run[0], _level(run[0].level)
+    if first.projector is None:
+        return f"ON {level}"
+    step = run[1].row - first.row if len(run) > 1 else 1
+    return f"LINE {first.projector} {first.row} {step} {len(run)} {level}"
 
 
 def _level(level: float) -> int:

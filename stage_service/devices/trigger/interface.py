@@ -15,16 +15,22 @@ class TriggerStatus:
     estop_pressed: bool
 
 
+Gates = Literal["L", "P", "LP", "-"]
+"""Which gates a step opens: the light bank's, the projectors', both, none."""
+TableState = Literal["idle", "armed", "running", "done", "stopped"]
+
+
 @dataclass(frozen=True)
 class TableRow:
     """`repeat` steps alike of a hardware-stepped sequence; times in seconds.
 
     `gates` open ("L" light bank, "P" projectors), `settle_s` later the cameras fire, after
     `exposure_s` the gates close; the next step begins `period_s` after this one at the earliest.
+    Settle 0 to 1 s, exposure 1e-6 to 10 s, period 0 to 60 s, each rounded to microseconds.
     """
 
     repeat: int
-    gates: Literal["L", "P", "LP", "-"]
+    gates: Gates
     settle_s: float
     exposure_s: float
     period_s: float
@@ -32,9 +38,13 @@ class TableRow:
 
 @dataclass(frozen=True)
 class TableProgress:
-    """Where a table is: `steps` and `pulses` since `go`; `reason` says why it stopped, or "-"."""
+    """Where a table is: `steps` and `pulses` since `go`; `reason` says why it stopped, or "-".
 
-    state: Literal["idle", "armed", "running", "done", "stopped"]
+    A step counts when its gates have closed, a pulse when the cameras fire: within an exposure, and
+    where a table was stopped in one, `pulses` is `steps` + 1.
+    """
+
+    state: TableState
     steps: int
     pulses: int
     reason: str
@@ -77,11 +87,13 @@ class TriggerBox(Protocol):
 
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
         """Upload a table, verify its checksum, and arm it; it stops by itself when nobody asks
-        for `watchdog_s` seconds."""
+        for `watchdog_s` seconds. Raises `ValueError` for times out of range; `DeviceError` where
+        the box has no table, or too short a one. Neighbours alike share a row of the table."""
         ...
 
     def go(self) -> None:
-        """Run the armed table from its first step."""
+        """Run the armed table from its first step. Never repeated on its own: the table of a lost
+        answer may run; `stop` ends it."""
         ...
 
     def progress(self) -> TableProgress:
@@ -89,5 +101,6 @@ class TriggerBox(Protocol):
         ...
 
     def stop(self) -> int:
-        """Close the gates at once; returns the steps that were done."""
+        """Close the gates at once and leave the table; returns the steps that were done. May be
+        repeated."""
         ...

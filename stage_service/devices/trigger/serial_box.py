@@ -3,25 +3,44 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import cast, get_args
 
 from stage_service.config import SerialConfig
-from stage_service.devices.serial_lines import SerialLines
-from stage_service.devices.trigger.interface import TableProgress, TableRow, TriggerStatus
+from stage_service.devices.errors import DeviceError
+from stage_service.devices.serial_lines import SerialLines, milliseconds
+from stage_service.devices.trigger.interface import (
+    Gates,
+    TableProgress,
+    TableRow,
+    TableState,
+    TriggerStatus,
+)
+
+MOST_REPEATS = 1_000_000
+LONGEST_US = {"settle": 1_000_000, "exposure": 10_000_000, "period": 60_000_000}
 
 
 class SerialTriggerBox:
     """Implements `TriggerBox`; see there for the contract."""
 
     def __init__(self, config: SerialConfig) -> None:
-        self._lines = SerialLines(
-            "trigger box", config, re.compile(r"HAIRSTAGE-TRIGGER (?:1|2 \d+)")
-        )
+        identity = re.compile(r"HAIRSTAGE-TRIGGER (?:1|2 (\d+))")
+        self._lines = SerialLines("trigger box", config, identity)
+        self._table_rows = 0
         self.name = self._lines.name
+
+    @property
+    def table_rows(self) -> int:
+        """Rows of its table; version 1 of the box has none."""
+        return self._table_rows
 
     def connect(self) -> None:
         """Open the port; raises `DeviceError` where no trigger box answers."""
-        self._lines.connect()
+        self._table_rows = int(self._lines.connect()[1] or 0)
 
     def close(self) -> None:
         """Close the port."""
@@ -29,9 +48,7 @@ class SerialTriggerBox:
 
     def pulse(self, exposure_s: float) -> int:
         """Fire all cameras once for 1 µs to 10 s; returns the count."""
-        us = round(exposure_s * 1e6)
-        if not 1 <= us <= 10_000_000:
-            raise ValueError(f"{self.name}: exposure must be 1e-6 to 10 s, got {exposure_s}")
+        us = self._microseconds("exposure", exposure_s, 1)
         return int(self._lines.ask(f"PULSE {us}", r"OK (\d+)", "firing the cameras")[1])
 
     def count(self) -> int:
@@ -48,23 +65,69 @@ class SerialTriggerBox:
         match = self._lines.ask("STATUS?", reply, "reading the safety inputs")
         return TriggerStatus(match[1] == "1", match[2] == "1")
 
-    @property
-    def table_rows(self) -> int:
-        """Not there yet."""
-        return 0
-
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
-        """Not there yet."""
-        raise NotImplementedError
+        """Upload, compare checksum and number of steps with our own, and leave the box armed."""
+        texts = [self._text(row) for row in _joined(rows)]
+        if not 1 <= len(texts) <= self._table_rows:
+            raise DeviceError(
+                self.name,
+                "uploading a table",
+                expected=f"1 to {self._table_rows} rows, which the box holds",
+                received=f"{len(texts)} rows",
+                todo="Shoot in shorter runs, or step by software.",
+            )
+        watchdog = f"WATCHDOG {milliseconds(self.name, watchdog_s)}"
+        self._lines.ask(watchdog, f"OK {watchdog}", "setting the watchdog")
+        self._lines.ask(f"TABLE {len(texts)}", f"OK TABLE {len(texts)}", "beginning a table")
+        for i, text in enumerate(texts):
+            self._lines.ask(f"ROW {i} {text}", f"OK ROW {i}", f"uploading row {i} of the table")
+        crc = zlib.crc32("".join(f"{text}\n" for text in texts).encode("ascii"))
+        armed = f"OK ARM {sum(row.repeat for row in rows)} {crc:08x}"
+        self._lines.ask("ARM", armed, "arming the table")
 
     def go(self) -> None:
-        """Not there yet."""
-        raise NotImplementedError
+        """Run the armed table; raises `SafetyRefusal` where the box refuses to."""
+        self._lines.ask("GO", "OK GO", "starting the table")
 
     def progress(self) -> TableProgress:
-        """Not there yet."""
-        raise NotImplementedError
+        """Ask where the table is; any request feeds the box's watchdog."""
+        reply = rf"SEQ ({'|'.join(get_args(TableState))}) (\d+) (\d+) ([a-z-]+)"
+        match = self._lines.ask("SEQ?", reply, "reading the table's progress")
+        # The pattern admits these states only.
+        return TableProgress(cast("TableState", match[1]), int(match[2]), int(match[3]), match[4])
 
     def stop(self) -> int:
-        """Not there yet."""
-        raise NotImplementedError
+        """Close the gates at once; returns the steps that were done."""
+        return int(self._lines.ask("STOP", r"OK STOP (\d+)", "stopping the table")[1])
+
+    def _text(self, row: TableRow) -> str:
+        if row.gates not in get_args(Gates):
+            raise ValueError(f"{self.name}: gates must be {get_args(Gates)}, got {row.gates!r}")
+        times = (
+            self._microseconds("settle", row.settle_s, 0),
+            self._microseconds("exposure", row.exposure_s, 1),
+            self._microseconds("period", row.period_s, 0),
+        )
+        return f"{row.repeat} {row.gates} {' '.join(map(str, times))}"
+
+    def _microseconds(self, what: str, seconds: float, least: int) -> int:
+        most = LONGEST_US[what]
+        # In this order a NaN or an infinity fails the comparison, not the rounding.
+        if not -1 < seconds * 1e6 < most + 1 or not least <= (us := round(seconds * 1e6)) <= most:
+            limits = f"{least * 1e-6:g} to {most * 1e-6:g} s"
+            raise ValueError(f"{self.name}: {what} must be {limits}, got {seconds}")
+        return us
+
+
+def _joined(rows: Sequence[TableRow]) -> list[TableRow]:
+    """Neighbours alike as one row, as far as a row's `repeat` goes."""
+    out: list[TableRow] = []
+    for row in rows:
+        if row.repeat < 1:
+            raise ValueError(f"a row is repeated 1 or more times, got {row.repeat}")
+    for row, alike in groupby(rows, lambda row: replace(row, repeat=1)):
+        left = sum(r.repeat for r in alike)
+        while left > 0:
+            out.append(replace(row, repeat=min(left, MOST_REPEATS)))
+            left -= MOST_REPEATS
+    return out
