@@ -16,7 +16,7 @@ from simulators.sensor import Sensor
 from simulators.serial_peer import SerialPeer
 from simulators.trigger_box import TriggerBox
 from simulators.world import World
-from stage_service.config import DevicesConfig, ModbusTcpConfig
+from stage_service.config import DevicesConfig, LinkCamerasConfig, ModbusTcpConfig
 
 HOST = "127.0.0.1"
 DEVICES_FILE = "devices.toml"
@@ -69,7 +69,9 @@ class SimulatedStage:
         light_host, light_port = HOST, 0
         if fixed and isinstance(fixed.lights, ModbusTcpConfig):
             light_host, light_port = fixed.lights.host, fixed.lights.port
-        camera_host, camera_port = (fixed.cameras.host, fixed.cameras.port) if fixed else (HOST, 0)
+        camera_host, camera_port = HOST, 0
+        if fixed and isinstance(fixed.cameras, LinkCamerasConfig):
+            camera_host, camera_port = fixed.cameras.host, fixed.cameras.port
         stack.callback(world.stop)
         lights = LedBank(world.lamps, light_host, light_port, world.hanging)
         stack.callback(lights.stop)
@@ -93,7 +95,8 @@ class SimulatedStage:
             "cameras": {"kind": "link", "host": camera_host, "port": camera_port},
         }
         for name, table in actual.items():
-            self.devices[name] = {**self.devices.get(name, {}), **table}
+            base = self.devices.get(name, {})
+            self.devices[name] = {**base, **table} if base.get("kind") == table["kind"] else table
         if not world.rig.projectors:
             del self.devices["projectors"]
         file = self._state / DEVICES_FILE

@@ -8,6 +8,9 @@ pulses are out of step, and that frames could stand for the wrong light.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 from stage_service.devices.errors import IndexShift
 
 
@@ -20,7 +23,11 @@ class PulseAccount:
 
     def fired(self, count: int) -> None:
         """Take the box's answer to a pulse. Raises `IndexShift` for doubled or lost pulses."""
-        expected = self.count + 1
+        self.ran(1, count)
+
+    def ran(self, pulses: int, count: int) -> None:
+        """Take the box's count after that many pulses. Raises `IndexShift`."""
+        expected = self.count + pulses
         if count != expected:
             raise IndexShift(
                 self.device,
@@ -62,6 +69,52 @@ class FrameAccount:
         self._advance(block_id, self.unanswered)
         self.unanswered -= 1
 
+    def place(
+        self, block_ids: Sequence[int], timestamps: Sequence[float], schedule: Sequence[float]
+    ) -> list[int] | None:
+        """The pulse that each frame of a hardware-stepped run belongs to, from 0.
+
+        `schedule` has the pulses' times in seconds. Gaps in the block ids are frames that were
+        lost on the way. A trigger that came while the camera was busy leaves no gap: then only the
+        timestamps can tell which. None where they cannot, or are missing: no frame of the run may
+        be used. Raises `IndexShift` for more frames than pulses, and for ids that repeat.
+        """
+        pulses = len(schedule)
+        if not block_ids:
+            self.unanswered += pulses
+            return []
+        skipped = self._skipped(block_ids[0], pulses)
+        after = [(b - block_ids[0]) % self.wrap for b in block_ids]
+        rising = all(a < b for a, b in pairwise(after))
+        if not rising or after[-1] >= pulses:
+            raise self._shift(
+                f"at most {pulses} frames with rising numbers",
+                block_ids[-1],
+                "The camera was triggered by something else, or repeats frames. Check the trigger "
+                "cable and start again.",
+            )
+        # Ids that were skipped may have belonged to pulses before this run.
+        start = max(0, skipped - self.unanswered)
+        whole = start + after[-1] == pulses - 1 and (self.unanswered == 0 or start == 0)
+        places: list[int] | None = [start + k for k in after]
+        if not whole:
+            places = _by_time(start, after, timestamps, schedule)
+        self.last = block_ids[-1]
+        self.unanswered = pulses - 1 - (places[-1] if places else after[-1])
+        return places
+
+    def _skipped(self, block_id: int, pulses: int) -> int:
+        """How many block ids there were between the last frame and this one."""
+        before, most = self.last or 0, pulses + self.unanswered
+        skipped = (block_id - before) % self.wrap - 1
+        if not 1 <= block_id <= self.wrap or not 0 <= skipped < most:
+            raise self._shift(
+                f"block id {before % self.wrap + 1}",
+                block_id,
+                "Frames and pulses are out of step. Check the trigger cable and start again.",
+            )
+        return skipped
+
     def _advance(self, block_id: int, most: int) -> None:
         before = 0 if self.last is None else self.last
         advance = (block_id - before) % self.wrap
@@ -83,3 +136,27 @@ class FrameAccount:
             received=f"block id {block_id}",
             todo=todo,
         )
+
+
+def _by_time(
+    start: int, after: Sequence[int], timestamps: Sequence[float], schedule: Sequence[float]
+) -> list[int] | None:
+    """Places that fit block ids and, to half a step, timestamps; None unless exactly one does."""
+    rising = all(a < b for a, b in pairwise(timestamps))
+    if len(after) < 2 or not rising:
+        return None
+    slack = 0.5 * min(b - a for a, b in pairwise(schedule))
+    fits = []
+    for first in range(start, len(schedule) - after[-1]):
+        found = [first]
+        for stamp, at_least in zip(timestamps[1:], after[1:], strict=True):
+            due = schedule[first] + stamp - timestamps[0]
+            nearest = min(range(len(schedule)), key=lambda i: abs(schedule[i] - due))
+            if abs(schedule[nearest] - due) > slack or nearest < max(
+                first + at_least, found[-1] + 1
+            ):
+                break
+            found.append(nearest)
+        else:
+            fits.append(found)
+    return fits[0] if len(fits) == 1 else None

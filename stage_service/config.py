@@ -12,7 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from reconstruction.rig import Rig, RigError
 
@@ -115,7 +123,7 @@ class SerialConfig(Strict):
     timeout_s: Seconds = 1.0
 
 
-class CamerasConfig(Strict):
+class LinkCamerasConfig(Strict):
     """`[devices.cameras]`: the camera link.
 
     `timeout_s` bounds each answer, `busy_s` how long a camera may say that its frame is not ready.
@@ -133,6 +141,47 @@ class CamerasConfig(Strict):
     buffers: int = Field(default=64, ge=1)
 
 
+class BaslerConfig(Strict):
+    """`[devices.cameras]`: Basler cameras, found by serial number.
+
+    `serials` maps each camera of the rig file to its number. `gain` is counts per
+    (W/(sr m²) · s) and `black` counts: calibrated, the camera knows neither. `features` are written
+    to the camera in their order after its default settings are loaded: region of interest, analog
+    gain, black level, packet size. `timeout_s` bounds arming; a frame may come `frame_s` later than
+    its exposure takes. `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are
+    for predictions. `buffers` is how many frames are held unread.
+    """
+
+    kind: Literal["basler"]
+    serials: dict[str, Annotated[str, Field(min_length=1)]]
+    gain: float = Field(gt=0.0)
+    black: float = Field(default=0.0, ge=0.0)
+    pixel_format: str = Field(
+        default="BayerRG12", pattern="^(Mono|Bayer(RG|GR|GB|BG))(8|10|12|16)$"
+    )
+    trigger_line: str = Field(default="Line1", pattern=r"^Line\d+$")
+    features: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    timeout_s: Seconds = 2.0
+    frame_s: Seconds = 0.5
+    readout_s: float = Field(default=0.02, ge=0.0)
+    bytes_per_s: float = Field(default=100e6, gt=0.0)
+    buffers: int = Field(default=16, ge=1)
+
+    @field_validator("serials")
+    @classmethod
+    def _one_camera_each(cls, serials: dict[str, str]) -> dict[str, str]:
+        if len(set(serials.values())) < len(serials):
+            raise ValueError("two cameras have the same serial number")
+        return serials
+
+
+def _link_by_default(table: Any) -> Any:
+    return {"kind": "link", **table} if isinstance(table, dict) else table
+
+
+CamerasConfig = Annotated[LinkCamerasConfig | BaslerConfig, Field(discriminator="kind")]
+
+
 class DevicesConfig(Strict):
     """`[devices]`: how to reach the stage. Without `projectors` there are no sweeps.
 
@@ -146,7 +195,7 @@ class DevicesConfig(Strict):
     lights: Annotated[LightBankConfig, BeforeValidator(_modbus_tcp_by_default)]
     trigger: SerialConfig
     projectors: SerialConfig | None = None
-    cameras: CamerasConfig
+    cameras: Annotated[CamerasConfig, BeforeValidator(_link_by_default)]
 
     @model_validator(mode="after")
     def _heartbeat_before_watchdog(self) -> DevicesConfig:
@@ -263,7 +312,7 @@ def _place(loc: tuple[int | str, ...]) -> str:
     return ".".join(str(p) for p in loc if p not in _KINDS)
 
 
-_KINDS = ("modbus_tcp", "modbus_rtu", "dmx_enttec")
+_KINDS = ("modbus_tcp", "modbus_rtu", "dmx_enttec", "link", "basler")
 
 
 def _validate(path: Path, tables: dict[str, Any]) -> _Tables:

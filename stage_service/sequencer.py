@@ -1,23 +1,28 @@
-"""Runs a plan's steps over a stage: light, confirm, pulse, dark, read, account, write."""
+"""Runs a plan's steps over a stage: expose, read, account, write; dark at every end."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from reconstruction.capture import Step
+from reconstruction.capture import Capture, Step
 from reconstruction.capture_writer import CaptureWriter
 from stage_service.accounting import FrameAccount, PulseAccount
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera, Frame
-from stage_service.devices.errors import Cancelled, DeviceError
+from stage_service.devices.errors import Cancelled
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.devices.stage import Stage
+from stage_service.exposing import Exposing
+from stage_service.hardware_run import HardwareRun, Shots
 from stage_service.safety import Blackout, blackout, check_interlocks
+from stage_service.sentinels import check_sentinels
+from stage_service.spent import Spent
 from stage_service.states import Machine, Outcome, State, WrongState
+from stage_service.stepping import SHORTEST_RUN, Run
 from stage_service.writer import FrameWriter, Shot
 
 Notify = Callable[[str, dict[str, Any]], None]
@@ -25,12 +30,26 @@ QUEUED_STEPS = 2
 """Steps' worth of frames that may wait for the disk before the sequence waits, too."""
 
 
+class CannotPause(WrongState):
+    """The trigger box clocks these steps; it cannot wait."""
+
+    def __init__(self, steps: int) -> None:
+        RuntimeError.__init__(
+            self,
+            f"cannot pause: the trigger box clocks a run of {steps} steps by itself. Pause after "
+            "it, or abort, which stops it at once and keeps the frames of the steps that are done",
+        )
+        self.action, self.state = "pause", "running"
+
+
 class Sequencer:
     """One run over the frames that a capture still lacks, so an interrupted one goes on where it
     stopped. `run` blocks; the other methods may be called from any thread.
 
-    `notify(kind, data)` hears "capture.state", "capture.step" and "capture.frame_missing".
-    Whatever ends the run, lamps and projectors are put off and read back.
+    `runs` says who clocks which steps (default: the service all), `rate_hz` how many steps a
+    second there are at most. `watch` is called before each step that lights something, and raises
+    what forbids it. `notify(kind, data)` hears "capture.state", "capture.step" and
+    "capture.frame_missing". Whatever ends the run, lamps and projectors are put off and read back.
     """
 
     def __init__(
@@ -39,6 +58,9 @@ class Sequencer:
         writer: CaptureWriter,
         *,
         retries: int = 2,
+        runs: Sequence[Run] | None = None,
+        rate_hz: float | None = None,
+        watch: Callable[[Step], None] = lambda _step: None,
         notify: Notify = lambda _kind, _data: None,
     ) -> None:
         self.stage = stage
@@ -49,6 +71,9 @@ class Sequencer:
         self._ended: float | None = None
         self._writer = writer
         self._retries = retries
+        self._runs = [Run(writer.steps, "software")] if runs is None else list(runs)
+        self._rate_hz = rate_hz
+        self._watch = watch
         self._notify = notify
         self._machine = Machine()
         self._changed = threading.Condition()
@@ -57,6 +82,11 @@ class Sequencer:
         self._cancel = threading.Event()
         self._lamp = {light.name: i for i, light in enumerate(writer.rig.lights)}
         self._armed: float | None = None
+        self._doubtful = False
+        self._clocked = 0  # steps of the hardware-stepped run that is under way
+        self._unclear: dict[str, str] = {}
+        self._spent = Spent()
+        self._exposing = Exposing(stage, self._lamp, self._cancel, self._spent, rate_hz)
         self._pulses = PulseAccount(stage.trigger.name)
         self._accounts = {
             c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in stage.cameras
@@ -83,6 +113,8 @@ class Sequencer:
         """Pause at the next step boundary, lights off. Raises `WrongState`."""
         with self._changed:
             self._require("pause")
+            if self._clocked:
+                raise CannotPause(self._clocked)
             self._pause_asked = True
             self._changed.notify_all()
 
@@ -136,12 +168,18 @@ class Sequencer:
     def _finish(self) -> None:
         if self.blackout is not None and not self.blackout.safe:
             self._fail(RuntimeError(f"blackout: {self.blackout.detail}"))
-        extra: dict[str, Any] = {"seconds": self.seconds, "error": self.error}
+        extra: dict[str, Any] = {
+            "seconds": self.seconds,
+            "error": self.error,
+            "seconds_by_cause": dict(self._spent.seconds),
+            "service_s_per_step_median": self._spent.own_median_s,
+            "sentinels_unclear": self._unclear,
+        }
         if self.blackout is not None:
             extra["blackout"] = {"safe": self.blackout.safe, "detail": self.blackout.detail}
         try:
             self._writer.finish(str(self.outcome), extra)
-        except OSError as error:  # a full disk: the journal keeps the frames, state has the reason
+        except Exception as error:  # a full disk: the journal keeps the frames, state the reason
             self._fail(error)
         self._ended = time.monotonic()
         self._move("finish")
@@ -162,49 +200,119 @@ class Sequencer:
             cameras = FanOut(stage.cameras)
             stack.callback(cameras.close)
             heartbeat = stack.enter_context(Heartbeat(stage.lights, stage.config.heartbeat_s))
-            self._dark()
-            for step in self._writer.steps:
-                self._boundary()
-                wanted = {c for s, c in self._wanted(step)}
-                if wanted:
+            self._exposing.dark()
+            for run in self._runs:
+                todo = {s: w for s in run.steps if (w := self._wanted(s))}
+                self.steps_done += len(run.steps) - len(todo)  # shot before this run
+                if run.stepping == "hardware" and len(todo) >= SHORTEST_RUN:
+                    self._boundary()
                     heartbeat.check()
-                    self._shoot(step, wanted, cameras, frames)
-                self.steps_done += 1
-                self._notify("capture.step", {"steps_done": self.steps_done, **step.to_dict()})
+                    self._clock(todo, cameras, frames)
+                for step, wanted in todo.items():
+                    self._boundary()
+                    heartbeat.check()
+                    if wanted:
+                        with self._spent.step():
+                            self._shoot(step, wanted, cameras, frames)
+                    self.steps_done += 1
+                    self._notify("capture.step", {"steps_done": self.steps_done, **step.to_dict()})
             cameras(self._drain)
             cameras(lambda camera: camera.disarm())
+        self._unclear = check_sentinels(Capture(self._writer.path))
 
-    def _wanted(self, step: Step) -> list[tuple[int, str]]:
-        keys = [(step.index, c.name) for c in self.stage.cameras]
+    def _wanted(self, step: Step) -> set[str]:
         records = self._writer.records
-        return [k for k in keys if k not in records or records[k].file is None]
+        names = (c.name for c in self.stage.cameras)
+        return {
+            name
+            for name in names
+            if (record := records.get((step.index, name))) is None or record.file is None
+        }
+
+    def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
+        """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
+        steps = list(todo)
+        for step in steps:
+            self._watch(step)
+        with self._spent.on("arm"):
+            self._arm(steps[0].exposure, cameras)
+        run = HardwareRun(self.stage, steps, self._lamp, rate_hz=self._rate_hz)
+        self._clocked = len(steps)
+        try:
+            with self._spent.on("hardware run"):
+                shots = run.shoot(cameras, self._cancel, lambda: self._abort_asked)
+                self._exposing.dark()
+        finally:
+            self._clocked = 0
+        first = self._pulses.count + 1
+        self._pulses.ran(shots.progress.pulses, self.stage.trigger.count())
+        places = self._place(shots, run.schedule[: shots.progress.pulses])
+        for camera in self.stage.cameras:
+            for place, frame in zip(
+                places[camera.name] or (), shots.frames[camera.name], strict=False
+            ):
+                # The frame of a pulse beyond the steps that were done was cut short.
+                if place >= shots.progress.steps or camera.name not in todo[steps[place]]:
+                    continue
+                self._put(
+                    frames, Shot(steps[place], camera.name, frame, camera.info, first + place, 0)
+                )
+                todo[steps[place]].discard(camera.name)
+        self._doubtful = any(todo.values())
+        if shots.error is not None:
+            raise shots.error
+        if not self._abort_asked:
+            for step in steps:
+                self._tell_missing(step, todo[step], 0)
+
+    def _place(self, shots: Shots, schedule: list[float]) -> dict[str, list[int] | None]:
+        return {
+            name: self._accounts[name].place(
+                [f.block_id for f in frames], [f.timestamp for f in frames], schedule
+            )
+            for name, frames in shots.frames.items()
+        }
 
     def _shoot(self, step: Step, wanted: set[str], cameras: FanOut, frames: FrameWriter) -> None:
         """One step; cameras without a frame get more pulses, only their frames are kept then."""
         for attempt in range(self._retries + 1):
-            if attempt or self._armed != step.exposure:
-                self._arm(step.exposure, cameras)
-            pulse = self._expose(step)
-            shot = cameras(lambda camera: camera.read(self._cancel))
+            if self._doubtful or self._armed != step.exposure:
+                with self._spent.on("arm"):
+                    self._arm(step.exposure, cameras)
+            self._watch(step)
+            pulse = self._exposing.expose(step)
+            self._pulses.fired(pulse)
+            with self._spent.on("cameras"):
+                shot = cameras(lambda camera: camera.read(self._cancel))
             for camera in self.stage.cameras:
                 frame = shot[camera.name]
                 self._account(camera, frame)
                 if frame is not None and camera.name in wanted:
-                    frames.put(Shot(step, camera.name, frame, camera.info, pulse, attempt))
+                    self._put(frames, Shot(step, camera.name, frame, camera.info, pulse, attempt))
                     wanted.discard(camera.name)
             if not wanted:
                 return
-            again = attempt < self._retries
-            lost = {"step": step.index, "cameras": sorted(wanted), "attempt": attempt}
-            self._notify("capture.frame_missing", {**lost, "shot_again": again})
+            self._tell_missing(step, wanted, attempt)
         for name in sorted(wanted):
             reason = f"no frame from the camera after {self._retries + 1} pulses"
             self._writer.record_missing(
                 step, name, reason=reason, pulse=pulse, attempt=self._retries
             )
 
+    def _put(self, frames: FrameWriter, shot: Shot) -> None:
+        with self._spent.on("storage"):
+            frames.put(shot)
+
+    def _tell_missing(self, step: Step, cameras: set[str], attempt: int) -> None:
+        if cameras:
+            lost = {"step": step.index, "cameras": sorted(cameras), "attempt": attempt}
+            again = attempt < self._retries
+            self._notify("capture.frame_missing", {**lost, "shot_again": again})
+
     def _account(self, camera: Camera, frame: Frame | None) -> None:
         if frame is None:
+            # It may still come, and must not pass for the next pulse's.
+            self._doubtful = True
             self._accounts[camera.name].missed()
         else:
             self._accounts[camera.name].arrived(frame.block_id)
@@ -216,75 +324,12 @@ class Sequencer:
             cameras(self._drain)
         self._armed = None
         cameras(lambda camera: camera.arm(exposure))
-        self._armed = exposure
+        self._armed, self._doubtful = exposure, False
 
     def _drain(self, camera: Camera) -> None:
         """Drop frames that came late for pulses counted as missed; others raise `IndexShift`."""
         while (frame := camera.read(self._cancel)) is not None:
             self._accounts[camera.name].late(frame.block_id)
-
-    def _expose(self, step: Step) -> int:
-        """Light, confirm, settle, pulse, dark; returns the pulse's number."""
-        self._sleep(0)
-        self._light(step)
-        self._sleep(self.stage.config.lights.settle_s)
-        self._pulses.fired(self.stage.trigger.pulse(step.exposure))
-        # From the box's answer, which never comes before the pulse: the light stays long enough.
-        self._sleep(step.exposure)
-        self._check_lit(step)
-        self._dark(step)
-        return self._pulses.count
-
-    def _check_lit(self, step: Step) -> None:
-        """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
-        lights = self.stage.lights
-        if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
-            return
-        lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
-        if lit != expected:
-            raise DeviceError(
-                lights.name,
-                f"looking after the exposure of step {step.index}",
-                expected=f"{expected} lamps lit",
-                received=f"{lit} lit",
-                todo="Watchdog, interlock or emergency stop put them off: clear the cause.",
-            )
-
-    def _sleep(self, seconds: float) -> None:
-        if self._cancel.wait(max(0.0, seconds)):
-            raise Cancelled("the capture is being stopped")
-
-    def _light(self, step: Step) -> None:
-        lights = self.stage.lights
-        if step.kind in ("olat", "all_on"):
-            lights.set_level(step.level)
-        if step.light is not None:
-            lights.select(self._lamp[step.light])
-        elif step.kind == "all_on":
-            lights.all_on()
-        elif step.kind == "dark":
-            self._dark()
-        else:
-            self._project(step)
-
-    def _project(self, step: Step) -> None:
-        projectors = self.stage.projectors
-        if projectors is None:
-            raise RuntimeError(f"step {step.index} ({step.kind}): the stage has no projectors")
-        if step.kind == "tracking":
-            projectors.all_on(step.level)
-        else:
-            assert step.projector is not None
-            assert step.row is not None
-            projectors.line(step.projector, step.row, step.level)
-
-    def _dark(self, step: Step | None = None) -> None:
-        """Put off what the step lit; without a step, everything."""
-        if step is None or step.kind in ("olat", "all_on"):
-            self.stage.lights.off()
-        projected = step is None or step.kind in ("scanline", "tracking")
-        if projected and self.stage.projectors is not None:
-            self.stage.projectors.off()
 
     def _boundary(self) -> None:
         """Where pause and abort take effect."""

@@ -7,8 +7,19 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Self
 
+from reconstruction.cameras import Camera as Geometry
 from reconstruction.rig import RigError
-from stage_service.config import DevicesConfig, LightBankConfig, ModbusTcpConfig, RigFile
+from stage_service.config import (
+    BaslerConfig,
+    CamerasConfig,
+    DevicesConfig,
+    LightBankConfig,
+    LinkCamerasConfig,
+    ModbusTcpConfig,
+    RigFile,
+)
+from stage_service.devices.cameras.basler import BaslerCamera
+from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
@@ -47,13 +58,20 @@ class Stage:
             _light_bank(config.lights, len(rig.lights)),
             SerialTriggerBox(config.trigger),
             projectors,
-            tuple(LinkCamera(config.cameras, c) for c in rig.cameras),
+            tuple(_camera(config.cameras, c) for c in rig.cameras),
         )
 
     def connect(self) -> None:
-        """Connect to every device, lights first. Raises the first `DeviceError`."""
+        """Connect to every device, lights first, cameras side by side. Raises `DeviceError`, or
+        an `ExceptionGroup` of those of several cameras."""
         for device in self._all():
-            device.connect()
+            if device not in self.cameras:
+                device.connect()
+        cameras = FanOut(self.cameras)
+        try:
+            cameras(lambda camera: camera.connect())
+        finally:
+            cameras.close()
 
     def close(self) -> None:
         """Close every link; lamps and projectors stay as they are."""
@@ -96,6 +114,14 @@ def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
             return ModbusLightBank(config, lamps)
         case _:
             raise RigError(f"devices.lights: {config.kind} is not there yet")
+
+
+def _camera(config: CamerasConfig, geometry: Geometry) -> Camera:
+    match config:
+        case LinkCamerasConfig():
+            return LinkCamera(config, geometry)
+        case BaslerConfig():
+            return BaslerCamera(config, geometry)
 
 
 def _info(camera: Camera) -> dict[str, Any]:

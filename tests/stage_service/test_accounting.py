@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stage_service.accounting import FrameAccount, PulseAccount
 from stage_service.devices.errors import IndexShift
@@ -66,3 +68,69 @@ def test_pulses_count_one_by_one():
     box.fired(2)
     with pytest.raises(IndexShift, match="expected pulse 3, received pulse 4"):
         box.fired(4)
+
+
+WRAP = 40
+"""A camera that wraps soon, so that the tests see it."""
+
+
+@given(
+    fates=st.lists(st.sampled_from("ooooolm"), min_size=1, max_size=30),
+    last=st.integers(0, WRAP),
+    stamped=st.booleans(),
+    jitter=st.floats(0, 0.2),
+)
+def test_frames_are_placed_rightly_or_not_at_all(fates, last, stamped, jitter):
+    """Each pulse's frame came (o), was lost on the way (l), or the camera missed the pulse (m)."""
+    one = account(last or None)
+    one.wrap = WRAP
+    block, ids, times, true = last, [], [], []
+    for pulse, fate in enumerate(fates):
+        if fate == "m":
+            continue
+        block = block % WRAP + 1
+        if fate == "o":
+            ids.append(block)
+            times.append(7.0 + pulse + jitter * (-1) ** pulse if stamped else 0.0)
+            true.append(pulse)
+    places = one.place(ids, times, [1.0 * i for i in range(len(fates))])
+    assert places in (true, None)
+    if set(fates) <= {"o", "l"} and fates[-1] == "o":
+        assert places == true
+    if stamped and fates[0] == fates[-1] == "o" and len(fates) > 1:
+        assert places == true
+
+
+def test_a_whole_run_is_placed_without_timestamps():
+    one = account(last=65530)
+    assert one.place([65531 + i if i < 5 else i - 4 for i in range(8)], [0.0] * 8, range(8)) == [
+        *range(8)
+    ]
+    assert (one.last, one.unanswered) == (3, 0)
+
+
+def test_a_lost_frame_leaves_a_gap_that_tells_its_place():
+    one = account(last=4)
+    assert one.place([5, 6, 8], [0.0] * 3, range(4)) == [0, 1, 3]
+
+
+def test_an_over_trigger_without_a_gap_is_placed_by_time_or_not_at_all():
+    schedule = [0.1 * i for i in range(6)]
+    times = [3.0, 3.1, 3.3, 3.4, 3.5]  # the third pulse made no frame
+    assert account(last=0).place([1, 2, 3, 4, 5], times, schedule) == [0, 1, 3, 4, 5]
+    assert account(last=0).place([1, 2, 3, 4, 5], [0.0] * 5, schedule) is None
+    # The first and the last pulse cannot be told apart by equal periods.
+    assert account(last=0).place([1, 2, 3, 4, 5], times[:1] * 5, schedule) is None
+    assert account(last=0).place([1, 2, 3, 4, 5], [0.1 * i for i in range(5)], schedule) is None
+
+
+@pytest.mark.parametrize("ids", [[5, 5, 6], [5, 6, 7, 8], [5, 7, 6], [9, 10, 11]])
+def test_runs_with_repeated_surplus_or_foreign_frames_are_refused(ids):
+    with pytest.raises(IndexShift, match="cam_00"):
+        account(last=4).place(ids, [0.0] * len(ids), range(3))
+
+
+def test_a_run_without_any_frame_is_all_missing():
+    one = account(last=4)
+    assert one.place([], [], range(3)) == []
+    assert one.unanswered == 3

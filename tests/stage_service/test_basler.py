@@ -16,7 +16,8 @@ from pydantic import ValidationError
 from reconstruction.cameras import Camera as CameraGeometry
 from simulators.sensor import Sensor
 from stage_service.accounting import FrameAccount
-from stage_service.devices.cameras.basler import BaslerCamera, BaslerConfig
+from stage_service.config import BaslerConfig
+from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.block_counter import BlockCounter
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceUnreachable
 

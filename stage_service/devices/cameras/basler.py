@@ -11,12 +11,10 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Annotated, Any, Literal
-
-from pydantic import Field, field_validator
+from typing import Any
 
 from reconstruction.cameras import Camera as CameraGeometry
-from stage_service.config import Seconds, Strict
+from stage_service.config import BaslerConfig
 from stage_service.devices.cameras import pixel_formats
 from stage_service.devices.cameras.block_counter import BlockCounter
 from stage_service.devices.cameras.genicam_nodes import Nodes
@@ -67,40 +65,6 @@ OURS = {
     *("TriggerDelay", "TriggerDelayAbs", "LineSelector", "LineMode"),
 }
 """Nodes that the driver sets: not for `features`."""
-
-
-class BaslerConfig(Strict):
-    """`[devices.cameras]`: Basler cameras, found by serial number.
-
-    `serials` maps each camera of the rig file to its number. `gain` is counts per
-    (W/(sr m²) · s) and `black` counts: calibrated, the camera knows neither. `features` are written
-    to the camera in their order after its default settings are loaded: region of interest, analog
-    gain, black level, packet size. `timeout_s` bounds arming; a frame may come `frame_s` later than
-    its exposure takes. `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are
-    for predictions. `buffers` is how many frames are held unread.
-    """
-
-    kind: Literal["basler"]
-    serials: dict[str, Annotated[str, Field(min_length=1)]]
-    gain: float = Field(gt=0.0)
-    black: float = Field(default=0.0, ge=0.0)
-    pixel_format: str = Field(
-        default="BayerRG12", pattern="^(Mono|Bayer(RG|GR|GB|BG))(8|10|12|16)$"
-    )
-    trigger_line: str = Field(default="Line1", pattern=r"^Line\d+$")
-    features: dict[str, bool | int | float | str] = Field(default_factory=dict)
-    timeout_s: Seconds = 2.0
-    frame_s: Seconds = 0.5
-    readout_s: float = Field(default=0.02, ge=0.0)
-    bytes_per_s: float = Field(default=100e6, gt=0.0)
-    buffers: int = Field(default=16, ge=1)
-
-    @field_validator("serials")
-    @classmethod
-    def _one_camera_each(cls, serials: dict[str, str]) -> dict[str, str]:
-        if len(set(serials.values())) < len(serials):
-            raise ValueError("two cameras have the same serial number")
-        return serials
 
 
 class BaslerCamera:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from reconstruction.cameras import Camera as CameraGeometry
-from stage_service.config import CamerasConfig
+from stage_service.config import LinkCamerasConfig
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import (
     Cancelled,
@@ -31,7 +31,7 @@ POLL_S = (0.001, 0.05)
 class LinkCamera:
     """Implements `Camera` on a TCP connection of its own; see there for the contract."""
 
-    def __init__(self, config: CamerasConfig, geometry: CameraGeometry) -> None:
+    def __init__(self, config: LinkCamerasConfig, geometry: CameraGeometry) -> None:
         self.capabilities = CameraCapabilities(config.buffers, True, True, BLOCK_WRAP)
         self.name = geometry.name
         self.device = f"camera {geometry.name} ({config.host}:{config.port})"
