@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 from contextlib import ExitStack
@@ -80,10 +81,12 @@ class SimulatedStage:
         stack.callback(cameras.stop)
         camera_port = cameras.start()
         trigger = TriggerBox(world, self._faults)
+        stack.callback(trigger.stop)
         serial = {"trigger": trigger.reply, "projectors": world.projectors.reply}
         paths = {}
         for name, reply in serial.items():
-            peer = SerialPeer(self._state.absolute() / name, reply)
+            strikes = functools.partial(world.strikes, name)
+            peer = SerialPeer(self._state.absolute() / name, reply, strikes)
             peer.start()
             stack.callback(peer.stop)
             paths[name] = str(peer.link)

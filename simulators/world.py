@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.rig import Rig
-from simulators.faults import Faults
+from simulators.faults import Fault, Faults
 from simulators.frames import Snapshot
 from simulators.lamps import Lamps
 from simulators.projector_controller import ProjectorController, Show
@@ -66,7 +66,7 @@ class World:
     ) -> None:
         self.rig = rig
         self.lamps = lamps
-        self.projectors = ProjectorController(rig.projectors, faults, lambda: self.pulses)
+        self.projectors = ProjectorController(rig.projectors, self.blank)
         lamps.cut_by(self.safety)
         self._faults = faults
         self._make = make
@@ -97,26 +97,28 @@ class World:
         with self._lock:
             self._pulses = 0
 
-    def pulse(self) -> int:
-        """Fire all armed cameras at the present state; returns the pulse count."""
+    def pulse(self, fires: int = 1, counts: int = 1) -> int:
+        """Fire all armed cameras at the present state; returns the pulse count.
+
+        A faulty trigger fires twice or not at all, or does not count.
+        """
         with self._lock:
-            self._pulses += 1
+            self._pulses += counts
             self._fired += 1
             power, show = self.lamps.power(), self.projectors.show
-            self._move_subject(power, show)
+            if fires:
+                self._move_subject(power, show)
             shot = Snapshot(self._pulses, power, show, self._pose)
-            for index, (name, camera) in enumerate(self._cameras.items()):
-                if camera.exposure is None:
-                    continue
-                if self._faults.once("camera", "drop", self._pulses, name):
-                    continue
-                lane = self._lanes[index % len(self._lanes)]
-                counts = lane.submit(self._make, name, shot, camera.exposure)
-                self._queue(camera, camera.exposure, counts)
+            for _ in range(fires):
+                self._expose(shot)
             if self._log is not None:
                 with self._log.open("a") as log:
                     log.write(json.dumps({"pulse": shot.pulse, "pose": shot.pose}) + "\n")
             return self._pulses
+
+    def strikes(self, device: str, request: str) -> Fault | None:
+        """The fault of the serial device's wire at this request; PULSE is about the pulse to be."""
+        return self._faults.on_request(device, request, self._pulses + request.startswith("PULSE"))
 
     def hello(self, camera: str) -> None:
         """Start counting the camera's frames again; it is not armed and holds none."""
@@ -149,6 +151,10 @@ class World:
         """Whether a fault keeps the camera from answering."""
         return self._faults.since("camera", "mute", self._fired, camera)
 
+    def blank(self) -> bool:
+        """Whether a fault keeps the projectors' patterns from coming up."""
+        return self._faults.since("projectors", "blank", self._fired)
+
     def hanging(self) -> bool:
         """Whether a fault keeps the light bank from answering."""
         return self._faults.since("lights", "hang", self._fired)
@@ -160,6 +166,16 @@ class World:
                 self._empty(name)
         for lane in self._lanes:
             lane.shutdown(wait=True, cancel_futures=True)
+
+    def _expose(self, shot: Snapshot) -> None:
+        for index, (name, camera) in enumerate(self._cameras.items()):
+            if camera.exposure is None:
+                continue
+            if self._faults.once("camera", "drop", shot.pulse, name):
+                continue
+            lane = self._lanes[index % len(self._lanes)]
+            counts = lane.submit(self._make, name, shot, camera.exposure)
+            self._queue(camera, camera.exposure, counts)
 
     def _move_subject(self, power: NDArray[np.float64], show: Show) -> None:
         lit = int(np.count_nonzero(power))

@@ -9,7 +9,7 @@ from simulators.faults import Fault
 
 def test_trigger_counts_and_resets(bench):
     ask = bench.trigger.ask
-    assert ask("ID?") == "HAIRSTAGE-TRIGGER 1"
+    assert ask("ID?") == "HAIRSTAGE-TRIGGER 2 4096"
     assert ask("COUNT?") == "COUNT 0"
     assert ask("PULSE 20000") == "OK 1"
     assert ask("PULSE 1") == "OK 2"
@@ -39,7 +39,7 @@ def test_bytes_that_are_not_ascii_do_not_end_the_box(bench):
 
 def test_projectors_show_what_they_were_told(bench):
     ask = bench.projectors.ask
-    assert ask("ID?") == "HAIRSTAGE-PROJECTORS proj"
+    assert ask("ID?") == "HAIRSTAGE-PROJECTORS 2 4096 proj"
     assert ask("SHOW?") == "SHOW OFF"
     for command in ("LINE proj 7 65535", "ON 32768", "OFF"):
         assert ask(command) == f"OK {command}"
@@ -69,7 +69,7 @@ def test_silent_and_broken_replies_come_once(start):
     assert bench.trigger.ask("COUNT?") == "COUNT 1"
     assert not bench.trigger.ask("PULSE 1000").startswith("OK")
     assert bench.trigger.ask("PULSE 1000") == "OK 3"
-    bench = start(Fault("projectors", "garbage", 0), Fault("projectors", "silent", 0))
+    bench = start(Fault("projectors", "silent", 0), Fault("projectors", "garbage", 0))
     assert bench.projectors.ask("ON 5") == ""
     assert bench.projectors.ask("ON 6") != "OK ON 6"
     assert bench.projectors.ask("SHOW?") == "SHOW ON 6"
