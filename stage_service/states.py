@@ -17,19 +17,28 @@ TRANSITIONS: dict[State, dict[str, State]] = {
     },
     "paused": {"resume": "running", "abort": "finishing", "fail": "finishing"},
     "finishing": {"finish": "done", "fail": "finishing"},
-    "done": {},
+    "done": {"continue": "running"},
 }
-"""state -> action -> next state; whatever is not listed is refused."""
+"""state -> action -> next state; whatever is not listed is refused.
+
+"continue" shoots what a capture lacks that is done and did not complete: a new run, which starts
+where the table says that a run starts.
+"""
 
 OUTCOMES: dict[str, Outcome] = {"complete": "completed", "abort": "aborted", "fail": "failed"}
 """The outcome that the action decides; a later failure wins over an earlier success."""
 
 
+def possible(state: State, outcome: Outcome | None) -> dict[str, State]:
+    """The actions that a state allows, and where they lead; a completed capture is over."""
+    return {} if state == "done" and outcome == "completed" else TRANSITIONS[state]
+
+
 class WrongState(RuntimeError):
     """The state does not allow the action; the message lists what it allows."""
 
-    def __init__(self, action: str, state: State) -> None:
-        allowed = ", ".join(sorted(TRANSITIONS[state])) or "nothing"
+    def __init__(self, action: str, state: State, outcome: Outcome | None = None) -> None:
+        allowed = ", ".join(sorted(possible(state, outcome))) or "nothing"
         super().__init__(f"cannot {action} a capture that is {state}; possible now: {allowed}")
         self.action, self.state = action, state
 
@@ -43,12 +52,12 @@ class Machine:
 
     def allows(self, action: str) -> bool:
         """Whether `action` is possible now."""
-        return action in TRANSITIONS[self.state]
+        return action in possible(self.state, self.outcome)
 
     def do(self, action: str) -> State:
         """Move along the table; raises `WrongState` for what is not in it."""
         if not self.allows(action):
-            raise WrongState(action, self.state)
+            raise WrongState(action, self.state, self.outcome)
         self.state = TRANSITIONS[self.state][action]
         self.outcome = OUTCOMES.get(action, self.outcome)
         return self.state

@@ -35,6 +35,17 @@ def test_whatever_is_not_in_the_table_is_refused_and_changes_nothing():
         machine.do("abort")
 
 
+@pytest.mark.parametrize("end", ["abort", "fail"])
+def test_only_what_did_not_complete_can_be_continued(end):
+    machine = Machine()
+    for action in ("start", end, "finish", "continue"):
+        machine.do(action)
+    assert machine.state == "running"
+    for action in ("complete", "finish"):
+        machine.do(action)
+    assert not machine.allows("continue")
+
+
 def test_a_failure_while_finishing_wins():
     machine = Machine()
     for action in ("start", "complete", "fail", "finish"):
