@@ -1,0 +1,260 @@
+"""The parameters of `extended_hair` and their values at a hit: constants, or tables of strands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from appearance.bsdf.absorption import of_colour, of_melanin
+from appearance.bsdf.corrective import axis_in_frame
+from appearance.bsdf.lobes import Fibre
+from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
+
+INFINITE = float("inf")
+SCALARS = {
+    "longitudinal_roughness": (0.3, 0.001, 1.0),
+    "azimuthal_roughness": (0.3, 0.001, 1.0),
+    "scale_tilt": (2.0, -20.0, 20.0),
+    "eta": (1.55 / 1.000277, 1.0001, 5.0),
+}
+"""Name: default, least and greatest value."""
+PIGMENTS = {"eumelanin": (1.3, 0.0, INFINITE), "pheomelanin": (0.2, 0.0, INFINITE)}
+
+
+class HairParameters:
+    """The values of one BSDF, each a Dr.Jit array that Mitsuba's `traverse` may replace in place.
+
+    `values` maps names to constants (`Float`, `Color3f`), per-strand `Float (S,)`, or tensors; what
+    they mean is in `appearance.bsdf.plugin`. Raises `ValueError` naming the parameter.
+    """
+
+    def __init__(self, props: Any) -> None:
+        self.values: dict[str, Any] = {}
+        for name, limits in SCALARS.items():
+            self.values[name] = _scalar(props, name, *limits)
+        if "int_ior" in props or "ext_ior" in props:
+            if "eta" in props:
+                raise ValueError("extended_hair: give eta or int_ior and ext_ior, not both")
+            ratio = _index(props, "int_ior", 1.55) / _index(props, "ext_ior", 1.000277)
+            self.values["eta"] = _checked("int_ior/ext_ior", ratio, *SCALARS["eta"][1:])
+        self.values |= _absorption(props)
+        if "rotation" in props:
+            self.values["rotation"] = _tensor("rotation", props["rotation"], 2, -np.pi, np.pi)
+        self.scale = float(props.get("scale", 1.0))
+        self.strands = {name: props[name] for name in NAMES if name in props}
+        self._constant: dict[str, Any] = {}
+        self.refresh()
+        missing = sorted(set(NAMES) - set(self.strands))
+        tables = [n for n, v in self.values.items() if _cells(v) > 1]
+        if missing and tables:
+            raise ValueError(
+                f"extended_hair: {tables} vary over strands, which needs {missing}: "
+                "merge strand_parameters(...) into the dictionary"
+            )
+
+    def refresh(self) -> None:
+        """Look for tables that are constant: those are read without a lookup."""
+        for name in ("sigma_a", "rotation"):
+            if name in self.values:
+                self._constant[name] = _constant(self.values[name])
+
+    def fibre(self, place: Place) -> Fibre:
+        """The fibre at a hit."""
+        import drjit as dr
+        import mitsuba as mi
+
+        beta_n = place.scalar(self.values["azimuthal_roughness"])
+        if "color" in self.values:
+            sigma_a = of_colour(self.values["color"], beta_n)
+        elif "sigma_a" in self.values:
+            sigma_a = self._look_up("sigma_a", mi.Color3f, place)
+        else:
+            sigma_a = mi.Color3f(*of_melanin(*(place.scalar(self.values[n]) for n in PIGMENTS)))
+        return Fibre(
+            sigma_a if self.scale == 1 else sigma_a * self.scale,
+            place.scalar(self.values["longitudinal_roughness"]),
+            beta_n,
+            place.scalar(self.values["eta"]),
+            -dr.deg2rad(place.scalar(self.values["scale_tilt"])),
+        )
+
+    def axis(self, place: Place) -> Any | None:
+        """Axis-angle in the shading frame that corrects it at a hit; None where nothing turns."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if "rotation" not in self.values:
+            return None
+        constant = self._known("rotation")
+        if constant is not None and not np.any(np.array(constant)):
+            return None
+        turn = self._look_up("rotation", mi.Vector2f, place)
+        frame, normal = place.si.sh_frame, place.normal
+        across = dr.dot(normal, frame.s), dr.dot(normal, frame.n)
+        return mi.Vector3f(*axis_in_frame(turn.x, turn.y, *across))
+
+    def _known(self, name: str) -> Any | None:
+        """The constant in table `name`; None where it varies or is being differentiated."""
+        import drjit as dr
+
+        return None if dr.grad_enabled(self.values[name]) else self._constant[name]
+
+    def _look_up(self, name: str, kind: Any, place: Place) -> Any:
+        value = self.values[name]
+        if _cells(value) == 1:
+            return value if isinstance(value, kind) else kind(*value.array)
+        constant = self._known(name)
+        return place.cell(value, kind) if constant is None else kind(constant)
+
+
+class Place:
+    """Where a hit lies, worked out only as far as it is asked for."""
+
+    def __init__(self, strands: dict[str, Any], si: Any, active: Any) -> None:
+        self.strands, self.si, self.active = strands, si, active
+
+    @cached_property
+    def strand(self) -> Any:
+        """Index of the strand."""
+        return self._gather("UInt32", "strand_of_segment", self.si.prim_index)
+
+    @cached_property
+    def along(self) -> Any:
+        """0 at the root to 1 at the tip, in segments."""
+        import drjit as dr
+        import mitsuba as mi
+
+        first = self._gather("UInt32", "first_segment", self.strand)
+        end = self._gather("UInt32", "first_segment", self.strand + 1)
+        inside = place_in_segment(
+            mi.Vector3f(self.si.p),
+            self.strands["control_points"],
+            self._gather("UInt32", "segment_indices", self.si.prim_index),
+            self.active,
+        )
+        whole = mi.Float(self.si.prim_index - first)
+        return dr.minimum((whole + inside) / mi.Float(end - first), 1)
+
+    @cached_property
+    def normal(self) -> Any:
+        """The first of the strand's own two normals."""
+        return self._gather("Vector3f", "reference_normals", self.si.prim_index)
+
+    def scalar(self, value: Any) -> Any:
+        """The element of a constant or per-strand `Float`."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if dr.width(value) == 1:
+            return value
+        return dr.gather(mi.Float, value, self.strand, self.active)
+
+    def cell(self, table: Any, kind: Any) -> Any:
+        """The value of a table at the hit: nearest on the scalp, linear along the strand."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if table.ndim == 2:
+            return dr.gather(kind, table.array, self.strand, self.active)
+        layers, columns, rows, _ = table.shape
+        uv = self._gather("Point2f", "root_uv", self.strand)
+        column = dr.minimum(mi.UInt32(uv.x * columns), columns - 1)
+        cell = column * rows + dr.minimum(mi.UInt32(uv.y * rows), rows - 1)
+        if layers == 1:
+            return dr.gather(kind, table.array, cell, self.active)
+        height = self.along * (layers - 1)
+        below = dr.minimum(mi.UInt32(height), layers - 2)
+        index = below * (columns * rows) + cell
+        low = dr.gather(kind, table.array, index, self.active)
+        high = dr.gather(kind, table.array, index + columns * rows, self.active)
+        return dr.lerp(low, high, height - mi.Float(below))
+
+    def _gather(self, kind: str, name: str, index: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        return dr.gather(getattr(mi, kind), self.strands[name], index, self.active)
+
+
+def _absorption(props: Any) -> dict[str, Any]:
+    import mitsuba as mi
+
+    ways = [n for n in ("sigma_a", "color") if n in props]
+    if ways and (len(ways) > 1 or any(n in props for n in PIGMENTS)):
+        raise ValueError("extended_hair: give one of sigma_a, color, or the two pigments")
+    if not ways:
+        return {name: _scalar(props, name, *limits) for name, limits in PIGMENTS.items()}
+    name, value = ways[0], props[ways[0]]
+    greatest = 1.0 if name == "color" else INFINITE
+    if isinstance(value, mi.TensorXf) and name == "sigma_a":
+        return {name: _tensor(name, value, 3, 0.0, greatest)}
+    if isinstance(value, float):
+        value = [value] * 3
+    if len(value) != 3 or isinstance(value, mi.TensorXf):
+        raise ValueError(f"extended_hair: {name} must be an rgb colour, got {value}")
+    channels = [_checked(name, v, 0.0, greatest) for v in value]
+    return {name: mi.Color3f(*channels)}
+
+
+def _scalar(props: Any, name: str, default: float, low: float, high: float) -> Any:
+    return _checked(name, props.get(name, default), low, high)
+
+
+def _checked(name: str, value: Any, low: float, high: float) -> Any:
+    """`value` as an opaque `Float`, after a check of its range."""
+    import drjit as dr
+    import mitsuba as mi
+
+    numbers = np.atleast_1d(np.asarray(getattr(value, "array", value), np.float32))
+    in_range = (numbers >= np.float32(low)) & (numbers <= np.float32(high))
+    if not (in_range & np.isfinite(numbers)).all():
+        raise ValueError(
+            f"extended_hair: {name} must be finite and in [{low:g}, {high:g}], "
+            f"got {numbers.min():g} to {numbers.max():g}"
+        )
+    values = mi.Float(numbers)
+    dr.make_opaque(values)
+    return values
+
+
+def _tensor(name: str, value: Any, channels: int, low: float, high: float) -> Any:
+    shape: Sequence[int] = value.shape
+    if len(shape) not in (2, 4) or shape[-1] != channels or 0 in shape:
+        raise ValueError(
+            f"extended_hair: {name} must be a tensor (S, {channels}) or (n_c, w, h, {channels}), "
+            f"got {tuple(shape)}"
+        )
+    _checked(name, value, low, high)
+    return value
+
+
+def _index(props: Any, name: str, default: float) -> float:
+    import mitsuba as mi
+
+    value = props.get(name, default)
+    return float(mi.lookup_ior(props, name, default) if isinstance(value, str) else value)
+
+
+def _cells(value: Any) -> int:
+    """Number of entries of a constant, a per-strand array or a table."""
+    import drjit as dr
+
+    return int(np.prod(value.shape[:-1])) if dr.is_tensor_v(value) else int(dr.width(value))
+
+
+def _constant(table: Any) -> list[Any] | None:
+    """The channels of a table that is the same everywhere; None where it varies."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not dr.is_tensor_v(table) or dr.grad_enabled(table):
+        return None
+    channels = table.shape[-1]
+    lane = dr.arange(mi.UInt32, len(table.array))
+    first = dr.gather(mi.Float, table.array, lane % channels)
+    if not dr.all(table.array == first):
+        return None
+    return [dr.opaque(mi.Float, table.array[i]) for i in range(channels)]

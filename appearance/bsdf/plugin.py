@@ -1,0 +1,89 @@
+"""The Mitsuba plugin `extended_hair`.
+
+Frame: as on Mitsuba's curves, +y of the shading frame runs along the fibre from root to tip and +z
+is the normal. The names that stock `hair` has too mean the same here.
+
+| parameter | type, default | |
+|---|---|---|
+| `longitudinal_roughness`, `azimuthal_roughness` | float or `Float (S,)`, 0.3 | in [0.001, 1], d |
+| `scale_tilt` | float or `Float (S,)`, 2 | degrees; Mitsuba's sign: + moves R to the tip, d |
+| `eta`, or `int_ior` and `ext_ior` | float or a material's name | only the ratio counts, d |
+| `sigma_a` | rgb, or `TensorXf` `(S, 3)`, `(n_c, w, h, 3)` | absorption per fibre radius, d |
+| `scale` | float, 1 | factor on the absorption |
+| `eumelanin`, `pheomelanin` | float or `Float (S,)`, 1.3 and 0.2 | instead of `sigma_a`, d |
+| `color` | rgb | Chiang's colour of dense hair, instead of `sigma_a`, d |
+| `rotation` | `TensorXf` `(S, 2)`, `(n_c, w, h, 2)` | correctives: radians about the strand's |
+| | | two transported normals, d |
+| `strand_coordinates.NAMES` | arrays | from `strand_parameters`; needed by whatever varies |
+
+S strands; n_c layers from root to tip, linear in between; (w, h) cells of the scalp, of which the
+nearest counts. d: differentiable. A table that is the same everywhere costs no lookup.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from appearance.bsdf.corrective import rodrigues
+from appearance.bsdf.lobes import evaluate, sample
+from appearance.bsdf.parameters import HairParameters, Place
+
+
+def plugin() -> Any:
+    """The plugin's class for the current variant; its base is another one in each."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class ExtendedHair(mi.BSDF):
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+            kind = mi.BSDFFlags.Glossy | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.NonSymmetric
+            sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            self.m_components = [kind | sides]
+            self.m_flags = kind | sides
+            self.parameters = HairParameters(props)
+
+        def traverse(self, callback: Any) -> None:
+            for name, value in self.parameters.values.items():
+                callback.put(name, value, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            self.parameters.refresh()
+
+        def sample(
+            self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            fibre, axis = self._at(si, active)
+            wi = si.wi if axis is None else rodrigues(-axis, si.wi)
+            wo, pdf, weight = sample(fibre, wi, sample1, sample2.x, sample2.y)
+            bs: Any = mi.BSDFSample3f()
+            bs.wo = wo if axis is None else rodrigues(axis, wo)
+            bs.pdf = dr.select(active, pdf, 0)
+            bs.eta = 1
+            bs.sampled_type = +mi.BSDFFlags.Glossy
+            bs.sampled_component = 0
+            return bs, dr.select(active, mi.Color3f(weight), 0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            fibre, axis = self._at(si, active)
+            wi = si.wi
+            if axis is not None:
+                wi, wo = rodrigues(-axis, wi), rodrigues(-axis, wo)
+            value, pdf = evaluate(fibre, wi, wo)
+            return dr.select(active, mi.Color3f(value), 0), dr.select(active, pdf, 0)
+
+        def to_string(self) -> str:
+            return f"extended_hair[{', '.join(self.parameters.values)}]"
+
+        def _at(self, si: Any, active: Any) -> tuple[Any, Any]:
+            place = Place(self.parameters.strands, si, active)
+            return self.parameters.fibre(place), self.parameters.axis(place)
+
+    return ExtendedHair

@@ -1,0 +1,164 @@
+"""The hair BSDF in plain float64 NumPy, one function per symbol, as the papers print it.
+
+Chiang et al. 2016 with near-field h, on the symbols of pbrt. Slow and readable: the other side of
+the tests of `appearance.bsdf.lobes`, which has the stable forms. Everything broadcasts.
+
+Directions are `(..., 3)` in the fibre's frame: +y along the fibre from root to tip, +z the surface
+normal. `wi` is the direction known so far (towards the eye), `wo` the one that is evaluated.
+theta is the inclination towards +y, gamma the azimuth about the fibre, 0 at the normal and positive
+towards -x. The lobes p are R, TT, TRT and the residual: everything that leaves later.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit, i0e
+
+Array = NDArray[np.float64]
+LOBES = 4
+
+
+def inclination(w: ArrayLike) -> Array:
+    """theta of the directions `w (..., 3)`."""
+    w = np.asarray(w, float)
+    return np.arctan2(w[..., 1], np.hypot(w[..., 0], w[..., 2]))
+
+
+def azimuth(w: ArrayLike) -> Array:
+    """gamma of the directions `w (..., 3)`; h, where a ray meets the fibre across, is its sine."""
+    w = np.asarray(w, float)
+    return np.arctan2(-w[..., 0], w[..., 2])
+
+
+def direction(theta: ArrayLike, gamma: ArrayLike) -> Array:
+    """The direction `(..., 3)` of an inclination and an azimuth."""
+    theta, gamma = np.broadcast_arrays(theta, gamma)
+    flat = np.cos(theta)
+    return np.stack([-flat * np.sin(gamma), np.sin(theta), flat * np.cos(gamma)], axis=-1)
+
+
+def variance(p: int, beta_m: ArrayLike) -> Array:
+    """v of lobe `p`: Chiang's map of the longitudinal roughness, a quarter for TT, four for TRT."""
+    b = np.asarray(beta_m, float)
+    return np.asarray((1, 0.25, 4, 4)[p] * (0.726 * b + 0.812 * b**2 + 3.7 * b**20) ** 2)
+
+
+def logistic_scale(beta_n: ArrayLike) -> Array:
+    """s: Chiang's map of the azimuthal roughness to the scale of a logistic distribution."""
+    b = np.asarray(beta_n, float)
+    return np.asarray(np.sqrt(np.pi / 8) * (0.265 * b + 1.194 * b**2 + 5.372 * b**22))
+
+
+def tilted(p: int, theta: ArrayLike, tilt: ArrayLike) -> Array:
+    """theta that lobe `p` sees under a cuticle tilt, folded back into [-pi/2, pi/2]."""
+    turned = np.asarray(theta, float) + (2, -1, -4, 0)[p] * np.asarray(tilt, float)
+    return np.arcsin(np.sin(turned))
+
+
+def m_p(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
+    """M_p: the longitudinal lobe (d'Eon 2011, eq. 7), of unit integral over cos(theta_o) dtheta_o.
+
+    The printed exponent (c - s - 1)/v is -2 sin²((theta_i + theta_o)/2)/v.
+    """
+    theta_i, theta_o, v = (np.asarray(a, float) for a in (theta_i, theta_o, v))
+    c = np.abs(np.cos(theta_i) * np.cos(theta_o))
+    exponent = -2 * np.sin(0.5 * (theta_i + theta_o)) ** 2 / v
+    return np.asarray(i0e(c / v) * np.exp(exponent) / (-v * np.expm1(-2 / v)))
+
+
+def refracted_azimuth(theta: ArrayLike, gamma: ArrayLike, eta: ArrayLike) -> Array:
+    """gamma_t inside the fibre, by Bravais' modified index eta'."""
+    eta_p = np.sqrt(np.asarray(eta, float) ** 2 - np.sin(theta) ** 2) / np.cos(theta)
+    return np.arcsin(np.sin(gamma) / eta_p)
+
+
+def refracted_inclination(theta: ArrayLike, eta: ArrayLike) -> Array:
+    """theta_t inside the fibre."""
+    return np.arcsin(np.sin(theta) / np.asarray(eta, float))
+
+
+def phi(p: int, gamma: ArrayLike, gamma_t: ArrayLike) -> Array:
+    """Phi_p: how far lobe `p` turns the azimuth in a smooth fibre."""
+    return np.asarray(2 * p * np.asarray(gamma_t, float) - 2 * np.asarray(gamma) + p * np.pi)
+
+
+def logistic(x: ArrayLike, s: ArrayLike) -> Array:
+    """Logistic density of scale `s`."""
+    z = np.exp(-np.abs(x) / s)
+    return np.asarray(z / (s * (1 + z) ** 2))
+
+
+def n_p(p: int, turn: ArrayLike, gamma: ArrayLike, gamma_t: ArrayLike, s: ArrayLike) -> Array:
+    """N_p: density of the turn gamma_o - gamma_i; a logistic trimmed to [-pi, pi] about Phi_p."""
+    s = np.asarray(s, float)
+    if p == LOBES - 1:
+        return np.full(np.broadcast(turn, gamma, s).shape, 0.5 / np.pi)
+    x = np.asarray(turn, float) - phi(p, gamma, gamma_t)
+    x = x - 2 * np.pi * np.round(x / (2 * np.pi))
+    return np.asarray(logistic(x, s) / (expit(np.pi / s) - expit(-np.pi / s)))
+
+
+def fresnel(mu: ArrayLike, eta: ArrayLike) -> Array:
+    """F: unpolarised reflectance of a dielectric at the cosine `mu` to its normal."""
+    mu, eta = np.asarray(mu, float), np.asarray(eta, float)
+    inside = np.sqrt(1 - (1 - mu**2) / eta**2)
+    s = (mu - eta * inside) / (mu + eta * inside)
+    p = (eta * mu - inside) / (eta * mu + inside)
+    return np.asarray((s**2 + p**2) / 2)
+
+
+def a_p(p: int, f: ArrayLike, t: ArrayLike) -> Array:
+    """A_p: share of light that leaves by lobe `p`, from Fresnel's `f` and the transmission `t`."""
+    f, t = np.asarray(f, float), np.asarray(t, float)
+    if p == 0:
+        return np.broadcast_to(f, np.broadcast(f, t).shape)
+    share = (1 - f) ** 2 * t * (f * t) ** (p - 1)
+    return np.asarray(share if p < LOBES - 1 else share / (1 - f * t))
+
+
+def transmission(theta: ArrayLike, gamma: ArrayLike, eta: ArrayLike, sigma_a: ArrayLike) -> Array:
+    """T: what absorption leaves of light that crosses the fibre once."""
+    gamma_t = refracted_azimuth(theta, gamma, eta)
+    length = 2 * np.cos(gamma_t) / np.cos(refracted_inclination(theta, eta))
+    return np.exp(-np.asarray(sigma_a, float) * length)
+
+
+def lobe(
+    p: int,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    *,
+    beta_m: ArrayLike,
+    beta_n: ArrayLike,
+    eta: ArrayLike,
+    tilt: ArrayLike,
+) -> Array:
+    """M_p N_p: the density by solid angle of lobe `p` towards `wo`, of unit integral."""
+    theta, gamma = inclination(wi), azimuth(wi)
+    m = m_p(tilted(p, theta, tilt), inclination(wo), variance(p, beta_m))
+    gamma_t = refracted_azimuth(theta, gamma, eta)
+    return m * n_p(p, azimuth(wo) - gamma, gamma, gamma_t, logistic_scale(beta_n))
+
+
+def evaluate(
+    wi: ArrayLike,
+    wo: ArrayLike,
+    *,
+    sigma_a: ArrayLike,
+    beta_m: ArrayLike,
+    beta_n: ArrayLike,
+    eta: ArrayLike = 1.55,
+    tilt: ArrayLike = 0.0,
+) -> Array:
+    """BSDF times cosine: sum of A_p M_p N_p, per steradian.
+
+    `wi`, `wo` `(..., 3)` are unit directions; `sigma_a` is one channel's absorption per fibre
+    radius; `beta_m`, `beta_n` in (0, 1]; `eta` > 1 the relative index; `tilt` the cuticle's tilt
+    in radians, positive where R moves towards the root.
+    """
+    theta, gamma = inclination(wi), azimuth(wi)
+    f = fresnel(np.cos(theta) * np.abs(np.cos(gamma)), eta)
+    t = transmission(theta, gamma, eta, sigma_a)
+    shape = {"beta_m": beta_m, "beta_n": beta_n, "eta": eta, "tilt": tilt}
+    return np.asarray(sum(a_p(p, f, t) * lobe(p, wi, wo, **shape) for p in range(LOBES)))

@@ -1,0 +1,154 @@
+"""Where on the scalp and along its strand a hit lies, from the index of the segment that was hit.
+
+Mitsuba's own coordinate along all curves is one float32: with a few million segments it is off by a
+whole segment. The segment's index is an integer, and the place within the segment follows from the
+hit point and the segment's four control points.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+NAMES = (
+    "control_points",
+    "segment_indices",
+    "strand_of_segment",
+    "first_segment",
+    "root_uv",
+    "reference_normals",
+)
+"""The plugin's parameters that `strand_parameters` fills."""
+
+
+def strand_parameters(
+    control_points: ArrayLike,
+    segments: ArrayLike,
+    segments_of_strand: ArrayLike,
+    root_uv: ArrayLike | None = None,
+    root_normals: ArrayLike | None = None,
+) -> dict[str, Any]:
+    """What `extended_hair` needs to know of the curves, ready to be merged into its dictionary.
+
+    `control_points (N, 4)` and `segments (K,)` (the first of each segment's four control points)
+    are those of the `bsplinecurve` in the scene, in its units; `segments_of_strand (S,)` counts the
+    segments of each strand in the same order, and segments beyond their sum count as the last
+    strand's tip. `root_uv (S, 2)` in [0, 1] places roots on the scalp; without it, strand s lies at
+    ((s + 0.5)/S, 0.5). `root_normals (S, 3)` starts each strand's frame of normals and should move
+    with the head; without it, the frames follow the world's x axis. Raises `ValueError` on shapes
+    that do not fit.
+    """
+    import mitsuba as mi
+
+    points = np.asarray(control_points, float).reshape(-1, 4)
+    first_point = np.asarray(segments, np.int64)
+    counts = np.asarray(segments_of_strand, np.int64)
+    strands, total = len(counts), int(counts.sum())
+    if strands == 0 or counts.min() < 1 or total > len(first_point):
+        raise ValueError(
+            f"segments_of_strand must be positive and add up to at most the {len(first_point)} "
+            f"segments, got {strands} strands with {total}"
+        )
+    uv = np.stack([(np.arange(strands) + 0.5) / strands, np.full(strands, 0.5)], -1)
+    if root_uv is not None:
+        uv = np.asarray(root_uv, float)
+    if uv.shape != (strands, 2) or not ((uv >= 0) & (uv <= 1)).all():
+        raise ValueError(f"root_uv must be ({strands}, 2) in [0, 1], got shape {uv.shape}")
+    normals = transported_normals(points[:, :3], first_point[:total], counts, root_normals)
+    beyond = len(first_point) - total
+    strand = np.repeat(np.arange(strands), counts)
+    return {
+        "control_points": mi.Float(points.astype(np.float32).ravel()),
+        "segment_indices": mi.UInt32(first_point.astype(np.uint32)),
+        "strand_of_segment": mi.UInt32(np.pad(strand, (0, beyond), "edge").astype(np.uint32)),
+        "first_segment": mi.UInt32(np.concatenate([[0], np.cumsum(counts)]).astype(np.uint32)),
+        "root_uv": mi.Float(uv.astype(np.float32).ravel()),
+        "reference_normals": mi.Float(
+            np.pad(normals, ((0, beyond), (0, 0)), "edge").astype(np.float32).ravel()
+        ),
+    }
+
+
+def transported_normals(
+    points: NDArray[np.float64],
+    segments: NDArray[np.int64],
+    segments_of_strand: NDArray[np.int64],
+    root_normals: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """Unit normals `(K, 3)` at the middles of the segments, transported along each strand.
+
+    Parallel transport: from one segment to the next, the least rotation that takes one tangent to
+    the other, so that they do not turn about the strand. `points (N, 3)`; the rest as for
+    `strand_parameters`. Roots without `root_normals (S, 3)` start from the x axis, turned by the
+    least rotation that takes +z to the tangent: neighbours start alike.
+    """
+    p = [points[segments + i] for i in range(4)]
+    tangents = _unit(p[3] - p[0] + 5 * (p[2] - p[1]))
+    ends = np.cumsum(segments_of_strand)
+    starts = ends - segments_of_strand
+    up, across = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
+    if root_normals is None:
+        root = _turned(np.broadcast_to(across, (len(starts), 3)), up, tangents[starts])
+    else:
+        root = np.asarray(root_normals, float)
+        if root.shape != (len(starts), 3):
+            raise ValueError(f"root_normals must be ({len(starts)}, 3), got {root.shape}")
+    normals = np.empty_like(tangents)
+    normals[starts] = _upright(root, tangents[starts])
+    for i in range(1, int(segments_of_strand.max())):
+        at = starts[segments_of_strand > i] + i
+        moved = _turned(normals[at - 1], tangents[at - 1], tangents[at])
+        normals[at] = _upright(moved, tangents[at])
+    return normals
+
+
+def _turned(
+    v: NDArray[np.float64], before: NDArray[np.float64], after: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`v`, perpendicular to `before`, turned by the least rotation from `before` to `after`."""
+    cosine = (before * after).sum(-1, keepdims=True)
+    along = (v * after).sum(-1, keepdims=True)
+    return np.asarray(v - along / np.maximum(1 + cosine, 1e-9) * (before + after))
+
+
+def _upright(v: NDArray[np.float64], tangents: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`v` without its part along `tangents`, of unit length; any normal where none is left."""
+    left = v - (v * tangents).sum(-1, keepdims=True) * tangents
+    least = np.eye(3)[np.abs(tangents).argmin(-1)]
+    other = least - (least * tangents).sum(-1, keepdims=True) * tangents
+    return _unit(np.where(np.linalg.norm(left, axis=-1, keepdims=True) > 1e-6, left, other))
+
+
+def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
+
+
+def place_in_segment(p: Any, control_points: Any, first: Any, active: Any) -> Any:
+    """Parameter in [0, 1] of the point of a cubic B-spline segment that lies nearest to `p`.
+
+    `first` is the segment's first control point, in `control_points` (x, y, z, radius, …). From the
+    projection on the chord, two steps of Gauss-Newton.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    c = [dr.gather(mi.Point4f, control_points, first + i, active) for i in range(4)]
+    a, b, d, e = (mi.Vector3f(q.x, q.y, q.z) for q in c)
+    start, end = (a + 4 * b + d) / 6, (b + 4 * d + e) / 6
+    v = _projected(p - start, end - start)
+    for _ in range(2):
+        w = 1 - v
+        here = (w**3 * a + (3 * v**3 - 6 * v**2 + 4) * b + (3 * w**3 - 6 * w**2 + 4) * d) / 6
+        here = here + v**3 / 6 * e
+        slope = v**2 * e - w**2 * a + v * (3 * v - 4) * b + (1 + v * (2 - 3 * v)) * d
+        slope = 0.5 * slope
+        v = v + _projected(p - here, slope)
+    return dr.clip(v, 0, 1)
+
+
+def _projected(p: Any, direction: Any) -> Any:
+    import drjit as dr
+
+    return dr.dot(p, direction) / dr.maximum(dr.squared_norm(direction), 1e-30)
