@@ -18,7 +18,10 @@ from stage_service.config import (
     Level,
     RigFile,
 )
+from stage_service.flash import FlashRate, flash_rate
+from stage_service.limits import check_limits
 from stage_service.stepping import LATENCY_S, Run, limited_by, runs, seconds_by_cause
+from stage_service.timeline import timeline
 
 EXR_HEADER_BYTES = 700
 """What an EXR file holds beside 12 bytes a pixel, not counting its table of lines."""
@@ -73,7 +76,8 @@ class PlanCost(_Model):
     shooting, `seconds` includes exposure, settling, readout, link and storage; `limited_by` names
     what takes most of it. `stepping` counts the steps that the service and the trigger box clock,
     and `stepping_why` says why. `lamp_seconds` sums level times on-time over lamps; `dose` is the
-    radiant exposure at the head's centre, J/m² per channel, lamps and projectors together.
+    radiant exposure at the head's centre, J/m² per channel, lamps and projectors together. `flash`
+    says how fast it flashes, and whether a living subject must have consented to that.
     """
 
     steps: int
@@ -87,6 +91,7 @@ class PlanCost(_Model):
     stepping_why: str
     lamp_seconds: float
     dose: tuple[float, float, float]
+    flash: FlashRate
     left_out: tuple[LeftOutWork, ...]
 
 
@@ -103,7 +108,8 @@ class CapturePlan(_Model):
 
     `brackets` are factors on the exposure of a light alone: all lights at the first factor, then
     all at the next, so that cameras are armed once for each. `rate_hz` is the most steps a second.
-    `stepping` says who clocks the steps; "auto" lets the trigger box do it where it can.
+    `stepping` says who clocks the steps; "auto" lets the trigger box do it where it can. `consent`
+    says who agreed, when, and to what, where a living subject is to see flashes of 3 to 30 Hz.
 
     In the sweep a tracking frame stands before every full group of `tracking_every` scanlines of
     a projector, floor(rows / tracking_every) of them and at least one: 76 for 768 rows, 6 for 64.
@@ -117,6 +123,7 @@ class CapturePlan(_Model):
     brackets: Annotated[tuple[Bracket, ...], Field(min_length=1, max_length=8)] = (1.0,)
     stepping: Literal["auto", "software", "hardware"] = "auto"
     rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
+    consent: Annotated[str, Field(min_length=12, max_length=2000)] | None = None
     tracking_every: Annotated[int, Field(ge=0)] | None = None
     retries: Annotated[int, Field(ge=0, le=20)] | None = None
     exposure: KindExposures = KindExposures()
@@ -153,6 +160,10 @@ class CapturePlan(_Model):
             problems.append("projectors: the rig file has no [devices.projectors]")
         if not problems and not self.steps(rig_file):
             problems.append("the plan has no steps: no lights, no projectors, no sentinels")
+        if not problems:
+            parts, _ = self.runs(rig_file, self.steps(rig_file))
+            lights = timeline(parts, rig_file, rate_hz=self.rate_hz)
+            problems += check_limits(lights, rig, rig_file.safety)
         if problems:
             raise PlanError(problems)
 
@@ -227,6 +238,8 @@ class CapturePlan(_Model):
             folder_bytes=folder,
             rate_hz=self.rate_hz,
         )
+        lag = causes["storage"] / len(steps)
+        lights = timeline(parts, rig_file, rate_hz=self.rate_hz, lag_s=lag)
         lamp_seconds, dose = _dose(rig, steps, causes["settle"] / len(steps) + LATENCY_S)
         return PlanCost(
             steps=len(steps),
@@ -243,6 +256,7 @@ class CapturePlan(_Model):
             stepping_why=why,
             lamp_seconds=lamp_seconds,
             dose=dose,
+            flash=flash_rate(lights, rig_file.safety.living_subject),
             left_out=self.left_out(rig_file),
         )
 

@@ -38,6 +38,8 @@ lights = {LIGHTS}
 radius = 1.2
 intensity = [8.0, 8.0, 8.0]
 beside_cameras_at = 0.05
+[safety]
+living_subject = false
 [devices]
 heartbeat_s = 0.2
 watchdog_s = {WATCHDOG_S}

@@ -1,0 +1,231 @@
+"""A light bank that keeps the rig file's `[safety]` limits, whatever it is asked to do."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+
+from stage_service.config import SafetyLimits
+from stage_service.devices.errors import SafetyRefusal
+from stage_service.devices.lights.interface import LightBank, LightStatus, Lit
+
+AGAIN_S = 0.1
+"""After so many seconds lamps that could not be put off are tried again."""
+
+
+class LimitedLightBank:
+    """Implements `LightBank` over `bank`; what exceeds `limits` raises `SafetyRefusal`.
+
+    A lamp that stays lit too long, or too much of the time, is put off by a thread of this bank.
+    From then on every command but `off` raises, heartbeats too, so that a bank that does not obey
+    is left to its own watchdog; `connect` begins anew. Sequences that the trigger box clocks are
+    checked entry by entry; how long their lamps are lit follows from the plan.
+    """
+
+    def __init__(
+        self,
+        bank: LightBank,
+        limits: SafetyLimits,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name, self.capabilities = bank.name, bank.capabilities
+        self._bank, self._limits, self._clock = bank, limits, clock
+        self._level = 1.0  # what a bank has at power-up, and one without levels always
+        self._since: dict[int, float] = {}
+        self._past: dict[int, deque[tuple[float, float]]] = {}
+        self._refusal: SafetyRefusal | None = None
+        self._changed = threading.Condition(threading.RLock())
+        self._wakes = 0.0
+        self._thread: threading.Thread | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of lamps."""
+        return self._bank.count
+
+    def connect(self) -> None:
+        """Open the link; what was refused before is over."""
+        self._bank.connect()
+        with self._changed:
+            self._refusal = None
+
+    def close(self) -> None:
+        """Close the link; the lamps stay as they are, and are watched no more."""
+        with self._changed:
+            thread, self._thread = self._thread, None
+            self._changed.notify_all()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join()
+        self._bank.close()
+
+    def select(self, lamp: int) -> None:
+        """Put exactly this lamp on."""
+        with self._changed:
+            self._allow((lamp,), f"putting lamp {lamp} on")
+            self._bank.select(lamp)
+
+    def all_on(self) -> None:
+        """Put every lamp on."""
+        with self._changed:
+            self._allow(range(self.count), "putting all lamps on")
+            self._bank.all_on()
+
+    def off(self) -> None:
+        """Put every lamp off; never refused."""
+        with self._changed:
+            self._bank.off()
+            self._lit(())
+
+    def set_level(self, level: float) -> None:
+        """Set the level of every lamp."""
+        with self._changed:
+            self._raise_refusal()
+            self._check_power(len(self._since), level, f"setting the level to {level:g}")
+            self._bank.set_level(level)
+            self._level = level
+
+    def set_watchdog(self, seconds: float) -> None:
+        """Set the bank's watchdog."""
+        self._bank.set_watchdog(seconds)
+
+    def heartbeat(self) -> None:
+        """Tell the watchdog that somebody is there, unless lamps had to be put off."""
+        self._raise_refusal()
+        self._bank.heartbeat()
+
+    def status(self) -> LightStatus:
+        """Read the status back; says why, where lamps are off that were put on."""
+        if self._since:
+            self._raise_refusal()
+        return self._bank.status()
+
+    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
+        """Check each entry and upload them."""
+        with self._changed:
+            self._raise_refusal()
+            for number, (lit, level) in enumerate(entries):
+                lamps = {"all": self.count, "none": 0}.get(lit, 1) if isinstance(lit, str) else 1
+                doing = f"loading entry {number} of a sequence"
+                self._check_lamps(lamps, doing)
+                self._check_power(lamps, level, doing)
+            self._bank.load_sequence(entries)
+            self._lit(())
+
+    def position(self) -> int:
+        """How many steps of the armed sequence are over."""
+        return self._bank.position()
+
+    def enforce(self) -> float:
+        """Put the lamps off where one has been lit too long; seconds until this is due again."""
+        with self._changed:
+            if not self._since:
+                return self._limits.max_on_s
+            if self._refusal is None:
+                now = self._clock()
+                left, lamp = min((self._left(x, now), x) for x in self._since)
+                if left > 0:
+                    return left
+                self._refusal = self._too_long(lamp, now, f"keeping lamp {lamp} lit")
+            try:
+                self._bank.off()
+            except Exception:  # the heartbeats have ended: the bank's own watchdog is at work, too
+                return AGAIN_S
+            return self._limits.max_on_s
+
+    def _allow(self, lamps: Sequence[int], doing: str) -> None:
+        """Take it that these lamps are lit from now on. Raises `SafetyRefusal`."""
+        self._raise_refusal()
+        self._check_lamps(len(lamps), doing)
+        self._check_power(len(lamps), self._level, doing)
+        self._lit(lamps)
+        now = self._clock()
+        left, lamp = min((self._left(x, now), x) for x in lamps)
+        if left <= 0:
+            refusal = self._too_long(lamp, now, doing)
+            self._bank.off()
+            self._lit(())
+            raise refusal
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._watch, name="lamp limits", daemon=True)
+            self._thread.start()
+        elif now + left < self._wakes:
+            self._changed.notify_all()
+
+    def _lit(self, lamps: Iterable[int]) -> None:
+        """Book the lamps that are lit from now on, and those that no longer are."""
+        now, before = self._clock(), self._since
+        self._since = {x: before.get(x, now) for x in lamps}
+        if self._limits.max_duty < 1:
+            for lamp in before.keys() - self._since.keys():
+                self._past.setdefault(lamp, deque()).append((before[lamp], now))
+
+    def _left(self, lamp: int, now: float) -> float:
+        """Seconds that a lit lamp may at least stay lit."""
+        limits = self._limits
+        left = self._since.get(lamp, now) + limits.max_on_s - now
+        if limits.max_duty < 1:
+            left = min(left, limits.max_duty * limits.duty_window_s - self._used(lamp, now))
+        return left
+
+    def _used(self, lamp: int, now: float) -> float:
+        """Seconds that the lamp was lit within the last window."""
+        begin = now - self._limits.duty_window_s
+        past = self._past.get(lamp, deque())
+        while past and past[0][1] <= begin:
+            past.popleft()
+        spans = [*past, (self._since.get(lamp, now), now)]
+        return sum(end - max(start, begin) for start, end in spans)
+
+    def _too_long(self, lamp: int, now: float, doing: str) -> SafetyRefusal:
+        limits, on = self._limits, now - self._since.get(lamp, now)
+        if on >= limits.max_on_s:
+            return self._error(
+                doing,
+                f"at most {limits.max_on_s:g} s (max_on_s in [safety])",
+                f"lit for {on:.3g} s",
+                "It was put off. Shorten the exposure; a device that answers late keeps it lit.",
+            )
+        return self._error(
+            doing,
+            f"at most {limits.max_duty * limits.duty_window_s:.3g} s of {limits.duty_window_s:g} s "
+            "(max_duty in [safety])",
+            f"lit for {self._used(lamp, now):.3g} s",
+            "Let the lamp cool, then continue; a lower rate_hz gives it time.",
+        )
+
+    def _check_lamps(self, lamps: int, doing: str) -> None:
+        most = self._limits.max_lamps
+        if most is not None and lamps > most:
+            raise self._error(
+                doing,
+                f"at most {most} lamps lit (max_lamps in [safety])",
+                f"{lamps} asked for",
+                "Leave the sentinels out of the plan (sentinels = false).",
+            )
+
+    def _check_power(self, lamps: int, level: float, doing: str) -> None:
+        most, power = self._limits.max_power_w, lamps * level * self._limits.lamp_power_w
+        if most is not None and power > most:
+            raise self._error(
+                doing,
+                f"at most {most:g} W (max_power_w in [safety])",
+                f"{lamps} lamps at level {level:g}, {power:.4g} W",
+                "Lower the level in the plan.",
+            )
+
+    def _raise_refusal(self) -> None:
+        if self._refusal is not None:
+            raise self._refusal
+
+    def _watch(self) -> None:
+        """Run `enforce` whenever it is due; a lamp that is lit later is due later."""
+        with self._changed:
+            while self._thread is threading.current_thread():
+                wait = self.enforce()
+                self._wakes = self._clock() + wait
+                self._changed.wait(wait)
+
+    def _error(self, doing: str, expected: str, received: str, todo: str) -> SafetyRefusal:
+        return SafetyRefusal(self.name, doing, expected=expected, received=received, todo=todo)
