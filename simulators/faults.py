@@ -11,7 +11,7 @@ from pathlib import Path
 SERIAL = ("silent", "garbage", "nak", "late", "noise", "unplug")
 """What can go wrong on a serial line; see `Fault`."""
 _KINDS = {
-    "camera": ("drop", "mute"),
+    "camera": ("drop", "mute", "lost", "repeat", "stray", "late_frame"),
     "trigger": (
         *SERIAL,
         *("interlock", "estop", "double", "dropped", "uncounted", "late_trigger"),
@@ -29,8 +29,10 @@ class FaultError(ValueError):
 class Fault:
     """One fault. `pulse` is the trigger box's count from which, or at which, it shows.
 
-    camera drop: no frame of `camera` for that pulse, once. camera mute: `camera` answers nothing
-    from that pulse on. trigger interlock or estop: open or pressed after that pulse, for good.
+    camera drop: `camera` misses that pulse, once. camera lost: its frame is made, and lost on the
+    way. camera repeat: its frame has the number of the one before. camera stray: it makes one more
+    frame than was asked for. camera late_frame: the frame is not to be had before the next pulse.
+    camera mute: `camera` answers nothing from that pulse on. trigger interlock or estop: open or pressed after that pulse, for good.
     trigger double: fires twice, counts once; dropped: counts, does not fire; uncounted: fires, does
     not count; late_trigger: fires `seconds` late. projectors blank: after that pulse no pattern
     comes up any more, for good. lights hang: the bank answers nothing after that pulse, and its
@@ -101,6 +103,11 @@ class Faults:
                 raise FaultError(f"{where}: no camera {fault.camera!r}; the rig has {cameras}")
             faults.append(fault)
         return cls(tuple(faults))
+
+    def add(self, fault: Fault) -> None:
+        """Have one more fault, while the devices run."""
+        with self._lock:
+            self._left.append(fault)
 
     def once(self, device: str, kind: str, pulse: int, camera: str | None = None) -> bool:
         """Whether this fault shows at exactly `pulse`; it is then used up."""

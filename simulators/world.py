@@ -22,7 +22,7 @@ from simulators.projector_controller import ProjectorController, Show
 
 Counts = NDArray[np.uint16]
 MakeCounts = Callable[[str, Snapshot, float], Counts]
-_BLOCK_IDS = 65535
+BLOCK_IDS = 65535
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,7 @@ class _CameraState:
     exposure: float | None = None  # None: not armed
     block_id: int = 0
     queue: deque[Exposed] = field(default_factory=deque)
+    late: list[Exposed] = field(default_factory=list)
 
 
 class World:
@@ -173,9 +174,16 @@ class World:
                 continue
             if self._faults.once("camera", "drop", shot.pulse, name):
                 continue
+            camera.queue.extend(camera.late)
+            camera.late.clear()
             lane = self._lanes[index % len(self._lanes)]
             counts = lane.submit(self._make, name, shot, camera.exposure)
-            self._queue(camera, camera.exposure, counts)
+            for kind in ("repeat", "lost", "late_frame", "stray"):
+                if self._faults.once("camera", kind, shot.pulse, name):
+                    self._queue(camera, camera.exposure, counts, kind)
+                    break
+            else:
+                self._queue(camera, camera.exposure, counts)
 
     def _move_subject(self, power: NDArray[np.float64], show: Show) -> None:
         lit = int(np.count_nonzero(power))
@@ -188,13 +196,22 @@ class World:
         elif show.level > 0:
             self._rows_shown = True
 
-    def _queue(self, camera: _CameraState, exposure: float, counts: Future[Counts]) -> None:
-        camera.block_id = camera.block_id % _BLOCK_IDS + 1
-        now = time.monotonic() - self._began
-        camera.queue.append(Exposed(camera.block_id, now, exposure, counts))
+    def _queue(
+        self, camera: _CameraState, exposure: float, counts: Future[Counts], fault: str = ""
+    ) -> None:
+        for _ in range(2 if fault == "stray" else 1):
+            if fault != "repeat":
+                camera.block_id = camera.block_id % BLOCK_IDS + 1
+            now = time.monotonic() - self._began
+            frame = Exposed(camera.block_id, now, exposure, counts)
+            if fault == "late_frame":
+                camera.late.append(frame)
+            elif fault != "lost":
+                camera.queue.append(frame)
 
     def _empty(self, camera: str) -> None:
-        queue = self._cameras[camera].queue
-        for frame in queue:
+        held = self._cameras[camera]
+        for frame in (*held.queue, *held.late):
             frame.counts.cancel()
-        queue.clear()
+        held.queue.clear()
+        held.late.clear()
