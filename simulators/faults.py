@@ -10,6 +10,7 @@ from pathlib import Path
 
 SERIAL = ("silent", "garbage", "nak", "late", "noise", "unplug")
 """What can go wrong on a serial line; see `Fault`."""
+_ON_REQUEST = (*SERIAL, "crc", "echo")
 _KINDS = {
     "camera": ("drop", "mute", "lost", "repeat", "stray", "late_frame"),
     "trigger": (
@@ -17,7 +18,7 @@ _KINDS = {
         *("interlock", "estop", "double", "dropped", "uncounted", "late_trigger"),
     ),
     "projectors": (*SERIAL, "blank"),
-    "lights": ("hang",),
+    "lights": (*SERIAL, "crc", "echo", "hang", "lies", "stuck"),
 }
 
 
@@ -36,10 +37,14 @@ class Fault:
     trigger double: fires twice, counts once; dropped: counts, does not fire; uncounted: fires, does
     not count; late_trigger: fires `seconds` late. projectors blank: after that pulse no pattern
     comes up any more, for good. lights hang: the bank answers nothing after that pulse, and its
-    watchdog goes on.
+    watchdog goes on; lies: it reports no lamp as lit after that pulse, for good; stuck: the lamps
+    that are lit at that pulse cannot be put off any more.
 
     Serial faults strike once, at the first request from that pulse on that begins with `request`;
-    without it any of the projectors, and PULSE of the trigger box. silent: carried out, not
+    without it any of the projectors and the lights, and PULSE of the trigger box. The lights'
+    requests begin with function code and address on Modbus ("6 1000": the selector), with the
+    label on DMX. Theirs are also crc: the answer's checksum is wrong (RTU); echo: a write is
+    answered with another value. silent: carried out, not
     answered. garbage: carried out, the reply is broken. nak: not carried out, answered with an
     error. late: carried out, answered `seconds` later. noise: carried out, a line of garbage comes
     before the reply. unplug: the port goes away before it is carried out, and comes back
@@ -61,7 +66,7 @@ class Fault:
             raise FaultError(f"pulse must be a whole number >= 0, got {self.pulse!r}")
         if (self.device == "camera") != (self.camera is not None):
             raise FaultError(f"the field camera belongs to camera faults: {asdict(self)}")
-        if self.request is not None and self.kind not in SERIAL:
+        if self.request is not None and self.kind not in _ON_REQUEST:
             raise FaultError(f"the field request belongs to serial faults: {asdict(self)}")
         if not isinstance(self.seconds, int | float) or not 0 < self.seconds <= 60:
             raise FaultError(f"seconds must be over 0 and at most 60, got {self.seconds!r}")
@@ -126,7 +131,7 @@ class Faults:
             word = any_request if fault.request is None else fault.request
             return (
                 fault.device == device
-                and fault.kind in SERIAL
+                and fault.kind in _ON_REQUEST
                 and fault.pulse <= pulse
                 and request.startswith(word)
             )

@@ -223,14 +223,12 @@ class TriggerBox:
             self._state = "done"
 
     def _step(self, row: Row) -> None:
-        begun = time.monotonic()
         if "P" in row.gates:
             self._until_pattern(False)
         self._set_gates(row.gates)
         if "P" in row.gates:
             self._until_pattern(True)
-            begun = time.monotonic()
-        self._until(begun + row.settle)
+        self._until(time.monotonic() + row.settle)
         late = self._faults.at("trigger", "late_trigger", self._stage.pulses + 1)
         if late is not None:
             self._until(time.monotonic() + late.seconds)

@@ -1,0 +1,225 @@
+"""Serial devices on pseudo-terminals: simulated, of version 1, and the compiled firmware."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from reconstruction.projectors import Projector
+from simulators.faults import Fault, Faults
+from simulators.projector_controller import ProjectorController
+from simulators.serial_peer import SerialPeer
+from simulators.trigger_box import TriggerBox
+from stage_service.config import SerialConfig
+from stage_service.devices.projectors.serial_controller import SerialProjectorController
+from stage_service.devices.trigger.serial_box import SerialTriggerBox
+
+FIRMWARE = Path(__file__).resolve().parents[2] / "deploy" / "firmware"
+TIMEOUT_S = 0.3
+
+Edge = tuple[float, str, bool]
+"""When, which output (L, P, C), and whether it went up; a camera pulse is the way up alone."""
+
+
+@pytest.fixture
+def until() -> Callable[[Callable[[], bool]], None]:
+    """`until(condition)`: poll for what another thread or process brings about."""
+
+    def wait(condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 10
+        while not condition():
+            assert time.monotonic() < deadline, "it did not happen within 10 s"
+            time.sleep(0.002)
+
+    return wait
+
+
+class Wires:
+    """What a simulated trigger box is wired to; keeps the edges of its outputs."""
+
+    class Gate:
+        def __init__(self, edges: list[Edge], name: str, device: ProjectorController | None):
+            self.edges, self.name, self.device = edges, name, device
+
+        def gate(self, is_open: bool) -> None:
+            self.edges.append((time.monotonic(), self.name, is_open))
+            if self.device is not None:
+                self.device.gate(is_open)
+
+        @property
+        def trigger_out(self) -> bool:
+            return self.device is not None and self.device.trigger_out
+
+    def __init__(self, controller: ProjectorController, faults: Faults) -> None:
+        self.edges: list[Edge] = []
+        self.pulses = self.fired = 0
+        self.faults = faults
+        self.lamps = self.Gate(self.edges, "L", None)
+        self.projectors = self.Gate(self.edges, "P", controller)
+
+    def pulse(self, fires: int = 1, counts: int = 1) -> int:
+        self.pulses += counts
+        self.fired += fires
+        self.edges += [(time.monotonic(), "C", True)] * fires
+        return self.pulses
+
+    def reset(self) -> None:
+        self.pulses = 0
+
+    def safety(self) -> tuple[bool, bool]:
+        interlock, estop = (
+            self.faults.since("trigger", k, self.pulses) for k in ("interlock", "estop")
+        )
+        return interlock, estop
+
+
+class SerialStage:
+    """A simulated trigger box and projector controller, wired, each with its driver."""
+
+    def __init__(self, folder: Path, faults: Faults, stack: ExitStack) -> None:
+        places = {"left": [0.0, 1.0, 0.3], "right": [0.5, 1.0, 0.3]}
+        rig = [Projector.look_at(n, 8, 768, p, [0, 0, 0], 20.0) for n, p in places.items()]
+        self.faults = faults
+        self.controller = ProjectorController(rig, self.blank)
+        self.wires = Wires(self.controller, faults)
+        self.box = TriggerBox(self.wires, faults)
+        stack.callback(self.box.stop)
+        replies = {"trigger": self.box.reply, "projectors": self.controller.reply}
+        for name, reply in replies.items():
+            peer = SerialPeer(folder / name, self.heard(name, reply), self.strikes(name))
+            peer.start()
+            stack.callback(peer.stop)
+        self.requests: list[str] = []
+        config = {n: SerialConfig(port=str(folder / n), timeout_s=TIMEOUT_S) for n in replies}
+        self.trigger = SerialTriggerBox(config["trigger"])
+        self.projectors = SerialProjectorController(config["projectors"], ("left", "right"))
+        for driver in (self.trigger, self.projectors):
+            driver.connect()
+            stack.callback(driver.close)
+
+    def heard(self, name: str, reply: Callable[[str], str]) -> Callable[[str], str]:
+        def answer(line: str) -> str:
+            self.requests.append(f"{name} {line}")
+            return reply(line)
+
+        return answer
+
+    def strikes(self, name: str) -> Callable[[str], Fault | None]:
+        return lambda line: self.faults.on_request(name, line, self.wires.pulses + 1)
+
+    def blank(self) -> bool:
+        return self.faults.since("projectors", "blank", self.wires.pulses)
+
+
+@pytest.fixture
+def serial_stage(tmp_path: Path) -> Iterator[Callable[..., SerialStage]]:
+    """`serial_stage(*faults)`: simulated trigger box and projectors on pseudo-terminals."""
+    with ExitStack() as stack:
+        yield lambda *faults: SerialStage(tmp_path, Faults(faults), stack)
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[[Callable[[str], str]], SerialConfig]]:
+    """`serve(reply)`: a peer of the tests' own on a pseudo-terminal."""
+    with ExitStack() as stack:
+
+        def start(reply: Callable[[str], str]) -> SerialConfig:
+            peer = SerialPeer(tmp_path / "own", reply)
+            peer.start()
+            stack.callback(peer.stop)
+            return SerialConfig(port=str(peer.link), timeout_s=TIMEOUT_S)
+
+        yield start
+
+
+@pytest.fixture(scope="session")
+def build_firmware(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """`build_firmware(name, *options)`: the portable core, compiled; with sanitizers if it can."""
+    compiler = shutil.which("cc")
+    folder = tmp_path_factory.mktemp("firmware")
+
+    def build(name: str, *options: str, sources: tuple[str, ...] = ("host.c",)) -> Path:
+        if compiler is None:
+            pytest.skip("no C compiler: `cc` is not on the path")
+        strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1", "-g"]
+        core = ("protocol.c", "table.c", "text.c")
+        command = [compiler, *strict, *options, "-o", str(folder / name), *core, *sources]
+        subprocess.run(command, cwd=FIRMWARE, check=True, timeout=60)
+        return folder / name
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def firmware_host(build_firmware: Callable[..., Path]) -> Path:
+    """The trigger box's firmware as a program for this machine."""
+    try:
+        checked = "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
+        return build_firmware("host", *checked)
+    except subprocess.CalledProcessError:  # a compiler without the sanitizers' libraries
+        return build_firmware("host")
+
+
+class Firmware:
+    """The compiled trigger box on a pseudo-terminal; `steer` sets its inputs (host.c)."""
+
+    def __init__(self, program: Path, clock: int = 0) -> None:
+        self.edges: list[Edge] = []
+        self.process = subprocess.Popen(
+            [program, str(clock)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+        )
+        assert self.process.stdout is not None
+        port = self.process.stdout.readline().strip()
+        self.trigger = SerialTriggerBox(SerialConfig(port=port, timeout_s=TIMEOUT_S))
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        up: set[str] = set()
+        for line in self.process.stdout:
+            microseconds, outputs = line.split()
+            now = set(outputs) - {"-"}
+            for name in sorted(now ^ up):
+                if name != "C" or name in now:
+                    self.edges.append((int(microseconds) * 1e-6, name, name in now))
+            up = now
+
+    def steer(self, letter: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(letter)
+        self.process.stdin.flush()
+
+    def close(self) -> None:
+        self.trigger.close()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        assert self.process.wait(10) == 0  # the sanitizers say what is wrong by their exit code
+        self.reader.join(5)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def firmware(firmware_host: Path) -> Iterator[Callable[..., Firmware]]:
+    """`firmware(clock)`: the compiled trigger box, its microseconds beginning at `clock`."""
+    with ExitStack() as stack:
+
+        def start(clock: int = 0) -> Firmware:
+            one = Firmware(firmware_host, clock)
+            stack.callback(one.close)
+            one.trigger.connect()
+            return one
+
+        yield start
