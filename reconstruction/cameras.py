@@ -11,6 +11,22 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
+def facing(forward: ArrayLike, roll_deg: float = 0.0) -> Array:
+    """Rotation `(3, 3)` from the world to a device that looks along `forward (3,)`, not 0.
+
+    Rows: right, down, forward. At roll 0 the device's up is the world's +z; `roll_deg` turns it
+    clockwise about its viewing direction.
+    """
+    forward = np.asarray(forward, float)
+    forward = forward / np.linalg.norm(forward)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    return np.stack([c * right + s * down, c * down - s * right, forward])
+
+
 @dataclass(frozen=True, eq=False)
 class Pinhole:
     """A calibrated pinhole: `X_local = R @ X_world + t`, x right, y down, z forward.
@@ -59,16 +75,9 @@ class Pinhole:
         the device clockwise about its viewing direction; at 0 its image's up is the world's +z.
         """
         position, target = np.asarray(position, float), np.asarray(target, float)
-        forward = target - position
-        if not np.linalg.norm(forward) > 0:
+        if not np.linalg.norm(target - position) > 0:
             raise ValueError(f"{name}: position and target coincide at {position}")
-        forward = forward / np.linalg.norm(forward)
-        up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        down = np.cross(forward, right)
-        c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
-        R = np.stack([c * right + s * down, c * down - s * right, forward])
+        R = facing(target - position, roll_deg)
         f = 0.5 * width / np.tan(np.radians(fov_deg) / 2)
         K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]])
         return cls(name, width, height, K, R, -R @ position, **more)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from reconstruction.cameras import Camera, Pinhole
+from reconstruction.cameras import Camera, Pinhole, facing
+from reconstruction.ies import read_ies
+from reconstruction.lamp_profiles import LampProfile
 from reconstruction.lights import Light, dome_positions
 from reconstruction.projectors import Projector
 
@@ -36,6 +38,15 @@ class Rig:
             twice = {n for n in names if names.count(n) > 1}
             if twice:
                 raise RigError(f"rig {self.name}: {kind} must have distinct names, twice: {twice}")
+        kept = self.profiles
+        for profile in (x.profile for x in self.lights if x.profile is not None):
+            if kept[profile.name] is not profile:
+                raise RigError(f"rig {self.name}: two profiles are called {profile.name!r}")
+
+    @property
+    def profiles(self) -> dict[str, LampProfile]:
+        """The profiles of the lights, by name."""
+        return {x.profile.name: x.profile for x in self.lights if x.profile is not None}
 
     def camera(self, name: str) -> Camera:
         """The camera called `name`; KeyError names the ones there are."""
@@ -67,22 +78,28 @@ class Rig:
         except (json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
             raise RigError(f"{path}: {error}") from error
         try:
-            return cls.from_dict(data)
+            return cls.from_dict(data, path.parent)
         except (RigError, ValueError, TypeError) as error:
             raise RigError(f"{path}: {error}") from error
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Rig:
-        """Build a rig from the tables of a rig file; the device tables are not looked at."""
+    def from_dict(cls, data: dict[str, Any], folder: Path = Path()) -> Rig:
+        """Build a rig from the tables of a rig file; the device tables are not looked at.
+
+        Files that it names, such as IES profiles, are looked for in `folder`.
+        """
         cameras = tuple(_pinholes(Camera, data, "cameras"))
         if not cameras:
             raise RigError("a rig needs at least one [[cameras]] table")
         projectors = tuple(_pinholes(Projector, data, "projectors"))
-        return cls(str(data.get("name", "rig")), cameras, tuple(_lights(data, cameras)), projectors)
+        lights = tuple(_lights(data, cameras, _profiles(data, folder)))
+        return cls(str(data.get("name", "rig")), cameras, lights, projectors)
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready description with every pose explicit; `from_dict` reads it back exactly."""
+        profiles = {"profiles": {k: p.to_dict() for k, p in self.profiles.items()}}
         return {
+            **(profiles if self.profiles else {}),
             "name": self.name,
             "cameras": [c.to_dict() for c in self.cameras],
             "lights": [light.to_dict() for light in self.lights],
@@ -113,7 +130,7 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
         where = f"[[{key}]] number {i + 1} ({table.get('name', 'unnamed')})"
         name = str(_take(table, "name", where))
         width, height = (int(_take(table, f, where)) for f in ("width", "height"))
-        more = {f: table[f] for f in ("intensity", "line_sigma") if f in table}
+        more: dict[str, Any] = {f: table[f] for f in ("intensity", "line_sigma") if f in table}
         allowed = {
             "name",
             "width",
@@ -148,15 +165,75 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
     return out
 
 
-def _lights(data: dict[str, Any], cameras: tuple[Camera, ...]) -> list[Light]:
-    """Explicit `[[lights]]`, then the `[dome]`: the nearest dome lamp moves beside each camera."""
-    lights = []
-    for i, table in enumerate(data.get("lights", [])):
-        where = f"[[lights]] number {i + 1}"
-        name, position, intensity = (
-            _take(table, f, where) for f in ("name", "position", "intensity")
+def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LampProfile]:
+    """`[profiles.NAME]`: an IES `file` with a `unit`, or the table of `LampProfile.to_dict`."""
+    out = {}
+    for name, table in data.get("profiles", {}).items():
+        where = f"[profiles.{name}]"
+        try:
+            if "file" not in table:
+                out[name] = LampProfile.from_dict({**table, "name": name})
+                continue
+            if unknown := set(table) - {"file", "unit", "tilt_deg"}:
+                raise RigError(f"unknown fields {sorted(unknown)}")
+            unit = table.get("unit")
+            of_file = None if unit == "relative" else unit
+            read = read_ies(
+                folder / table["file"], unit=of_file, tilt_deg=float(table.get("tilt_deg", 0.0))
+            )
+            profile = read.profile.relative() if unit == "relative" else read.profile
+            out[name] = replace(profile, name=name)
+        except (ValueError, TypeError) as error:
+            raise RigError(f"{where}: {error}") from error
+    return out
+
+
+_LIGHT_FIELDS = {
+    *("name", "position", "intensity", "beside"),
+    *("orientation", "aim", "roll_deg", "profile", "radius", "size"),
+}
+
+
+def _light(table: dict[str, Any], where: str, profiles: dict[str, LampProfile]) -> Light:
+    """A lamp; `aim` (a direction) and `roll_deg` stand for `orientation`."""
+    if unknown := set(table) - _LIGHT_FIELDS:
+        raise RigError(
+            f"{where}: unknown fields {sorted(unknown)}; known are {sorted(_LIGHT_FIELDS)}"
         )
-        lights.append(Light(name, position, intensity, table.get("beside")))
+    name, position, intensity = (_take(table, f, where) for f in ("name", "position", "intensity"))
+    more: dict[str, Any] = {
+        f: table[f] for f in ("beside", "orientation", "radius", "size") if f in table
+    }
+    if "profile" in table:
+        if table["profile"] not in profiles:
+            raise RigError(
+                f"{where}: no [profiles.{table['profile']}]; there are {sorted(profiles)}"
+            )
+        more["profile"] = profiles[table["profile"]]
+    try:
+        if "aim" in table:
+            if "orientation" in more:
+                raise RigError("give orientation or aim, not both")
+            aim = np.asarray(table["aim"], float)
+            if aim.shape != (3,) or not np.isfinite(aim).all() or not aim.any():
+                raise RigError(f"aim must be a direction of 3 numbers, got {table['aim']}")
+            more["orientation"] = facing(aim, float(table.get("roll_deg", 0.0)))
+        return Light(name, position, intensity, **more)
+    except (ValueError, TypeError) as error:
+        raise RigError(f"{where}: {error}") from error
+
+
+def _lights(
+    data: dict[str, Any], cameras: tuple[Camera, ...], profiles: dict[str, LampProfile]
+) -> list[Light]:
+    """Explicit `[[lights]]`, then the `[dome]`: the nearest dome lamp moves beside each camera.
+
+    The dome's lamps are all alike and aim at the origin.
+    """
+    lights = [
+        _light(table, f"[[lights]] number {i + 1}", profiles)
+        for i, table in enumerate(data.get("lights", []))
+    ]
     dome = data.get("dome")
     if dome is None:
         return lights
@@ -174,6 +251,23 @@ def _lights(data: dict[str, Any], cameras: tuple[Camera, ...]) -> list[Light]:
             nearest = int(distance.argmin())
             beside[nearest] = camera.name
             positions[nearest] = camera.center - offset * camera.R[1]
+    shared = {f: dome[f] for f in ("profile", "radius", "size", "roll_deg") if f in dome}
+    if "profile" in shared or "size" in shared:
+        aims = [{"aim": -p} for p in positions]
+    else:
+        aims = [{} for _ in positions]
     return lights + [
-        Light(f"light_{i:03d}", positions[i], intensity, beside.get(i)) for i in range(count)
+        _light(
+            {
+                "name": f"light_{i:03d}",
+                "position": positions[i],
+                "intensity": intensity,
+                "beside": beside.get(i),
+                **shared,
+                **aims[i],
+            },
+            "[dome]",
+            profiles,
+        )
+        for i in range(count)
     ]
