@@ -48,10 +48,10 @@ class HairParameters:
         self._constant: dict[str, Any] = {}
         self.refresh()
         missing = sorted(set(NAMES) - set(self.strands))
-        tables = [n for n, v in self.values.items() if _cells(v) > 1]
+        tables = [n for n, v in self.values.items() if _cells(v) > 1 or n == "rotation"]
         if missing and tables:
             raise ValueError(
-                f"extended_hair: {tables} vary over strands, which needs {missing}: "
+                f"extended_hair: {tables} belong to strands, which needs {missing}: "
                 "merge strand_parameters(...) into the dictionary"
             )
 
@@ -103,9 +103,14 @@ class HairParameters:
         return None if dr.grad_enabled(self.values[name]) else self._constant[name]
 
     def _look_up(self, name: str, kind: Any, place: Place) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
         value = self.values[name]
+        if not dr.is_tensor_v(value):
+            return value
         if _cells(value) == 1:
-            return value if isinstance(value, kind) else kind(*value.array)
+            return dr.gather(kind, value.array, mi.UInt32(0))
         constant = self._known(name)
         return place.cell(value, kind) if constant is None else kind(constant)
 
