@@ -82,7 +82,8 @@ def _run(
         log = args.truth / EXPOSURES if args.truth is not None else None
         world = World(rig, Lamps(len(rig.lights)), faults, frames.counts, log, args.processes)
         free = args.ports == "auto"
-        stage = SimulatedStage(world, sensor, faults, args.state, rig_file.devices, free)
+        wires, paced = rig_file.devices, args.paced
+        stage = SimulatedStage(world, sensor, faults, args.state, wires, free, paced)
         # Ends in reverse: the renderer first, so that no frame holds up the devices' end.
         stack.enter_context(stage)
         stack.callback(responder.stop)
@@ -100,9 +101,9 @@ def _poses(rig_file: RigFile) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m simulators",
-        description="Simulated light stage: LED bank on Modbus TCP, trigger box and projector "
-        "controller on pseudo-terminals, cameras on TCP. Frames are rendered from what the devices "
-        "were commanded to do. Runs until SIGTERM.",
+        description="Simulated light stage: LED bank on the rig file's wire, trigger box and "
+        "projector controller on pseudo-terminals, cameras on TCP. Frames are rendered from "
+        "what the devices were commanded to do. Runs until SIGTERM.",
     )
     parser.add_argument("--rig", type=Path, required=True, help="rig file (TOML or JSON)")
     parser.add_argument(
@@ -114,6 +115,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--faults", type=Path, help="JSON list of faults (simulators/faults.py)")
     parser.add_argument(
         "--ports", choices=("auto", "rig"), default="rig", help="free TCP ports, or the rig file's"
+    )
+    parser.add_argument(
+        "--paced", action="store_true", help="a light bank on RTU answers at its baud rate"
     )
     parser.add_argument("--truth", type=Path, help="write the true strands, head, poses here")
     parser.add_argument("--truth-only", type=Path, help="write the truth here and end")

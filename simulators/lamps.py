@@ -42,6 +42,7 @@ class Lamps:
         self._selector = 0
         self._heartbeat = 0
         self._watchdog_ms = 2000
+        self._dead_man = True
         self._fed = clock()
         self._tripped = False
         self._table = np.zeros((ENTRIES, 2), np.uint16)
@@ -57,6 +58,10 @@ class Lamps:
         Either cuts the lamps' supply: they go off and stay off until they are commanded again.
         """
         self._cut = safety
+
+    def without_dead_man(self) -> None:
+        """Lamps that stay as they are when nobody speaks any more, as those on DMX."""
+        self._dead_man = False
 
     def power(self) -> NDArray[np.float64]:
         """Share of full intensity `(count,)` that each lamp gives right now, 0 to 1."""
@@ -89,7 +94,7 @@ class Lamps:
         with self._lock:
             return self._selector, self._heartbeat, self._watchdog_ms
 
-    def switch(self, first: int, on: Sequence[bool]) -> None:
+    def switch(self, first: int, on: Sequence[int]) -> None:
         """Put lamps on or off from lamp `first`; raises `NotNow`."""
         with self._lock:
             self._refuse_while_armed()
@@ -102,6 +107,12 @@ class Lamps:
         """Set levels from lamp `first`."""
         with self._lock:
             self._level[first : first + len(levels)] = levels
+
+    def show(self, levels: Sequence[int]) -> None:
+        """Level of every lamp at once; 0 is off."""
+        with self._lock:
+            self._level[:] = levels
+            self._set(self._level > 0)
 
     def select(self, command: int) -> bool:
         """The selector's command; False, and nothing happens, where there is no such lamp.
@@ -208,7 +219,7 @@ class Lamps:
     def _look(self) -> None:
         if not self._on.any() and not self._armed:
             return
-        late = self._clock() - self._fed > self._watchdog_ms / 1000
+        late = self._dead_man and self._clock() - self._fed > self._watchdog_ms / 1000
         self._tripped |= late
         if late or any(self._cut()):
             self._on = np.zeros(self.count, bool)

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from simulators.cameras import CameraLink
 from simulators.faults import Faults
-from simulators.led_bank import LedBank
+from simulators.light_bank import light_bank
 from simulators.sensor import Sensor
 from simulators.serial_peer import SerialPeer
 from simulators.trigger_box import TriggerBox
@@ -26,6 +26,7 @@ DEVICES_FILE = "devices.toml"
 class SimulatedStage:
     """The four peers around a `World`; a context manager.
 
+    With `paced` a light bank on RTU takes the time that its baud rate needs.
     `configured` is the rig file's `[devices]`; its TCP ports are used, or any free ones with
     `free_ports` or without it. Inside, `devices` holds the `[devices]` table with the true ports
     and paths, which `state/devices.toml` holds, too.
@@ -39,6 +40,7 @@ class SimulatedStage:
         state: Path,
         configured: DevicesConfig | None = None,
         free_ports: bool = True,
+        paced: bool = False,
     ) -> None:
         self._world = world
         self._sensor = sensor
@@ -46,6 +48,7 @@ class SimulatedStage:
         self._state = state
         self._configured = configured
         self._free_ports = free_ports
+        self._paced = paced
         self._stack = ExitStack()
         self.devices: dict[str, Any] = {}
 
@@ -67,16 +70,20 @@ class SimulatedStage:
         self._state.mkdir(parents=True, exist_ok=True)
         world, wires = self._world, self._configured
         fixed = None if self._free_ports else wires
-        light_host, light_port = HOST, 0
+        light_kind = wires.lights if wires else ModbusTcpConfig()
+        light_tcp = (HOST, 0)
         if fixed and isinstance(fixed.lights, ModbusTcpConfig):
-            light_host, light_port = fixed.lights.host, fixed.lights.port
+            light_tcp = (fixed.lights.host, fixed.lights.port)
         camera_host, camera_port = HOST, 0
         if fixed and isinstance(fixed.cameras, LinkCamerasConfig):
             camera_host, camera_port = fixed.cameras.host, fixed.cameras.port
         stack.callback(world.stop)
-        lights = LedBank(world.lamps, light_host, light_port, world.hanging)
+        link = self._state.absolute() / "lights"
+        lights = light_bank(light_kind, world, link, light_tcp, self._paced)
         stack.callback(lights.stop)
-        light_port = lights.start()
+        light: dict[str, Any] = {"kind": light_kind.kind, "port": lights.start()}
+        if isinstance(light_kind, ModbusTcpConfig):
+            light["host"] = light_tcp[0]
         cameras = CameraLink(world, self._sensor, camera_host, camera_port)
         stack.callback(cameras.stop)
         camera_port = cameras.start()
@@ -92,7 +99,7 @@ class SimulatedStage:
             paths[name] = str(peer.link)
         self.devices = wires.model_dump(mode="json", exclude_none=True) if wires else {}
         actual: dict[str, dict[str, Any]] = {
-            "lights": {"kind": "modbus_tcp", "host": light_host, "port": light_port},
+            "lights": light,
             "trigger": {"kind": "serial", "port": paths["trigger"]},
             "projectors": {"kind": "serial", "port": paths["projectors"]},
             "cameras": {"kind": "link", "host": camera_host, "port": camera_port},

@@ -106,6 +106,8 @@ class World:
         with self._lock:
             self._pulses += counts
             self._fired += 1
+            if self._faults.once("lights", "stuck", self._pulses):
+                self.lamps.stick()
             power, show = self.lamps.power(), self.projectors.show
             if fires:
                 self._move_subject(power, show)
@@ -156,9 +158,9 @@ class World:
         """Whether a fault keeps the projectors' patterns from coming up."""
         return self._faults.since("projectors", "blank", self._fired)
 
-    def hanging(self) -> bool:
-        """Whether a fault keeps the light bank from answering."""
-        return self._faults.since("lights", "hang", self._fired)
+    def begun(self, device: str, kind: str) -> bool:
+        """Whether a lasting fault of the device shows."""
+        return self._faults.since(device, kind, self._fired)
 
     def stop(self) -> None:
         """Make no more frames."""

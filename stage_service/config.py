@@ -43,9 +43,10 @@ class LightRegisters(Strict):
     """`[devices.lights.registers]`: Modbus addresses; the defaults are those of docs/wire.md.
 
     Holding registers, then input registers; `levels`, `coils` and `table` are the first of many.
-    None: the bank has no such register. Without `selector` lamps are put on by coils; without
-    `heartbeat` and `watchdog` there is no dead-man, without `lit` no read-back, without `sequence`
-    and `table` no hardware stepping. `signature` is (address, value), checked at `connect`.
+    None, "none" in TOML: the bank has no such register. Without `selector` lamps are put on by
+    coils; without `heartbeat` and `watchdog` there is no dead-man, without `lit` no read-back,
+    without `sequence`, `table` and `position` no hardware stepping. `signature` is (address,
+    value), checked at `connect`.
     """
 
     coils: Address = 0
@@ -61,6 +62,13 @@ class LightRegisters(Strict):
     count: Address | None = 2
     signature: tuple[Address, Address] | None = (3, 0x4853)
     position: Address | None = 4
+
+    @model_validator(mode="before")
+    @classmethod
+    def _none_in_toml(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        return {key: None if value == "none" else value for key, value in table.items()}
 
 
 class _LightBank(Strict):
@@ -98,11 +106,16 @@ class ModbusRtuConfig(_LightBank):
 
 
 class DmxConfig(_LightBank):
-    """`[devices.lights]`: lamps on DMX channels `first_channel` … through an Enttec USB Pro."""
+    """`[devices.lights]`: lamps on DMX channels `first_channel` … through an Enttec USB Pro.
+
+    A new level waits for the frame that is under way and then takes a frame itself: 50 ms at the
+    widget's 40 frames a second. `settle_s` covers them, or the pulse sees the lamps of before.
+    """
 
     kind: Literal["dmx_enttec"]
     port: str = Field(min_length=1)
     first_channel: int = Field(default=1, ge=1, le=512)
+    settle_s: float = Field(default=0.06, ge=0.0, le=1.0)
 
 
 def _modbus_tcp_by_default(table: Any) -> Any:
@@ -273,7 +286,7 @@ class _Tables(Strict):
     safety: SafetyLimits = SafetyLimits()
 
 
-GEOMETRY = {"name", "dome", "cameras", "lights", "projectors"}
+GEOMETRY = {"name", "dome", "cameras", "lights", "projectors", "profiles"}
 
 
 def load_rig_file(path: str | Path, devices: str | Path | None = None) -> RigFile:

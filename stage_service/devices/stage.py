@@ -13,8 +13,10 @@ from stage_service.config import (
     BaslerConfig,
     CamerasConfig,
     DevicesConfig,
+    DmxConfig,
     LightBankConfig,
     LinkCamerasConfig,
+    ModbusRtuConfig,
     ModbusTcpConfig,
     RigFile,
 )
@@ -23,8 +25,10 @@ from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
+from stage_service.devices.lights.dmx_enttec import DmxLightBank
 from stage_service.devices.lights.interface import LightBank
-from stage_service.devices.lights.modbus_tcp import ModbusLightBank
+from stage_service.devices.lights.limited import LimitedLightBank
+from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.interface import TriggerBox
@@ -55,7 +59,7 @@ class Stage:
             projectors = SerialProjectorController(config.projectors, names)
         return cls(
             config,
-            _light_bank(config.lights, len(rig.lights)),
+            LimitedLightBank(_light_bank(config.lights, len(rig.lights)), rig_file.safety),
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(_camera(config.cameras, c) for c in rig.cameras),
@@ -86,9 +90,7 @@ class Stage:
         """
         lights, trigger, beams = self.lights, self.trigger, self.projectors
         out = {
-            "lights": _ask(
-                lights, connect, lambda: {"count": lights.count, **asdict(lights.status())}
-            ),
+            "lights": _ask(lights, connect, lambda: _lamps(lights)),
             "trigger": _ask(
                 trigger, connect, lambda: {"pulses": trigger.count(), **asdict(trigger.status())}
             ),
@@ -110,10 +112,10 @@ class Stage:
 
 def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
     match config:
-        case ModbusTcpConfig():
+        case ModbusTcpConfig() | ModbusRtuConfig():
             return ModbusLightBank(config, lamps)
-        case _:
-            raise RigError(f"devices.lights: {config.kind} is not there yet")
+        case DmxConfig():
+            return DmxLightBank(config, lamps)
 
 
 def _camera(config: CamerasConfig, geometry: Geometry) -> Camera:
@@ -122,6 +124,11 @@ def _camera(config: CamerasConfig, geometry: Geometry) -> Camera:
             return LinkCamera(config, geometry)
         case BaslerConfig():
             return BaslerCamera(config, geometry)
+
+
+def _lamps(lights: LightBank) -> dict[str, Any]:
+    known = asdict(lights.status()) if lights.capabilities.reads_back else {}
+    return {"count": lights.count, **known}
 
 
 def _info(camera: Camera) -> dict[str, Any]:

@@ -30,6 +30,8 @@ class World:
         self.lock = threading.RLock()
         self.lit: set[int] = set()
         self.levels = [65535] * LAMPS
+        self.table = [0] * 8192
+        self.armed = self.position = 0
         self.show = "OFF"
         self.pulses = 0
         self.heartbeats = 0
@@ -72,7 +74,7 @@ class World:
 
 
 class Lights(socketserver.BaseRequestHandler):
-    """Modbus TCP by hand: functions 3, 4, 6 and 16."""
+    """Modbus TCP by hand: functions 3 (levels, sequence and table), 4, 6 and 16."""
 
     def handle(self) -> None:
         world: World = self.server.world  # type: ignore[attr-defined]
@@ -87,17 +89,28 @@ class Lights(socketserver.BaseRequestHandler):
         function, address, value = struct.unpack(">BHH", pdu[:5])
         if function == 4:
             bits = 2 * world.interlock | 4 * world.estop | 8 * bool(world.lit)
-            registers = [bits, len(world.lit), LAMPS, 0x4853][address : address + value]
-            return struct.pack(f">BB{value}H", 4, 2 * value, *registers)
+            bits |= 16 * bool(world.armed)
+            inputs = [bits, len(world.lit), LAMPS, 0x4853, world.position]
+            return struct.pack(f">BB{value}H", 4, 2 * value, *inputs[address : address + value])
+        if function == 3:
+            holding = {1003: [world.armed], 0: world.levels}.get(address)
+            words = (holding or world.table[address - 2000 :])[:value]
+            return struct.pack(f">BB{value}H", 3, 2 * value, *words)
         if function == 16:
             if value > 123:
                 return struct.pack(">BB", 0x90, 3)
             values = struct.unpack(f">{value}H", pdu[6:])
-            world.levels[address : address + value] = values
+            store, first = (world.table, 2000) if address >= 2000 else (world.levels, 0)
+            store[address - first : address - first + value] = values
             return struct.pack(">BHH", 16, address, value)
-        if address == 1000:
+        if address == 1003:
+            world.armed, world.position = value, 0
+        if address == 1000 and world.armed:
+            return struct.pack(">BB", 0x86, 4)
+        if address in (1000, 1003):
             if not (value == 0 and world.stuck_lamps):
-                world.lit = set() if value == 0 or world.dead_lamps else {value - 1}
+                dark = value == 0 or address == 1003 or world.dead_lamps
+                world.lit = set() if dark else {value - 1}
             if value == 65535:
                 world.lit = set(range(LAMPS))
         elif address == 1001:
@@ -256,6 +269,8 @@ def rig_file(world: World, tmp_path: Path) -> Iterator[RigFile]:
 
 def devices(ports: list[int], paths: list[str]) -> str:
     return f"""
+[safety]
+living_subject = false
 [devices]
 heartbeat_s = 0.05
 watchdog_s = 0.5

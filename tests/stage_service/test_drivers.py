@@ -20,7 +20,7 @@ from stage_service.devices.errors import (
     SafetyRefusal,
 )
 from stage_service.devices.heartbeat import Heartbeat
-from stage_service.devices.lights.modbus_tcp import ModbusLightBank
+from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.stage import Stage
 from stage_service.devices.trigger.serial_box import SerialTriggerBox

@@ -1,0 +1,81 @@
+"""A pseudo-terminal as a serial port that can be unplugged."""
+
+from __future__ import annotations
+
+import os
+import select
+import tty
+from pathlib import Path
+
+
+class Terminal:
+    """The near end of a pseudo-terminal; `link` points to the far one, the client's.
+
+    One thread receives and sends; `wake` may be called from any. Made plugged in, without a link.
+    """
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self._wake_read, self._wake_write = os.pipe()
+        self._make()
+
+    @property
+    def path(self) -> str:
+        """The device path behind the link."""
+        return os.ttyname(self._far)
+
+    def make_link(self) -> None:
+        """Let `link` point to the far end."""
+        fresh = self.link.with_name(self.link.name + ".new")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(self.path)
+        fresh.replace(self.link)
+
+    def receive(self, within_s: float | None = None) -> bytes | None:
+        """What came; empty when nothing came within `within_s`; None when the peer is to stop."""
+        ready, _, _ = select.select([self._near, self._wake_read], [], [], within_s)
+        if self._wake_read in ready:
+            return None
+        return os.read(self._near, 4096) if ready else b""
+
+    def send(self, data: bytes) -> None:
+        """Send to the far end."""
+        os.write(self._near, data)
+
+    def stops_within(self, seconds: float) -> bool:
+        """Wait so long; at once True when the peer is to stop."""
+        ready, _, _ = select.select([self._wake_read], [], [], seconds)
+        return bool(ready)
+
+    def unplug(self, seconds: float) -> None:
+        """The far end hangs up and the link is gone; after `seconds` there are new ones."""
+        self._remove_link()
+        self._close()
+        gone = self.stops_within(seconds)
+        self._make()
+        if not gone:
+            self.make_link()
+
+    def wake(self) -> None:
+        """Have the receiving thread told to stop."""
+        os.write(self._wake_write, b"x")
+
+    def close(self) -> None:
+        """Remove the link and close; the receiving thread has stopped."""
+        self._remove_link()
+        self._close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _make(self) -> None:
+        # The far end stays open here, or the near end would fail between two clients.
+        self._near, self._far = os.openpty()
+        tty.setraw(self._far)
+
+    def _close(self) -> None:
+        os.close(self._near)
+        os.close(self._far)
+
+    def _remove_link(self) -> None:
+        if self.link.is_symlink() and str(self.link.readlink()) == self.path:
+            self.link.unlink()

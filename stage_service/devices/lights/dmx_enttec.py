@@ -1,0 +1,206 @@
+"""A light bank on DMX through an Enttec DMX USB Pro (its API specification 1.44).
+
+The widget keeps sending the newest frame by itself, forty times a second: it is no dead-man, and
+nothing comes back from the lamps. After each frame the widget is asked for its parameters: its
+answer says that the frame has reached the widget, not that a lamp followed. No other request is
+ever sent: the widget stops its output for all but these two.
+"""
+
+from __future__ import annotations
+
+import select
+import struct
+import termios
+import threading
+import time
+from collections.abc import Sequence
+
+import serial
+
+from reconstruction.rig import RigError
+from stage_service.config import DmxConfig
+from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
+from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
+from stage_service.devices.lights.limits import cannot, refuse_unverified_blackout
+
+CHANNELS, FEWEST_CHANNELS = 512, 24
+FULL = 255
+GET_PARAMETERS, SEND_DMX = 3, 6
+_START, _END, _START_CODE = 0x7E, 0xE7, 0
+_NO_USER_DATA = b"\0\0"
+_PARAMETERS = struct.Struct("<HBBB")  # firmware, break, mark after break, frames a second
+
+
+class DmxLightBank:
+    """Implements `LightBank` without read-back, dead-man and table; see there for the contract.
+
+    Levels have 8 bits: they are rounded to n / 255, and a level above 0 that would become 0 is an
+    error. Raises `RigError` where the lamps do not fit one universe.
+    """
+
+    capabilities = LightCapabilities(reads_back=False, dead_man=False, table=0)
+
+    def __init__(self, config: DmxConfig, lamps: int) -> None:
+        last = config.first_channel + lamps - 1
+        if last > CHANNELS:
+            raise RigError(
+                f"devices.lights: {lamps} lamps from channel {config.first_channel} end at channel "
+                f"{last}; a DMX universe has {CHANNELS}"
+            )
+        self.name = f"light bank (DMX, {config.port})"
+        self.config = config
+        self._lamps = lamps
+        self._level = 1.0
+        self._on: range = range(0)
+        self._port: serial.Serial | None = None
+        self._lock = threading.RLock()
+
+    @property
+    def count(self) -> int:
+        """Number of lamps, as the rig file has it; DMX cannot confirm it."""
+        return self._lamps
+
+    def connect(self) -> None:
+        """Open the port and check that a widget answers; `DeviceError` unless the rig file accepts
+        that a blackout cannot be verified."""
+        refuse_unverified_blackout(
+            self.name, self.capabilities, self.config.accept_unverified_blackout
+        )
+        with self._lock:
+            self._open()
+            self._ask_parameters("identifying")
+
+    def close(self) -> None:
+        """Close the port; the widget goes on with its last frame."""
+        with self._lock:
+            if self._port is not None:
+                self._port.close()
+            self._port = None
+
+    def select(self, lamp: int) -> None:
+        """Have the widget send a frame with exactly this lamp on."""
+        if not 0 <= lamp < self._lamps:
+            raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {lamp}")
+        self._show(range(lamp, lamp + 1), self._level, f"putting lamp {lamp} on")
+
+    def all_on(self) -> None:
+        """Have the widget send a frame with every lamp on."""
+        self._show(range(self._lamps), self._level, "putting all lamps on")
+
+    def off(self) -> None:
+        """Have the widget send a dark frame."""
+        self._show(range(0), self._level, "putting all lamps off")
+
+    def set_level(self, level: float) -> None:
+        """Set the level of the lamps that are on, and of those that come next."""
+        if not 0 <= level <= 1:
+            raise ValueError(f"{self.name}: a level is 0 to 1, got {level}")
+        doing = f"setting the level to {level:g}"
+        if level > 0 and round(level * FULL) == 0:
+            raise DeviceError(
+                self.name,
+                doing,
+                expected=f"0, or at least {0.5 / FULL:.4f}",
+                received=f"{level:g}",
+                todo="DMX has 256 levels: use a longer exposure instead of a lower level.",
+            )
+        with self._lock:
+            if self._on and level != self._level:
+                self._show(self._on, level, doing)
+            self._level = level
+
+    def set_watchdog(self, seconds: float) -> None:
+        """DMX has none: raises `DeviceError`."""
+        raise cannot(self.name, f"setting the watchdog to {seconds:g} s", "a watchdog")
+
+    def heartbeat(self) -> None:
+        """DMX has no watchdog to feed: raises `DeviceError`."""
+        raise cannot(self.name, "sending a heartbeat", "a watchdog")
+
+    def status(self) -> LightStatus:
+        """Nothing comes back on DMX: raises `DeviceError`."""
+        raise cannot(self.name, "reading the status", "read-back")
+
+    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
+        """DMX has no sequence table: raises `DeviceError`."""
+        raise cannot(self.name, f"loading a sequence of {len(entries)} steps", "a sequence table")
+
+    def position(self) -> int:
+        """DMX has no sequence table: raises `DeviceError`."""
+        raise cannot(self.name, "reading the position in the sequence", "a sequence table")
+
+    def _show(self, on: range, level: float, doing: str) -> None:
+        channels = bytearray(max(FEWEST_CHANNELS, self.config.first_channel - 1 + self._lamps))
+        for lamp in on:
+            channels[self.config.first_channel - 1 + lamp] = round(level * FULL)
+        with self._lock:
+            self._open()
+            self._send(SEND_DMX, bytes([_START_CODE]) + channels, doing)
+            self._ask_parameters(doing)
+            self._on = on
+
+    def _open(self) -> None:
+        """Have an open port; what came before is dropped."""
+        try:
+            if self._port is None:
+                # The widget's USB driver ignores the baud rate.
+                timeout = self.config.timeout_s
+                self._port = serial.Serial(self.config.port, write_timeout=timeout, exclusive=True)
+            self._port.reset_input_buffer()
+        except (OSError, termios.error) as error:
+            raise self._lost("opening the port", error) from error
+
+    def _send(self, label: int, data: bytes, doing: str) -> None:
+        assert self._port is not None
+        message = struct.pack("<BBH", _START, label, len(data)) + data + bytes([_END])
+        try:
+            self._port.write(message)
+        except OSError as error:
+            raise self._lost(doing, error) from error
+
+    def _ask_parameters(self, doing: str) -> None:
+        """Wait until the widget has taken all that was sent to it."""
+        assert self._port is not None
+        self._send(GET_PARAMETERS, _NO_USER_DATA, doing)
+        deadline = time.monotonic() + self.config.timeout_s
+        came = b""
+        try:
+            while not _has_parameters(came):
+                wait = deadline - time.monotonic()
+                if wait <= 0 or not select.select([self._port], [], [], wait)[0]:
+                    self.close()
+                    raise DeviceTimeout(
+                        self.name,
+                        doing,
+                        expected="the widget's parameters",
+                        received=came[:32].hex(" ") or "nothing",
+                        deadline_s=self.config.timeout_s,
+                        todo="Its lamps may still be lit. Check the widget's USB cable, and that "
+                        "this port is an Enttec USB Pro.",
+                    )
+                came += self._port.read(max(1, self._port.in_waiting))
+        except OSError as error:
+            raise self._lost(doing, error) from error
+
+    def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
+        self.close()
+        return DeviceUnreachable(
+            self.name,
+            doing,
+            expected="an open serial port",
+            received=str(error),
+            deadline_s=self.config.timeout_s,
+            todo="Its lamps may still be lit. Plug the widget in and check the port in "
+            "[devices.lights].",
+        )
+
+
+def _has_parameters(data: bytes) -> bool:
+    """Whether a whole answer to `GET_PARAMETERS` is in `data`, among whatever else came."""
+    for start in range(len(data) - 4):
+        first, label, size = struct.unpack_from("<BBH", data, start)
+        end = start + 4 + size
+        whole = end < len(data) and data[end] == _END
+        if (first, label) == (_START, GET_PARAMETERS) and size >= _PARAMETERS.size and whole:
+            return True
+    return False

@@ -1,0 +1,38 @@
+"""What a light bank cannot do, told as errors."""
+
+from __future__ import annotations
+
+from stage_service.devices.errors import DeviceError
+from stage_service.devices.lights.interface import LightCapabilities
+
+
+def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool) -> None:
+    """Raise `DeviceError` for a bank that cannot guarantee a blackout, unless that is accepted."""
+    lacking = [
+        text
+        for there, text in (
+            (can.reads_back, "no read-back: that the lamps are off is never known"),
+            (can.dead_man, "no dead-man: when the service or the cable dies, lit lamps stay lit"),
+        )
+        if not there
+    ]
+    if lacking and not accepted:
+        raise DeviceError(
+            name,
+            "checking that a blackout can be guaranteed",
+            expected="read-back and a dead-man",
+            received="; ".join(lacking),
+            todo="Wire the emergency stop and a timer into the lamps' supply, then set "
+            "accept_unverified_blackout = true in [devices.lights].",
+        )
+
+
+def cannot(name: str, doing: str, lacks: str) -> DeviceError:
+    """The error of a call that the capabilities exclude."""
+    return DeviceError(
+        name,
+        doing,
+        expected=lacks,
+        received="a light bank without",
+        todo="Ask its capabilities first; [devices.lights] describes the bank.",
+    )

@@ -1,0 +1,386 @@
+"""A light bank on Modbus, TCP or RTU; `docs/wire.md` has its register map."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from pymodbus import ModbusException
+
+from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
+from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
+from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
+from stage_service.devices.lights.limits import cannot, refuse_unverified_blackout
+from stage_service.devices.lights.modbus_answers import CODES, expected, received, unusable
+from stage_service.devices.lights.modbus_links import ModbusLink, open_link
+
+ALL_ON, ALL_OFF = 65535, 0
+MOST_WRITTEN, MOST_READ = 122, 124  # even, so that a table's entries stay whole; of 123 and 125
+MOST_COILS = 1968
+TABLE_ENTRIES = 4096
+_ATTEMPTS_TO_FALL_INTO_STEP = 3
+_EXCEPTIONS = {1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "refused now"}
+
+
+class _OutOfStep(DeviceError):
+    """The answer belongs to another request."""
+
+
+class ModbusLightBank:
+    """Implements `LightBank` with pymodbus; see there for the contract.
+
+    After any trouble the link is closed. The next request opens it anew, drains it and identifies
+    the bank before anything else is asked, so that no late answer is taken for a later one's.
+    """
+
+    def __init__(self, config: ModbusTcpConfig | ModbusRtuConfig, lamps: int) -> None:
+        port = config.port
+        place = port if isinstance(config, ModbusRtuConfig) else f"{config.host}:{port}"
+        self.name = f"light bank ({place})"
+        self.config = config
+        self._map = r = config.registers
+        self.capabilities = LightCapabilities(
+            reads_back=r.lit is not None,
+            dead_man=None not in (r.heartbeat, r.watchdog),
+            table=TABLE_ENTRIES if None not in (r.sequence, r.table, r.position) else 0,
+        )
+        self._lamps = lamps
+        self._level: int | None = None
+        self._armed: int | None = None  # entries; None: not known
+        self._link: ModbusLink | None = None
+        self._identified = False
+        self._falls = 0
+        self._lock = threading.RLock()
+
+    @property
+    def count(self) -> int:
+        """Number of lamps, as the rig file has it and `connect` has confirmed it."""
+        return self._lamps
+
+    def connect(self) -> None:
+        """Connect; raises `DeviceError` where the peer is no light bank, has another size, or
+        cannot guarantee a blackout though the rig file does not accept that."""
+        refuse_unverified_blackout(
+            self.name, self.capabilities, self.config.accept_unverified_blackout
+        )
+        with self._lock:
+            self._identified = False
+            self._trust()
+
+    def close(self) -> None:
+        """Close the connection; the lamps stay as they are."""
+        with self._lock:
+            if self._link is not None:
+                self._link.close()
+            self._link = self._level = self._armed = None
+            self._identified = False
+
+    def select(self, lamp: int) -> None:
+        """Put exactly lamp `lamp` on, and confirm that one lamp is lit where the bank can."""
+        if not 0 <= lamp < self._lamps:
+            raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {lamp}")
+        self._command(lamp + 1, 1, f"putting lamp {lamp} on")
+
+    def all_on(self) -> None:
+        """Put every lamp on, and confirm that all are lit where the bank can."""
+        self._command(ALL_ON, self._lamps, "putting all lamps on")
+
+    def off(self) -> None:
+        """Put every lamp off, leave a sequence, and confirm it where the bank can."""
+        doing = "putting all lamps off"
+        with self._lock:
+            if not self._identified:
+                # Before the link is trusted again: a bank whose answers are lost goes dark, too.
+                self._open(doing)
+                try:
+                    self._put(ALL_OFF, doing)
+                except (DeviceTimeout, DeviceUnreachable):
+                    raise
+                except DeviceError:
+                    pass  # said again, and confirmed, below
+            self._command(ALL_OFF, 0, doing)
+            self._armed = 0
+
+    def set_level(self, level: float) -> None:
+        """Set every lamp's level in chunks, unless it is set already."""
+        doing = f"setting the level to {level:g}"
+        first = self._required(self._map.levels, doing, "level registers")
+        value = self._level_word(level)
+        with self._lock:
+            if value == self._level:
+                return
+            self._level = None
+            self._write([value] * self._lamps, first, doing)
+            self._level = value
+
+    def set_watchdog(self, seconds: float) -> None:
+        """Set the watchdog time, 0.1 to 60 s."""
+        doing = f"setting the watchdog to {seconds:g} s"
+        register = self._required(self._map.watchdog, doing, "a watchdog register")
+        self._write([round(seconds * 1000)], register, doing)
+
+    def heartbeat(self) -> None:
+        """Feed the watchdog."""
+        doing = "sending a heartbeat"
+        self._write([1], self._required(self._map.heartbeat, doing, "a heartbeat register"), doing)
+
+    def status(self) -> LightStatus:
+        """Read status bits and the number of lamps that are lit."""
+        doing = "reading the status"
+        lit = self._required(self._map.lit, doing, "a register with the number of lit lamps")
+        first = self._map.status
+        if first is not None and lit == first + 1:
+            bits, count = self._read("read_input_registers", first, 2, doing)
+        else:
+            with self._lock:
+                bits = 0 if first is None else self._input(first, doing)
+                count = self._input(lit, doing)
+        return LightStatus(bool(bits & 1), bool(bits & 2), bool(bits & 4), count)
+
+    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
+        """Upload the table, read it back, and arm it; dark until the gate opens."""
+        doing = f"loading a sequence of {len(entries)} steps"
+        table = self._required(self._map.table, doing, "a sequence table")
+        sequence = self._required(self._map.sequence, doing, "a sequence register")
+        if not 1 <= len(entries) <= self.capabilities.table:
+            most = self.capabilities.table
+            raise ValueError(f"{self.name}: a sequence has 1 to {most} steps, got {len(entries)}")
+        words = [word for what, level in entries for word in self._entry(what, level)]
+        with self._lock:
+            self.off()
+            self._write(words, table, doing)
+            self._level = None  # entries set levels, too
+            for start in range(0, len(words), MOST_READ):
+                wanted = words[start : start + MOST_READ]
+                got = self._read("read_holding_registers", table + start, len(wanted), doing)
+                if got != wanted:
+                    at = next(i for i, (a, b) in enumerate(zip(wanted, got, strict=True)) if a != b)
+                    raise self._error(
+                        f"{doing}: reading the table back",
+                        f"{wanted[at]} at register {table + start + at}",
+                        f"{got[at]}",
+                        "Load it again; if it stays, the bank's table or its map is wrong.",
+                    )
+            self._armed = None
+            self._write([len(entries)], sequence, f"{doing}: arming it")
+            self._armed = len(entries)
+            self._confirm(0, f"{doing}: arming it")
+
+    def position(self) -> int:
+        """How many steps of the armed sequence are over."""
+        doing = "reading the position in the sequence"
+        position = self._input(self._required(self._map.position, doing, "a position"), doing)
+        if self._armed is not None and position > self._armed:
+            raise self._error(
+                doing,
+                f"at most {self._armed} steps, as armed",
+                f"{position}",
+                "The gate closed more often than the sequence has steps: check the gate's wire.",
+            )
+        return position
+
+    def _entry(self, what: Lit, level: float) -> tuple[int, int]:
+        if isinstance(what, int) and not 0 <= what < self._lamps:
+            raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {what}")
+        selector = {"all": ALL_ON, "none": ALL_OFF}.get(what) if isinstance(what, str) else what + 1
+        return selector or 0, self._level_word(level)
+
+    def _level_word(self, level: float) -> int:
+        if not 0 <= level <= 1:
+            raise ValueError(f"{self.name}: a level is 0 to 1, got {level}")
+        return round(level * self._map.level_full)
+
+    def _command(self, selector: int, lit: int, doing: str) -> None:
+        with self._lock:
+            self._trust()
+            self._put(selector, doing)
+            if self.capabilities.reads_back:
+                self._confirm(lit, doing)
+
+    def _put(self, selector: int, doing: str) -> None:
+        if selector == ALL_OFF and self._map.sequence is not None and self._armed != 0:
+            # Leaves the sequence, which refuses the selector, and puts all lamps off.
+            self._exchange(doing, "write_register", self._map.sequence, 0)
+        if self._map.selector is not None:
+            self._exchange(doing, "write_register", self._map.selector, selector)
+            return
+        on = [selector in (ALL_ON, lamp + 1) for lamp in range(self._lamps)]
+        starts = range(0, self._lamps, MOST_COILS)
+        # Dark ones first: never two lamps where one is wanted.
+        for start in sorted(starts, key=lambda s: any(on[s : s + MOST_COILS])):
+            part = on[start : start + MOST_COILS]
+            self._exchange(doing, "write_coils", self._map.coils + start, part)
+
+    def _confirm(self, lit: int, doing: str) -> None:
+        status = self.status()
+        if status.lit == lit:
+            return
+        causes = [
+            text
+            for seen, text in (
+                (status.watchdog_tripped, "its watchdog has tripped"),
+                (status.interlock_open, "the interlock is open"),
+                (status.estop_pressed, "the emergency stop is pressed"),
+            )
+            if seen
+        ]
+        raise self._error(
+            doing,
+            f"{lit} lamps lit",
+            f"{status.lit} lit" + "".join(f", {c}" for c in causes),
+            "Clear the cause at the stage."
+            if causes
+            else "Check the lamp drivers' supply, and that nobody else writes to the bank.",
+        )
+
+    def _write(self, values: list[int], first: int, doing: str) -> None:
+        """Write registers from `first` on, in chunks."""
+        with self._lock:
+            self._trust()
+            if len(values) == 1:
+                self._exchange(doing, "write_register", first, values[0])
+                return
+            for start in range(0, len(values), MOST_WRITTEN):
+                part = values[start : start + MOST_WRITTEN]
+                self._exchange(doing, "write_registers", first + start, part)
+
+    def _input(self, address: int, doing: str) -> int:
+        return self._read("read_input_registers", address, 1, doing)[0]
+
+    def _read(self, method: str, address: int, count: int, doing: str) -> list[int]:
+        with self._lock:
+            self._trust()
+            return list(self._exchange(doing, method, address, count).registers)
+
+    def _trust(self) -> None:
+        """Have an open link to the right bank on which no answer is late."""
+        if self._identified:
+            return
+        self._open("connecting")
+        for attempt in range(1, _ATTEMPTS_TO_FALL_INTO_STEP + 1):
+            try:
+                self._fall_into_step()
+                break
+            except _OutOfStep:
+                if attempt == _ATTEMPTS_TO_FALL_INTO_STEP:
+                    raise
+                # Late answers come one after the other now: let them pass.
+                self._open("connecting")
+                self._drain()
+        self._identify()
+        self._identified = True
+
+    def _fall_into_step(self) -> None:
+        """Read something whose answer has another length than the last times, so that a late one
+        is told from this one's."""
+        doing = "falling into step"
+        self._falls += 1
+        if self._map.levels is not None:
+            count = 1 + self._falls % min(self._lamps, MOST_READ)
+            self._exchange(doing, "read_holding_registers", self._map.levels, count)
+        else:
+            count = 1 + 8 * self._falls % min(self._lamps, MOST_COILS)
+            self._exchange(doing, "read_coils", self._map.coils, count)
+
+    def _drain(self) -> None:
+        assert self._link is not None
+        try:
+            self._link.drain(self.config.timeout_s)
+        except OSError:
+            self.close()
+            self._open("connecting")
+
+    def _identify(self) -> None:
+        r, doing = self._map, "identifying"
+        if r.signature is not None:
+            address, wanted = r.signature
+            got = self._exchange(doing, "read_input_registers", address, 1).registers[0]
+            if got != wanted:
+                raise self._error(
+                    doing,
+                    f"input register {address} to be {wanted:#06x}",
+                    f"{got:#06x}",
+                    "Check port and unit in [devices.lights]: this is another device.",
+                )
+        if r.count is not None:
+            lamps = self._exchange(doing, "read_input_registers", r.count, 1).registers[0]
+            if lamps != self._lamps:
+                raise self._error(
+                    doing,
+                    f"{self._lamps} lamps as in the rig file",
+                    f"{lamps}",
+                    "Use the rig file of this stage.",
+                )
+        if r.sequence is not None:
+            answer = self._exchange(doing, "read_holding_registers", r.sequence, 1)
+            self._armed = answer.registers[0]
+
+    def _open(self, doing: str) -> None:
+        if self._link is not None:
+            return
+        try:
+            self._link = open_link(self.config)
+        except OSError as error:
+            raise DeviceUnreachable(
+                self.name,
+                doing,
+                expected="a connection",
+                received=f"none ({error})",
+                deadline_s=self.config.timeout_s,
+                todo="Check power, cable, and the address in [devices.lights].",
+            ) from error
+
+    def _exchange(self, doing: str, method: str, address: int, payload: Any) -> Any:
+        """One request: `payload` is the count of a read, else the value or values to write."""
+        link: Any = self._link
+        count = payload if method.startswith("read") else None
+        try:
+            ask = getattr(link, method)
+            more = {"device_id": self.config.unit}
+            answer = (
+                ask(address, payload, **more)
+                if count is None
+                else ask(address, count=count, **more)
+            )
+        except (ModbusException, OSError) as error:
+            self.close()
+            lost = isinstance(error, OSError)
+            raise (DeviceUnreachable if lost else DeviceTimeout)(
+                self.name,
+                doing,
+                expected="an answer",
+                received=f"none ({error})" if lost else unusable(link.received),
+                deadline_s=self.config.timeout_s,
+                todo="Check power and cable of the bank; its watchdog puts the lamps off."
+                if self.capabilities.dead_man
+                else "Check power and cable of the bank; its lamps may still be lit.",
+            ) from error
+        wanted, got = expected(method, address, payload), received(answer)
+        if answer.function_code == CODES[method] | 0x80:
+            code = answer.exception_code
+            raise self._error(
+                doing,
+                "an answer",
+                f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'see its manual')})",
+                "Check the registers in [devices.lights]; 4 also says that a sequence is armed.",
+            )
+        if got != wanted:
+            self.close()
+            raise _OutOfStep(
+                self.name,
+                doing,
+                expected=f"the answer {wanted}",
+                received=f"{got}",
+                todo="Answers were out of step; the next request opens the link anew. If it "
+                "happens again, look for a second master.",
+            )
+        return answer
+
+    def _required(self, address: int | None, doing: str, what: str) -> int:
+        if address is None:
+            raise cannot(self.name, doing, what)
+        return address
+
+    def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
+        return DeviceError(self.name, doing, expected=expected, received=received, todo=todo)
