@@ -1,8 +1,10 @@
-"""Pinhole cameras in OpenCV's convention."""
+"""Cameras and pinholes in OpenCV's convention."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -17,14 +19,14 @@ def facing(forward: ArrayLike, roll_deg: float = 0.0) -> Array:
     Rows: right, down, forward. At roll 0 the device's up is the world's +z; `roll_deg` turns it
     clockwise about its viewing direction.
     """
-    forward = np.asarray(forward, float)
-    forward = forward / np.linalg.norm(forward)
-    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(forward, up)
+    ahead: Array = np.asarray(forward, float)
+    ahead = ahead / np.linalg.norm(ahead)
+    up = np.array([0.0, 0.0, 1.0]) if abs(ahead[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(ahead, up)
     right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
+    down = np.cross(ahead, right)
     c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
-    return np.stack([c * right + s * down, c * down - s * right, forward])
+    return np.stack([c * right + s * down, c * down - s * right, ahead])
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +45,11 @@ class Pinhole:
     t: Array
 
     def __post_init__(self) -> None:
-        for field, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
-            value = np.array(getattr(self, field), dtype=np.float64)
+        for name, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
+            value = np.array(getattr(self, name), dtype=np.float64)
             if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(
-                    f"{self.name}: {field} must be {shape} finite numbers, got {value}"
-                )
-            object.__setattr__(self, field, value)
+                raise ValueError(f"{self.name}: {name} must be {shape} finite numbers, got {value}")
+            object.__setattr__(self, name, value)
         if self.width < 1 or self.height < 1:
             raise ValueError(f"{self.name}: size must be positive, got {self.width}x{self.height}")
         if not np.allclose(self.R @ self.R.T, np.eye(3), atol=1e-6) or np.linalg.det(self.R) < 0:
@@ -96,10 +96,11 @@ class Pinhole:
         local = np.asarray(points, float) @ self.R.T + self.t
         z = local[..., 2]
         xy = local[..., :2] / np.where(np.abs(z) < 1e-12, 1e-12, z)[..., None]
+        x, y = self._through_lens(xy[..., 0], xy[..., 1])
         pixels = np.stack(
             [
-                self.K[0, 0] * xy[..., 0] + self.K[0, 1] * xy[..., 1] + self.K[0, 2],
-                self.K[1, 1] * xy[..., 1] + self.K[1, 2],
+                self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2],
+                self.K[1, 1] * y + self.K[1, 2],
             ],
             axis=-1,
         )
@@ -110,9 +111,18 @@ class Pinhole:
         pixels = np.asarray(pixels, float)
         y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
         x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
+        x, y = self._before_lens(x, y)
         local = np.stack([x, y, np.ones_like(x)], axis=-1)
         world = local @ self.R
         return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
+
+    def _through_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Slopes x/z, y/z behind the lens from those before it."""
+        return x, y
+
+    def _before_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The inverse of `_through_lens`."""
+        return x, y
 
     def inside(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether `pixels (..., 2)` fall on the image, edge pixels' outer halves included."""
@@ -146,4 +156,115 @@ class Pinhole:
 
 @dataclass(frozen=True, eq=False)
 class Camera(Pinhole):
-    """A calibrated camera; see `Pinhole` for the convention."""
+    """A calibrated camera with its lens; see `Pinhole` for the convention.
+
+    `distortion` holds OpenCV's k1, k2, p1, p2, k3 (shorter lists end in zeros): slopes x/z, y/z of
+    radius r become (1 + k1 r² + k2 r⁴ + k3 r⁶) times themselves, plus the tangential terms. What is
+    far outside of the image gets the factor of the image's surroundings: the polynomial must not
+    fold it back into the image. `filter_sigma` is the standard deviation in pixels of a Gaussian
+    that a pixel averages over; 0 is a box of one pixel, as a sensor integrates. Raises
+    `ValueError` where the lens is not invertible over the image.
+    """
+
+    distortion: Array = field(default_factory=lambda: np.zeros(5))
+    filter_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given = np.array(self.distortion, dtype=np.float64).ravel()
+        if len(given) > 5 or not np.isfinite(given).all():
+            raise ValueError(
+                f"{self.name}: distortion must be up to 5 numbers k1, k2, p1, p2, k3, got {given}"
+            )
+        object.__setattr__(self, "distortion", np.append(given, np.zeros(5 - len(given))))
+        if not 0 <= self.filter_sigma < np.inf:
+            raise ValueError(f"{self.name}: filter_sigma must be >= 0, got {self.filter_sigma}")
+        if self.distorted:
+            self._check_lens()
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the lens bends lines."""
+        return bool(self.distortion.any())
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready description that `Rig.from_dict` reads back exactly."""
+        out = super().to_dict()
+        if self.distorted:
+            out["distortion"] = self.distortion.tolist()
+        if self.filter_sigma > 0:
+            out["filter_sigma"] = self.filter_sigma
+        return out
+
+    def _through_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
+        if not self.distorted:
+            return x, y
+        far = np.maximum(np.hypot(x, y) / self._reach, 1.0)
+        a, b, _ = _bent(self.distortion, x / far, y / far)
+        return a * far, b * far
+
+    def _before_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
+        return undistorted(self.distortion, x, y) if self.distorted else (x, y)
+
+    @cached_property
+    def _reach(self) -> float:
+        """Radius before the lens of the image's furthest corner, and a tenth more."""
+        u, v = self._border()
+        return 1.1 * float(np.hypot(u, v).max())
+
+    def _border(self) -> tuple[Array, Array]:
+        """Slopes before the lens all over the image, its edges included."""
+        column, row = np.meshgrid(
+            np.linspace(-0.5, self.width - 0.5, 17), np.linspace(-0.5, self.height - 0.5, 17)
+        )
+        y = (row - self.K[1, 2]) / self.K[1, 1]
+        x = (column - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
+        return undistorted(self.distortion, x, y)
+
+    def _check_lens(self) -> None:
+        with np.errstate(all="ignore"):  # a lens that cannot be inverted overflows here
+            u, v = self._border()
+            a, b, (axx, axy, ayy) = _bent(self.distortion, u, v)
+            again = undistorted(self.distortion, a, b)
+            upright = (axx > 0) & (ayy > 0) & (axx * ayy > axy * axy)
+            same = np.hypot(again[0] - u, again[1] - v) < 1e-9
+            radius = np.hypot(u, v).max() * np.linspace(0, 1.1, 45)
+            zero = np.zeros_like(radius)
+            outwards = _bent(self.distortion * (1, 1, 0, 0, 1), radius, zero)[2][0] > 0
+            good = bool(upright.all() and same.all() and outwards.all())
+        if not good:
+            raise ValueError(
+                f"{self.name}: the lens folds over within the image with distortion "
+                f"{self.distortion.tolist()}: it cannot be inverted"
+            )
+
+
+_NEWTON_STEPS = 8
+
+
+def undistorted(distortion: Iterable[Any], x: Any, y: Any) -> tuple[Any, Any]:
+    """Slopes before the lens from those behind it, by Newton's method; see `Camera.distortion`.
+
+    Takes whatever has arithmetic, such as a renderer's arrays.
+    """
+    u, v = x, y
+    for _ in range(_NEWTON_STEPS):
+        a, b, (axx, axy, ayy) = _bent(distortion, u, v)
+        a, b = x - a, y - b
+        scale = 1 / (axx * ayy - axy * axy)
+        u, v = u + (ayy * a - axy * b) * scale, v + (axx * b - axy * a) * scale
+    return u, v
+
+
+def _bent(k: Iterable[Any], x: Any, y: Any) -> tuple[Any, Any, tuple[Any, Any, Any]]:
+    """Slopes behind the lens, and their (symmetric) derivative: d/dx x, d/dy x, d/dy y."""
+    k1, k2, p1, p2, k3 = k
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+    a = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    b = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    axx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    axy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    ayy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return a, b, (axx, axy, ayy)

@@ -92,6 +92,11 @@ def reconstruct(
     head = capture.head
     if head is None:
         raise CaptureError(f"{capture.path}: no head.obj: strands need a scalp to be rooted on")
+    if bent := [c.name for c in capture.rig.cameras if c.distorted]:
+        raise CaptureError(
+            f"{capture.path}: the lenses of {bent} bend lines, and the reconstruction takes them "
+            "for straight: undistort the frames first and leave distortion out of rig.json"
+        )
     model = Path(model)
     (model / "masks").mkdir(parents=True, exist_ok=True)
     report = Report.load(model / "report.json")

@@ -123,6 +123,12 @@ def _take(table: dict[str, Any], field: str, where: str) -> Any:
     return table[field]
 
 
+_OWN_FIELDS: dict[type[Pinhole], tuple[str, ...]] = {
+    Camera: ("distortion", "filter_sigma"),
+    Projector: ("intensity", "line_sigma"),
+}
+
+
 def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
     """Pinholes from explicit `K, R, t` or from `position, target, fov_deg[, roll_deg]`."""
     out: list[P] = []
@@ -130,21 +136,12 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
         where = f"[[{key}]] number {i + 1} ({table.get('name', 'unnamed')})"
         name = str(_take(table, "name", where))
         width, height = (int(_take(table, f, where)) for f in ("width", "height"))
-        more: dict[str, Any] = {f: table[f] for f in ("intensity", "line_sigma") if f in table}
+        own = _OWN_FIELDS[kind]
+        more: dict[str, Any] = {f: table[f] for f in own if f in table}
         allowed = {
-            "name",
-            "width",
-            "height",
-            "K",
-            "R",
-            "t",
-            "position",
-            "target",
-            "fov_deg",
-            "roll_deg",
+            *("name", "width", "height", "K", "R", "t"),
+            *("position", "target", "fov_deg", "roll_deg", *own),
         }
-        if kind is Projector:
-            allowed |= {"intensity", "line_sigma"}
         unknown = set(table) - allowed
         if unknown:
             raise RigError(

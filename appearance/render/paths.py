@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from appearance.scene import SCALE, HairScene
-from reconstruction.cameras import Camera
+from reconstruction.cameras import Camera, undistorted
 
 
 def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
@@ -26,6 +26,8 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
     k = opaque([camera.K[0, 0], camera.K[0, 1], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]])
     y = (v - 0.5 - k[4]) / k[3]
     x = (u - 0.5 - k[2] - k[1] * y) / k[0]
+    if camera.distorted:
+        x, y = undistorted(opaque(camera.distortion), x, y)
     direction = opaque_matrix(camera.R.T) @ mi.Vector3f(x, y, mi.Float(1))
     return mi.Ray3f(mi.Point3f(*opaque(camera.center * SCALE)), dr.normalize(direction))
 
@@ -246,8 +248,8 @@ def passes(spp: int, per_pass: int) -> Iterator[tuple[int, int]]:
 def jittered(camera: Camera, pixel: Any, sample: Any, spp: int, rng: Any) -> Any:
     """Rays of sample number `sample` of `spp` through `pixel`: jittered on a grid over the pixel.
 
-    Samples beyond the largest square grid fall anywhere in the pixel; a box filter, as the sensor
-    integrates.
+    Samples beyond the largest square grid fall anywhere in the pixel. A box filter, as the sensor
+    integrates, or `camera.filter_sigma`'s Gaussian, onto which the grid is stretched.
     """
     import drjit as dr
     import mitsuba as mi
@@ -259,6 +261,10 @@ def jittered(camera: Camera, pixel: Any, sample: Any, spp: int, rng: Any) -> Any
     a, b = rng.next_float32(), rng.next_float32()
     x = dr.select(on_grid, (mi.Float(cell_x) + a) / mi.Float(n), a)
     y = dr.select(on_grid, (mi.Float(cell_y) + b) / mi.Float(n), b)
+    if camera.filter_sigma > 0:
+        (spread,) = opaque(camera.filter_sigma * np.sqrt(2))
+        # not quite -1 and 1, whose inverses are infinite
+        x, y = (0.5 + spread * dr.erfinv((2 - 2**-22) * p - (1 - 2**-23)) for p in (x, y))
     width = opaque_index(camera.width)
     row = pixel // width
     column = pixel - row * width
