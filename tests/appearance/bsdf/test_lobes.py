@@ -125,6 +125,23 @@ def test_plain_numbers_work_like_arrays():
     assert weight.x == pytest.approx(lobes.evaluate(plain, wi, wo)[0].x / pdf)
 
 
+def test_every_back_end_gives_the_same():
+    """LLVM and, where there is one, CUDA."""
+    case = Case(theta_deg=20, h=0.2, sigma_a=0.4, tilt_deg=3)
+    wo = reference.direction(np.linspace(-1.5, 1.5, 100), np.linspace(-3, 3, 100))
+    want = reference.evaluate(case.wi, wo, sigma_a=0.4, **case.optics)
+    modules = [dr.llvm.ad]
+    if dr.has_backend(dr.JitBackend.CUDA):
+        modules.append(dr.cuda.ad)
+    for module in modules:
+        vector = module.Array3f
+        wi = vector(*map(float, case.wi))
+        value, _ = lobes.evaluate(
+            lobes.Fibre(vector(0.4), **case.optics), wi, vector(wo.T.astype(np.float32))
+        )
+        assert np.array(value.x) == pytest.approx(want, rel=1e-4, abs=1e-7)
+
+
 def test_lanes_may_have_fibres_of_their_own():
     number, vector = array_types(True)
     rng = np.random.default_rng(1)
