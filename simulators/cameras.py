@@ -174,6 +174,7 @@ class _Connection(socketserver.BaseRequestHandler):
             "block_id": frame.block_id,
             "timestamp": frame.timestamp,
             "exposure": frame.exposure,
+            "left": self.server.world.held(camera),
             "bytes": len(payload),
         }
         return answer, payload

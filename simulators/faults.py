@@ -33,8 +33,8 @@ class Fault:
     camera drop: `camera` misses that pulse, once. camera lost: its frame is made, and lost on the
     way. camera repeat: its frame has the number of the one before. camera stray: it makes one more
     frame than was asked for. camera late_frame: the frame is not to be had before the next pulse.
-    camera mute: `camera` answers nothing from that pulse on. trigger interlock or estop: open or pressed after that pulse, for good.
-    trigger double: fires twice, counts once; dropped: counts, does not fire; uncounted: fires, does
+    camera mute: `camera` answers nothing from that pulse on. trigger interlock or estop: open or
+    pressed after that pulse, for good. trigger double: fires twice, counts once; dropped: counts, does not fire; uncounted: fires, does
     not count; late_trigger: fires `seconds` late. projectors blank: after that pulse no pattern
     comes up any more, for good. lights hang: the bank answers nothing after that pulse, and its
     watchdog goes on; lies: it reports no lamp as lit after that pulse, for good; stuck: the lamps

@@ -150,6 +150,11 @@ class World:
             if queue and queue[0] is frame:
                 queue.popleft()
 
+    def held(self, camera: str) -> int:
+        """How many frames the camera holds, ready or not."""
+        with self._lock:
+            return len(self._cameras[camera].queue)
+
     def mute(self, camera: str) -> bool:
         """Whether a fault keeps the camera from answering."""
         return self._faults.since("camera", "mute", self._fired, camera)

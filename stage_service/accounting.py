@@ -13,6 +13,9 @@ from itertools import pairwise
 
 from stage_service.devices.errors import IndexShift
 
+CLOCK_DRIFT = 2e-4
+"""By which share a camera's clock may be faster or slower than the host's."""
+
 
 class PulseAccount:
     """The trigger box's count: each pulse commanded must raise it by exactly one."""
@@ -47,25 +50,55 @@ class FrameAccount:
         self.wrap = wrap
         self.last: int | None = None
         self.unanswered = 0
+        self._ahead: tuple[float, float] | None = None
+        self._timed_at = 0.0
+
+    def armed(self) -> None:
+        """The exposure may have changed, and with it what a time stamp means."""
+        self._ahead = None
 
     def missed(self) -> None:
         """A pulse after which the camera had no frame."""
         self.unanswered += 1
 
-    def arrived(self, block_id: int) -> None:
-        """The frame of the newest pulse. Raises `IndexShift` when its number does not fit."""
+    def arrived(self, block_id: int, left: int = 0) -> None:
+        """The frame of the newest pulse, with `left` frames behind it.
+
+        Raises `IndexShift` when its number does not fit, or when there are frames behind it: then
+        something else fired the camera.
+        """
         self._advance(block_id, 1 + self.unanswered)
         self.unanswered = 0
+        if left:
+            raise self._stray(f"{left} behind block id {block_id}")
+
+    def timed(self, timestamp: float, asked: float, answered: float) -> None:
+        """Check that the frame was made by the newest pulse, which fired between the two times.
+
+        How far the host's clock is ahead of the camera's is bounded by each frame; a frame of an
+        earlier pulse contradicts the others, because each pulse is asked for after the last was
+        answered. Raises `IndexShift`.
+        """
+        low, high = asked - timestamp, answered - timestamp
+        if self._ahead is not None:
+            slack = CLOCK_DRIFT * max(0.0, asked - self._timed_at)
+            low = max(low, self._ahead[0] - slack)
+            high = min(high, self._ahead[1] + slack)
+        if low > high:
+            raise IndexShift(
+                self.device,
+                "matching time stamps to pulses",
+                expected="a frame made by the newest pulse",
+                received=f"one made {low - high:.4g} s or more before or after it",
+                todo="The camera was triggered by something else, or a frame came late: check the "
+                "trigger cable and start again.",
+            )
+        self._ahead, self._timed_at = (low, high), asked
 
     def late(self, block_id: int) -> None:
         """A frame of a pulse that counted as unanswered. Raises `IndexShift` when it cannot be."""
         if self.unanswered == 0:
-            raise self._shift(
-                "no frame beside those of our pulses",
-                block_id,
-                "The camera was triggered by something else: frames since the last check may "
-                "belong to other steps. Check the trigger cable and start again.",
-            )
+            raise self._stray(f"block id {block_id}")
         self._advance(block_id, self.unanswered)
         self.unanswered -= 1
 
@@ -127,6 +160,16 @@ class FrameAccount:
                 "and start again.",
             )
         self.last = block_id
+
+    def _stray(self, received: str) -> IndexShift:
+        return IndexShift(
+            self.device,
+            "matching frames to pulses",
+            expected="no frame beside those of our pulses",
+            received=received,
+            todo="The camera was triggered by something else: frames since the last check may "
+            "belong to other steps. Check the trigger cable and start again.",
+        )
 
     def _shift(self, expected: str, block_id: int, todo: str) -> IndexShift:
         return IndexShift(

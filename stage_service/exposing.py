@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass
 
 from reconstruction.capture import Step
 from stage_service.devices.errors import Cancelled, DeviceError
 from stage_service.devices.stage import Stage
 from stage_service.spent import Spent
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """The trigger box's count, and the monotonic seconds between which it fired."""
+
+    count: int
+    asked: float
+    answered: float
 
 
 class Exposing:
@@ -29,8 +39,8 @@ class Exposing:
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
 
-    def expose(self, step: Step) -> int:
-        """Make one pulse in the step's light; returns the trigger box's count."""
+    def expose(self, step: Step) -> Pulse:
+        """Make one pulse in the step's light."""
         spent = self._spent
         with spent.on("rate limit"):
             self._sleep(self._next - time.monotonic())
@@ -40,14 +50,16 @@ class Exposing:
         with spent.on("settle"):
             self._sleep(self._stage.config.lights.settle_s)
         with spent.on("trigger"):
+            asked = time.monotonic()
             count = self._stage.trigger.pulse(step.exposure)
+            pulse = Pulse(count, asked, time.monotonic())
         # From the box's answer, which never comes before the pulse: the light stays long enough.
         with spent.on("exposure"):
             self._sleep(step.exposure)
         with spent.on("lights"):
             self._check_lit(step)
             self.dark(step)
-        return count
+        return pulse
 
     def dark(self, step: Step | None = None) -> None:
         """Put off what the step lit; without a step, everything."""

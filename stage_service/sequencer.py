@@ -16,7 +16,7 @@ from stage_service.devices.cameras.interface import Camera, Frame
 from stage_service.devices.errors import Cancelled
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.devices.stage import Stage
-from stage_service.exposing import Exposing
+from stage_service.exposing import Exposing, Pulse
 from stage_service.hardware_run import HardwareRun, Shots
 from stage_service.safety import Blackout, blackout, check_interlocks
 from stage_service.sentinels import check_sentinels
@@ -195,22 +195,29 @@ class Sequencer:
             stack.callback(self._black_out)
             stage.connect()
             check_interlocks(stage)
-            stage.lights.set_watchdog(stage.config.watchdog_s)
             stage.trigger.reset()
             cameras = FanOut(stage.cameras)
             stack.callback(cameras.close)
-            heartbeat = stack.enter_context(Heartbeat(stage.lights, stage.config.heartbeat_s))
+            watched = [
+                device
+                for device in (stage.lights, stage.projectors)
+                if device is not None and device.capabilities.dead_man
+            ]
+            for device in watched:
+                device.set_watchdog(stage.config.watchdog_s)
+            beats = [
+                stack.enter_context(Heartbeat(device, stage.config.heartbeat_s))
+                for device in watched
+            ]
             self._exposing.dark()
             for run in self._runs:
                 todo = {s: w for s in run.steps if (w := self._wanted(s))}
                 self.steps_done += len(run.steps) - len(todo)  # shot before this run
                 if run.stepping == "hardware" and len(todo) >= SHORTEST_RUN:
-                    self._boundary()
-                    heartbeat.check()
+                    self._boundary(beats)
                     self._clock(todo, cameras, frames)
                 for step, wanted in todo.items():
-                    self._boundary()
-                    heartbeat.check()
+                    self._boundary(beats)
                     if wanted:
                         with self._spent.step():
                             self._shoot(step, wanted, cameras, frames)
@@ -281,14 +288,16 @@ class Sequencer:
                     self._arm(step.exposure, cameras)
             self._watch(step)
             pulse = self._exposing.expose(step)
-            self._pulses.fired(pulse)
+            self._pulses.fired(pulse.count)
             with self._spent.on("cameras"):
                 shot = cameras(lambda camera: camera.read(self._cancel))
             for camera in self.stage.cameras:
                 frame = shot[camera.name]
-                self._account(camera, frame)
+                self._account(camera, frame, pulse)
                 if frame is not None and camera.name in wanted:
-                    self._put(frames, Shot(step, camera.name, frame, camera.info, pulse, attempt))
+                    self._put(
+                        frames, Shot(step, camera.name, frame, camera.info, pulse.count, attempt)
+                    )
                     wanted.discard(camera.name)
             if not wanted:
                 return
@@ -296,7 +305,7 @@ class Sequencer:
         for name in sorted(wanted):
             reason = f"no frame from the camera after {self._retries + 1} pulses"
             self._writer.record_missing(
-                step, name, reason=reason, pulse=pulse, attempt=self._retries
+                step, name, reason=reason, pulse=pulse.count, attempt=self._retries
             )
 
     def _put(self, frames: FrameWriter, shot: Shot) -> None:
@@ -309,13 +318,16 @@ class Sequencer:
             again = attempt < self._retries
             self._notify("capture.frame_missing", {**lost, "shot_again": again})
 
-    def _account(self, camera: Camera, frame: Frame | None) -> None:
+    def _account(self, camera: Camera, frame: Frame | None, pulse: Pulse) -> None:
         if frame is None:
             # It may still come, and must not pass for the next pulse's.
             self._doubtful = True
             self._accounts[camera.name].missed()
         else:
-            self._accounts[camera.name].arrived(frame.block_id)
+            account = self._accounts[camera.name]
+            account.arrived(frame.block_id, frame.left)
+            if camera.capabilities.timestamps and frame.timestamp:
+                account.timed(frame.timestamp, pulse.asked, pulse.answered)
 
     def _arm(self, exposure: float, cameras: FanOut) -> None:
         """Arm every camera; all have confirmed when this returns. What a queue still holds is
@@ -324,6 +336,8 @@ class Sequencer:
             cameras(self._drain)
         self._armed = None
         cameras(lambda camera: camera.arm(exposure))
+        for account in self._accounts.values():
+            account.armed()
         self._armed, self._doubtful = exposure, False
 
     def _drain(self, camera: Camera) -> None:
@@ -331,8 +345,10 @@ class Sequencer:
         while (frame := camera.read(self._cancel)) is not None:
             self._accounts[camera.name].late(frame.block_id)
 
-    def _boundary(self) -> None:
-        """Where pause and abort take effect."""
+    def _boundary(self, beats: Sequence[Heartbeat]) -> None:
+        """Where pause and abort take effect, and failed heartbeats come to light."""
+        for beat in beats:
+            beat.check()
         if self._abort_asked:
             raise Cancelled("aborted")
         if not self._pause_asked:

@@ -134,3 +134,25 @@ def test_a_run_without_any_frame_is_all_missing():
     one = account(last=4)
     assert one.place([], [], range(3)) == []
     assert one.unanswered == 3
+
+
+@given(
+    offset=st.floats(-1e6, 1e6),
+    drift=st.floats(-1e-4, 1e-4),
+    jitter=st.lists(st.floats(0, 0.05), min_size=6, max_size=6),
+)
+def test_time_stamps_tell_a_frame_of_an_earlier_pulse(offset, drift, jitter):
+    one = FrameAccount("cam_00", 65535)
+    one.armed()
+    now, stamps = 1000.0, []
+    for late in jitter:
+        stamps.append((1 + drift) * now + offset)
+        one.timed(stamps[-1], now - 1e-4, now + late)
+        now += 0.06
+    with pytest.raises(IndexShift, match="made by the newest pulse"):
+        one.timed(stamps[-1], now - 1e-4, now + jitter[0])
+
+
+def test_frames_behind_the_newest_are_named():
+    with pytest.raises(IndexShift, match="received 1 behind block id 8"):
+        account(last=7).arrived(8, left=1)

@@ -23,17 +23,25 @@ class CameraInfo:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One exposure as the camera sent it: `counts (H, W, 3) uint16`, RGB."""
+    """One exposure as the camera sent it: `counts (H, W, 3) uint16`, RGB.
+
+    `timestamp` is in seconds on the camera's clock, 0 where it has none; `left` is how many more
+    frames the camera holds.
+    """
 
     counts: NDArray[np.uint16]
     block_id: int
     timestamp: float
     exposure: float
+    left: int = 0
 
     def radiance(self, info: CameraInfo) -> NDArray[np.float32]:
         """Scene-linear radiance `(H, W, 3)`, W/(sr m²); noise may push it below zero."""
         scale = np.float32(self.count_scale(info))
-        return (self.counts.astype(np.float32) - np.float32(info.black)) * scale
+        radiance = self.counts.astype(np.float32)
+        radiance -= np.float32(info.black)
+        radiance *= scale
+        return radiance
 
     def count_scale(self, info: CameraInfo) -> float:
         """Radiance of one count."""

@@ -162,6 +162,7 @@ class LinkCamera:
             int(self._number(answer, "block_id", doing)),
             self._number(answer, "timestamp", doing),
             exposure,
+            int(self._number({"left": 0, **answer}, "left", doing)),
         )
 
     def _number(self, answer: dict[str, Any], field: str, doing: str) -> Any:

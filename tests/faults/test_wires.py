@@ -1,0 +1,256 @@
+"""Scripted faults on every wire of the simulated stage, in the middle of a capture."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from reconstruction.capture import Capture
+from reconstruction.capture_verify import verify
+from reconstruction.capture_writer import CaptureWriter
+from simulators.faults import Fault
+from stage_service.devices.stage import Stage
+from stage_service.plan import CapturePlan
+from stage_service.sequencer import Sequencer
+
+PULSE = 9
+LIGHTS = tuple(f"light_{i:03d}" for i in range(12))
+DEVICE_ERROR = r".+: .+: expected .+, received .+\. .+"
+"""Device: operation: expected …[ within … s], received …. What to do."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault and what must become of the capture: `error` is a pattern, "" for none."""
+
+    name: str
+    faults: tuple[Fault, ...]
+    outcome: str
+    error: str = ""
+    missing: int = 0
+    stepping: tuple[str, ...] = ("software", "hardware")
+
+
+def case(name: str, device: str, kind: str, outcome: str, error: str = "", **more: Any) -> Case:
+    own = {k: more.pop(k) for k in ("camera", "request", "seconds", "pulse") if k in more}
+    fault = Fault(device, kind, own.pop("pulse", PULSE), **own)
+    return Case(name, (fault,), outcome, error, **more)
+
+
+SOFTWARE, HARDWARE = ("software",), ("hardware",)
+CASES = [
+    case(
+        "trigger box: timeout",
+        "trigger",
+        "silent",
+        "failed",
+        "trigger box.*within 0.3 s",
+        stepping=SOFTWARE,
+    ),
+    case(
+        "trigger box: timeout of a table's question",
+        "trigger",
+        "silent",
+        "failed",
+        "trigger box.*within 0.3 s",
+        request="SEQ?",
+        pulse=1,
+        stepping=HARDWARE,
+    ),
+    case("trigger box: NAK", "trigger", "nak", "failed", "trigger box.*ERR", stepping=SOFTWARE),
+    case(
+        "trigger box: NAK of a table",
+        "trigger",
+        "nak",
+        "failed",
+        "trigger box.*ERR",
+        request="ROW",
+        pulse=0,
+        stepping=HARDWARE,
+    ),
+    case(
+        "trigger box: late reply",
+        "trigger",
+        "late",
+        "failed",
+        "trigger box.*within 0.3 s",
+        seconds=0.5,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "trigger box: garbage in a reply",
+        "trigger",
+        "garbage",
+        "failed",
+        "trigger box",
+        stepping=SOFTWARE,
+    ),
+    case(
+        "trigger box: garbage before a reply",
+        "trigger",
+        "noise",
+        "failed",
+        "trigger box",
+        stepping=SOFTWARE,
+    ),
+    case(
+        "trigger box: unplugged and plugged in again",
+        "trigger",
+        "unplug",
+        "failed",
+        "trigger box",
+        seconds=0.5,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "trigger box: unplugged while a table runs",
+        "trigger",
+        "unplug",
+        "failed",
+        "trigger box",
+        request="SEQ?",
+        pulse=1,
+        seconds=0.5,
+        stepping=HARDWARE,
+    ),
+    case("trigger: doubled", "trigger", "double", "failed", "matching frames|pulses"),
+    case("trigger: dropped by the box", "trigger", "dropped", "completed"),
+    case("trigger: fired but not counted", "trigger", "uncounted", "failed", "pulse"),
+    case(
+        "trigger: late",
+        "trigger",
+        "late_trigger",
+        "failed",
+        "trigger box.*within 0.3 s",
+        seconds=0.5,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "trigger: late in a table",
+        "trigger",
+        "late_trigger",
+        "completed",
+        seconds=0.1,
+        stepping=HARDWARE,
+    ),
+    case("interlock opened", "trigger", "interlock", "failed", "interlock"),
+    case("emergency stop pressed", "trigger", "estop", "failed", "emergency stop|estop"),
+    case(
+        "projectors: timeout",
+        "projectors",
+        "silent",
+        "failed",
+        "projector.*within 0.3 s",
+        pulse=16,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "projectors: NAK", "projectors", "nak", "failed", "projector", pulse=16, stepping=SOFTWARE
+    ),
+    case(
+        "projectors: late reply",
+        "projectors",
+        "late",
+        "failed",
+        "projector",
+        pulse=16,
+        seconds=0.5,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "projectors: garbage in a reply",
+        "projectors",
+        "garbage",
+        "failed",
+        "projector",
+        pulse=16,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "projectors: unplugged and plugged in again",
+        "projectors",
+        "unplug",
+        "failed",
+        "projector",
+        pulse=16,
+        seconds=0.5,
+        stepping=SOFTWARE,
+    ),
+    case(
+        "projectors: no pattern comes up",
+        "projectors",
+        "blank",
+        "failed",
+        "no-pattern",
+        pulse=16,
+        stepping=HARDWARE,
+    ),
+    case("camera: dropped trigger", "camera", "drop", "completed", camera="cam_b"),
+    case("camera: frame lost on the way", "camera", "lost", "completed", camera="cam_b"),
+    case(
+        "camera: repeated block id", "camera", "repeat", "failed", "cam_b.*block id", camera="cam_b"
+    ),
+    case("camera: a frame nobody asked for", "camera", "stray", "failed", "cam_b", camera="cam_b"),
+    case(
+        "camera: late frame", "camera", "late_frame", "completed", camera="cam_b", stepping=SOFTWARE
+    ),
+    case("camera: mute", "camera", "mute", "failed", "camera cam_b.*within 0.3 s", camera="cam_b"),
+    Case(
+        "camera: a trigger that never comes",
+        tuple(Fault("camera", "drop", p, camera="cam_b") for p in (PULSE, PULSE + 1, PULSE + 2)),
+        "completed",
+        missing=1,
+        stepping=SOFTWARE,
+    ),
+    case("light bank: hangs", "lights", "hang", "failed", "light bank.*within 0.3 s"),
+]
+
+
+@pytest.mark.parametrize(
+    ("one", "stepping"),
+    [pytest.param(c, s, id=f"{c.name}, {s}") for c in CASES for s in c.stepping],
+)
+def test_a_fault_on_the_wire(one, stepping, simulated, tmp_path, told):
+    rig_file, world = simulated(*one.faults)
+    plan = CapturePlan(lights=LIGHTS, stepping=stepping)
+    steps = plan.steps(rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
+    run = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, steps)[0])
+    run.run()
+    assert run.outcome == one.outcome, run.error
+    until = time.monotonic() + rig_file.devices.watchdog_s + 1.0
+    while world.lamps.power().any() or world.projectors.show.level:
+        assert time.monotonic() < until, "still lit"
+    capture = Capture(tmp_path / "c")
+    check_frames(capture)
+    for problem in verify(tmp_path / "c"):
+        assert re.search(r"outcome is|never shot|^Step \d+ .* is missing", problem), problem
+    missing = sum(r.file is None for r in capture.records.values())
+    assert missing == one.missing
+    if one.error:
+        assert re.search(one.error, str(run.error), re.S), run.error
+        assert re.search(DEVICE_ERROR, str(run.error), re.S)
+    else:
+        assert run.error is None
+        assert len(capture.records) == len(steps) * 2
+    told(one.name, stepping, run.outcome, missing, run.error)
+
+
+def check_frames(capture: Capture) -> None:
+    """Every frame there is shows what its step lit."""
+    pose = -1
+    for step in capture.steps:
+        pose += step.kind == "tracking"
+        level = {"dark": 0.0}.get(step.kind)
+        if step.light is not None:
+            level = 0.1 * (int(step.light[-3:]) + 1)
+        elif step.row is not None:
+            level = 0.2 * (step.row + 1) + pose
+        for camera in ("cam_a", "cam_b"):
+            if level is not None and capture.has(step, camera):
+                seen = capture.frame(step, camera).mean()
+                assert seen == pytest.approx(level, abs=0.045), (step, camera)

@@ -1,0 +1,124 @@
+"""Runs that the trigger box clocks, on the simulators' devices: every frame in its place."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reconstruction.capture import Capture
+from reconstruction.capture_verify import verify
+from reconstruction.capture_writer import CaptureWriter
+from simulators.faults import Fault
+from stage_service.devices.stage import Stage
+from stage_service.plan import CapturePlan
+from stage_service.sequencer import CannotPause, Sequencer
+
+
+def sequencer(rig_file: Any, path: Path, heard: list[Any], **plan: Any) -> Sequencer:
+    wanted = CapturePlan(**plan)
+    steps = wanted.steps(rig_file)
+    writer = CaptureWriter.create(path, rig_file.rig, {"steps": steps})
+    runs, _ = wanted.runs(rig_file, steps)
+    assert "hardware" in {r.stepping for r in runs}
+    return Sequencer(
+        Stage.of(rig_file), writer, runs=runs, notify=lambda *event: heard.append(event)
+    )
+
+
+def expected(step: Any, pose: int) -> float | None:
+    """What `Flat` answers to a step; None for all lamps together, which saturate."""
+    if step.kind == "dark":
+        return 0.0
+    if step.kind == "olat":
+        return 0.1 * (int(step.light[-3:]) + 1)
+    if step.kind == "scanline":
+        return 0.2 * (step.row + 1) + pose
+    return None
+
+
+def check_frames(path: Path, cameras: tuple[str, ...] = ("cam_a", "cam_b")) -> Capture:
+    capture, pose = Capture(path), -1
+    for step in capture.steps:
+        pose += step.kind == "tracking"
+        level = expected(step, pose)
+        for camera in cameras:
+            if level is not None and capture.has(step, camera):
+                seen = capture.frame(step, camera).mean()
+                assert seen == pytest.approx(level, abs=0.045), (step, camera)
+    return capture
+
+
+def is_dark(world: Any) -> bool:
+    return not world.lamps.power().any() and world.projectors.show.level == 0
+
+
+def test_a_whole_capture_clocked_by_the_box(simulated, tmp_path):
+    rig_file, world = simulated()
+    heard: list[Any] = []
+    run = sequencer(rig_file, tmp_path / "c", heard)
+    assert run.run() == "completed", run.error
+    assert verify(tmp_path / "c") == []
+    capture = check_frames(tmp_path / "c")
+    assert [r.pulse for (_, c), r in sorted(capture.records.items()) if c == "cam_a"] == [
+        *range(1, len(capture.steps) + 1)
+    ]
+    assert not [e for e in heard if e[0] == "capture.frame_missing"]
+    assert is_dark(world)
+    manifest = capture.manifest
+    assert manifest["seconds_by_cause"]["hardware run"] > 0
+    assert manifest["sentinels_unclear"] == {}
+
+
+def test_a_dropped_frame_is_shot_again_by_itself(simulated, tmp_path):
+    rig_file, world = simulated(Fault("camera", "drop", 7, "cam_b"))
+    heard: list[Any] = []
+    run = sequencer(rig_file, tmp_path / "c", heard, projectors=())
+    assert run.run() == "completed"
+    capture = check_frames(tmp_path / "c")
+    again = {k for k, r in capture.records.items() if r.pulse > len(capture.steps)}
+    # An over-trigger leaves no gap in the numbers: the time stamps tell which pulse it was.
+    assert again == {(6, "cam_b")}
+    assert [d["cameras"] for k, d in heard if k == "capture.frame_missing"] == [["cam_b"]]
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        (Fault("trigger", "double", 9), "at most|counting pulses|frames"),
+        (Fault("trigger", "estop", 9), "estop"),
+        (Fault("trigger", "interlock", 9), "interlock"),
+    ],
+)
+def test_trouble_in_a_run_ends_it_dark_and_named(simulated, tmp_path, fault, text):
+    rig_file, world = simulated(fault)
+    run = sequencer(rig_file, tmp_path / "c", [], projectors=())
+    assert run.run() == "failed"
+    import re
+
+    assert re.search(text, str(run.error))
+    assert is_dark(world)
+    capture = check_frames(tmp_path / "c")
+    if fault.kind in ("estop", "interlock"):
+        done = {s for (s, _), r in capture.records.items() if r.file}
+        assert done == set(range(8))  # the ninth pulse was cut short
+
+
+def test_pause_is_refused_and_abort_stops_the_box_at_once(simulated, tmp_path):
+    rig_file, world = simulated()
+    run = sequencer(rig_file, tmp_path / "c", [], rate_hz=20.0, exposure={"olat": 0.01})
+    thread = threading.Thread(target=run.run)
+    thread.start()
+    while not (world.lamps.power().any() and run._clocked):
+        assert thread.is_alive()
+    with pytest.raises(CannotPause, match="clocks a run of 24 steps"):
+        run.pause()
+    run.abort()
+    thread.join(10)
+    assert (run.state, run.outcome) == ("done", "aborted")
+    assert is_dark(world)
+    check_frames(tmp_path / "c")
+    assert np.count_nonzero([r.file is not None for r in Capture(tmp_path / "c").records.values()])
