@@ -1,0 +1,236 @@
+"""Power and lamp hours of a projector on PJLink class 1; never a part of a capture's timing.
+
+Source: PJLink Specifications, version 1.04 (10 December 2013), JBMIA: the commands POWR and LAMP
+and the authentication. `docs/wire.md` has what is used of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import NoReturn
+
+from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
+
+PORT = 4352
+_LONGEST_LINE = 136
+_POLL_S = 0.5
+_ERRORS = {
+    "1": ("ERR1, an undefined command", "The projector does not offer this; use its own panel."),
+    "2": ("ERR2, a parameter out of range", "The projector does not offer this state."),
+    "3": ("ERR3, not available now", "It is starting, cooling down or busy: try again later."),
+    "4": ("ERR4, a failure of the projector", "Look at the projector's own display and lamps."),
+}
+
+
+class Power(IntEnum):
+    """What a projector says of itself."""
+
+    STANDBY = 0
+    ON = 1
+    COOLING = 2
+    WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """One lamp: its hours so far and whether it is lit."""
+
+    hours: int
+    lit: bool
+
+
+class ProjectorBusy(DeviceError):
+    """The projector cannot do this now, ERR3; later it can."""
+
+
+@dataclass(frozen=True)
+class PjLinkProjector:
+    """One projector; `password` empty where it asks for none. Safe to call from several threads.
+
+    Every exchange, with connecting, is over within `timeout_s` and has a connection of its own:
+    projectors drop idle ones, and no late answer can pass for the next. Raises `DeviceError`:
+    `DeviceTimeout` for a missed deadline, `DeviceUnreachable` for a connection refused or lost,
+    `ProjectorBusy` for ERR3.
+    """
+
+    projector: str
+    host: str
+    port: int = PORT
+    password: str = field(default="", repr=False)
+    timeout_s: float = 5.0
+
+    @property
+    def name(self) -> str:
+        """As errors name it."""
+        return f"projector {self.projector} (PJLink {self.host}:{self.port})"
+
+    def power(self) -> Power:
+        """The power state that it reports."""
+        return Power(int(self._ask("POWR ?", "[0-3]", "reading the power state")))
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Hours of each lamp; empty where it has none to count (ERR1)."""
+        doing = "reading the lamp hours"
+        answer = self._ask("LAMP ?", r"\d{1,5} [01](?: \d{1,5} [01]){0,7}|ERR1", doing)
+        if answer == "ERR1":
+            return ()
+        words = answer.split(" ")
+        pairs = zip(words[::2], words[1::2], strict=True)
+        return tuple(Lamp(int(hours), lit == "1") for hours, lit in pairs)
+
+    def switch(self, on: bool) -> None:
+        """Ask for power on or standby. OK means accepted, not reached: see `wait_for`."""
+        self._ask(f"POWR {on:d}", "OK", f"switching the power {'on' if on else 'off'}")
+
+    def wait_for(
+        self, wanted: Power, within_s: float, wait: Callable[[float], object] = time.sleep
+    ) -> None:
+        """Return once it reports `wanted`; raises `DeviceTimeout` that names what it reports.
+
+        ERR3 counts as not yet. `wait(seconds)` passes the time between two questions; what it
+        raises ends the waiting.
+        """
+        deadline = time.monotonic() + within_s
+        while True:
+            try:
+                state = self.power()
+                if state is wanted:
+                    return
+                received = f"{state.name} ({state:d})"
+            except ProjectorBusy as busy:
+                received = busy.received
+            if time.monotonic() + _POLL_S > deadline:
+                raise DeviceTimeout(
+                    self.name,
+                    f"waiting for the power state {wanted.name}",
+                    expected=f"{wanted.name} ({wanted:d})",
+                    received=received,
+                    deadline_s=within_s,
+                    todo="Lamps take minutes to start and to cool; see the projector itself.",
+                )
+            wait(_POLL_S)
+
+    def _ask(self, command: str, answer: str, doing: str) -> str:
+        """Send `command` and return what follows `=` in its answer, which is like `answer`."""
+        deadline = time.monotonic() + self.timeout_s
+        try:
+            with socket.create_connection((self.host, self.port), self.timeout_s) as link:
+                digest = self._digest(_line(link, deadline), doing)
+                link.settimeout(_left(deadline))
+                link.sendall(f"{digest}%1{command}\r".encode("ascii"))
+                line = _line(link, deadline)
+        except _Incomplete as cut:
+            raise DeviceUnreachable(
+                self.name,
+                doing,
+                expected="an answer that ends in CR",
+                received=f"{cut}, and the connection was closed",
+                deadline_s=self.timeout_s,
+                todo="The projector takes few connections at once: see who else uses it.",
+            ) from cut
+        except TimeoutError as error:
+            raise DeviceTimeout(
+                self.name,
+                doing,
+                expected="an answer",
+                received=str(error),
+                deadline_s=self.timeout_s,
+                todo="Check the projector's network standby setting, cable and address.",
+            ) from error
+        except OSError as error:
+            raise DeviceUnreachable(
+                self.name,
+                doing,
+                expected="a connection",
+                received=str(error),
+                deadline_s=self.timeout_s,
+                todo="Check address, network and that PJLink is enabled in the projector.",
+            ) from error
+        if re.fullmatch("PJLINK ERRA", line, re.IGNORECASE):
+            self._not_authenticated("ERRA: the password is wrong", doing)
+        match = re.fullmatch(rf"%1{command[:4]}=({answer})", line, re.IGNORECASE)
+        if match is not None:
+            return match[1].upper()
+        error_match = re.fullmatch(rf"%1{command[:4]}=ERR([1-4])", line, re.IGNORECASE)
+        received, todo = (
+            _ERRORS[error_match[1]]
+            if error_match
+            else (repr(line), "Check that this is a PJLink port and nothing stands in between.")
+        )
+        kind = ProjectorBusy if error_match and error_match[1] == "3" else DeviceError
+        raise kind(
+            self.name,
+            doing,
+            expected=f"an answer like %1{command[:4]}={answer}",
+            received=received,
+            deadline_s=self.timeout_s,
+            todo=todo,
+        )
+
+    def _digest(self, greeting: str, doing: str) -> str:
+        """What goes in front of the first command: nothing, or the MD5 digest."""
+        match = re.fullmatch(r"PJLINK (?:0|1 ([0-9a-f]{8}))", greeting, re.IGNORECASE)
+        if match is None:
+            if re.fullmatch("PJLINK ERRA", greeting, re.IGNORECASE):
+                self._not_authenticated("ERRA", doing)
+            raise DeviceError(
+                self.name,
+                doing,
+                expected="a greeting like PJLINK 0 or PJLINK 1 and 8 hexadecimal digits",
+                received=repr(greeting),
+                deadline_s=self.timeout_s,
+                todo="This is another service: check host and port.",
+            )
+        if match[1] is None:
+            return ""
+        if not self.password:
+            self._not_authenticated("a greeting that asks for one", doing)
+        # The protocol has MD5; it keeps the password off the wire, no more.
+        text = (match[1] + self.password).encode()
+        return hashlib.md5(text, usedforsecurity=False).hexdigest()
+
+    def _not_authenticated(self, received: str, doing: str) -> NoReturn:
+        raise DeviceError(
+            self.name,
+            doing,
+            expected="the right password",
+            received=received,
+            deadline_s=self.timeout_s,
+            todo="Set the projector's PJLink password where the rig file says.",
+        )
+
+
+class _Incomplete(Exception):
+    """The connection was closed before the end of a line."""
+
+
+def _left(deadline: float) -> float:
+    left = deadline - time.monotonic()
+    if left <= 0:
+        raise TimeoutError("nothing")
+    return left
+
+
+def _line(link: socket.socket, deadline: float) -> str:
+    """The next line; garbage bytes are kept, visibly, for the error message."""
+    data = b""
+    while b"\r" not in data and len(data) < _LONGEST_LINE:
+        try:
+            link.settimeout(_left(deadline))
+            got = link.recv(_LONGEST_LINE)
+        except TimeoutError:
+            raise TimeoutError(_shown(data)) from None
+        if not got:
+            raise _Incomplete(_shown(data))
+        data += got
+    return data.split(b"\r", 1)[0].decode("ascii", "backslashreplace")
+
+
+def _shown(data: bytes) -> str:
+    return repr(data.decode("ascii", "backslashreplace")) if data else "nothing"
