@@ -14,16 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.capture import Capture
 from reconstruction.capture_writer import CaptureWriter, utc_now
 from reconstruction.mesh import Mesh
+from stage_service.audit import SERVICE, AuditLog
+from stage_service.capture_run import CaptureRun, plan_of
 from stage_service.capture_status import CaptureStatus, read_status
 from stage_service.config import RigFile
 from stage_service.devices.stage import Stage
 from stage_service.events import EventLog
-from stage_service.plan import CapturePlan, PlanError
-from stage_service.safety import blackout, off_on_exit
-from stage_service.sequencer import Sequencer
-from stage_service.states import WrongState
+from stage_service.flash import SLOW_HZ, FlashRefusal
+from stage_service.latch import Latch
+from stage_service.lease import RootLock
+from stage_service.plan import CapturePlan, PlanCost, PlanError
+from stage_service.safety import Blackout, blackout, off_on_exit
+from stage_service.states import WrongState, possible
 
 STOP_WITHIN_S = 30.0
 """A capture that is stopped at once is out of its last device call within this time."""
@@ -49,7 +54,11 @@ class CaptureManager:
 
     `on_complete(status)` is called on that thread when a capture is done with outcome "completed".
     Folders without a manifest found at the start are listed as interrupted. Constructing connects
-    to nothing; `start`, `devices` and `blackout` talk to the stage.
+    to nothing; `start`, `devices`, `blackout` and `darken` talk to the stage. Raises `RootInUse`
+    while another manager has this root.
+
+    A blackout that could not be verified is latched (`latch`): nothing is lit until that is over.
+    `audit` is where the captures' ends and the latch are recorded.
     """
 
     def __init__(
@@ -61,11 +70,15 @@ class CaptureManager:
         self.rig_file = rig_file
         self.folder = root / "captures"
         self.folder.mkdir(parents=True, exist_ok=True)
+        self._root_lock = RootLock(root)
+        self.audit = AuditLog(root / "audit.jsonl")
+        self.latch = Latch(root / "unsafe.json")
+        self._dark: Blackout | None = None
         self.events = EventLog()
         self._on_complete = on_complete
         self._lock = threading.RLock()
         self._talking = threading.Lock()
-        self._running: _Run | None = None
+        self._running: CaptureRun | None = None
         self._closed = False
         self._done: dict[str, CaptureStatus] = {}
         for plan in sorted(self.folder.glob("*/plan.json")):
@@ -81,14 +94,17 @@ class CaptureManager:
         masks: dict[str, NDArray[np.bool_]] | None = None,
         head: Mesh | None = None,
         extra: dict[str, Any] | None = None,
+        armed_by: str | None = None,
     ) -> str:
         """Validate, create the folder, begin on a thread; returns the capture's id at once.
 
-        `extra` is kept in `plan.json` and shown as `CaptureStatus.request`. Raises `Busy`;
-        `PlanError` and `CaptureError` (masks) before any device is touched. Trouble with devices
-        appears as outcome "failed" with `error`.
+        `extra` is kept in `plan.json` and shown as `CaptureStatus.request`; `armed_by` says who at
+        the stage answers for flashes that the plan has consent for. Raises `Busy`, `Unsafe`,
+        `FlashRefusal`; `PlanError` and `CaptureError` (masks) before any device is touched.
+        Trouble with devices appears as outcome "failed" with `error`.
         """
         cost = plan.cost(self.rig_file)
+        self._check_flashing(plan, cost, armed_by)
         free = shutil.disk_usage(self.folder).free
         if cost.bytes > free:
             need, have = cost.bytes / 1e9, free / 1e9
@@ -96,11 +112,7 @@ class CaptureManager:
                 [f"the plan writes {need:.1f} GB, {self.folder} has {have:.1f} GB free"]
             )
         with self._lock:
-            if self._closed:
-                raise Busy("none, but the service is closing")
-            if self._running is not None:
-                raise Busy(self._running.id)
-            stage = Stage.of(self.rig_file)
+            self._check_free()
             now = datetime.now(UTC)
             capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
             description = {
@@ -108,19 +120,60 @@ class CaptureManager:
                 "plan": plan.model_dump(mode="json"),
                 "cost": cost.model_dump(mode="json"),
                 "started": utc_now(),
+                "armed_by": armed_by,
                 "request": extra or {},
             }
+            stage = Stage.of(self.rig_file)
             writer = CaptureWriter.create(
                 self.folder / capture_id, self.rig_file.rig, description, masks=masks, head=head
             )
-            retries = plan.retries_on(self.rig_file)
-            run = _Run(capture_id, stage, writer, retries, self.events)
-            run.thread = threading.Thread(
-                target=self._run, args=(run,), name=f"capture-{capture_id}", daemon=True
-            )
-            self._running = run
-            run.thread.start()
+            self._begin(capture_id, plan, stage, writer, armed_by)
         return capture_id
+
+    def _continue(self, capture_id: str, armed_by: str | None) -> None:
+        """Shoot what a capture lacks that is done and did not complete."""
+        with self._lock:
+            done = self.get(capture_id)
+            if "continue" not in possible(done.state, done.outcome):
+                raise WrongState("resume", done.state, done.outcome)
+            self._check_free()
+            path = Path(done.path)
+            plan = plan_of(Capture(path), self.rig_file)
+            self._check_flashing(plan, plan.cost(self.rig_file), armed_by)
+            stage = Stage.of(self.rig_file)
+            self._begin(capture_id, plan, stage, CaptureWriter.reopen(path), armed_by)
+            del self._done[capture_id]
+
+    def _check_free(self) -> None:
+        if self._closed:
+            raise Busy("none, but the service is closing")
+        if self._running is not None:
+            raise Busy(self._running.id)
+        self.latch.check()
+
+    def _check_flashing(self, plan: CapturePlan, cost: PlanCost, armed_by: str | None) -> None:
+        if cost.flash.needs_consent and not (plan.consent and armed_by):
+            slow = plan.model_copy(update={"rate_hz": SLOW_HZ}).cost(self.rig_file)
+            raise FlashRefusal(
+                cost.flash, plan.consent, seconds=cost.seconds, slow_seconds=slow.seconds
+            )
+
+    def _begin(
+        self,
+        capture_id: str,
+        plan: CapturePlan,
+        stage: Stage,
+        writer: CaptureWriter,
+        armed_by: str | None,
+    ) -> None:
+        run = CaptureRun(
+            capture_id, plan, self.rig_file, stage, writer, self.events, consented=bool(armed_by)
+        )
+        run.thread = threading.Thread(
+            target=self._run, args=(run,), name=f"capture-{capture_id}", daemon=True
+        )
+        self._running = run
+        run.thread.start()
 
     def get(self, capture_id: str) -> CaptureStatus:
         """What is known about a capture. Raises `UnknownCapture`."""
@@ -134,8 +187,10 @@ class CaptureManager:
     def list(self) -> list[CaptureStatus]:
         """All captures, oldest first."""
         with self._lock:
-            done = [self._done[k] for k in sorted(self._done)]
-            return done + ([self._running.status()] if self._running is not None else [])
+            known = list(self._done.values())
+            if self._running is not None:
+                known.append(self._running.status())
+            return sorted(known, key=lambda c: c.id)
 
     def path(self, capture_id: str) -> Path:
         """The capture's folder. Raises `UnknownCapture`."""
@@ -152,8 +207,15 @@ class CaptureManager:
         """Pause at the next step boundary. Raises `UnknownCapture`, `WrongState`."""
         return self._steer(capture_id, "pause")
 
-    def resume(self, capture_id: str) -> CaptureStatus:
-        """Go on after a pause. Raises `UnknownCapture`, `WrongState`."""
+    def resume(self, capture_id: str, *, armed_by: str | None = None) -> CaptureStatus:
+        """Go on after a pause; of a capture that did not complete, shoot what is missing.
+
+        Raises `UnknownCapture` and `WrongState`; what continues a capture raises as `start` does,
+        and `PlanError` where the rig file is no longer that of the capture.
+        """
+        if self.get(capture_id).state == "done":
+            self._continue(capture_id, armed_by)
+            return self.get(capture_id)
         return self._steer(capture_id, "resume")
 
     def abort(self, capture_id: str) -> CaptureStatus:
@@ -162,21 +224,43 @@ class CaptureManager:
 
     def devices(self) -> dict[str, Any]:
         """Per device kind: {"state": "ok" | "unreachable" | "in use", "error"?: str, figures};
-        under "cameras" one such table per camera. Without a capture, connects for the answer."""
+        under "cameras" one such table per camera. Without a capture, connects for the answer.
+        "safety" has the state after the last blackout, and whether it is latched."""
         with self._talking:
             run = self._running
             if run is not None:
-                return run.sequencer.stage.status(connect=False)
+                return {**run.sequencer.stage.status(connect=False), "safety": self.darkness()}
             stage = Stage.of(self.rig_file)
             try:
-                return stage.status(connect=True)
+                return {**stage.status(connect=True), "safety": self.darkness()}
+            finally:
+                stage.close()
+
+    def darkness(self) -> dict[str, Any]:
+        """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
+        last, latched = self._dark, self.latch.latched
+        if latched is not None:
+            return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
+        if last is None:
+            return {"state": "unknown, unsafe", "detail": "no blackout yet", "latched": None}
+        return {"state": last.state, "detail": last.detail, "latched": None}
+
+    def darken(self) -> None:
+        """Put everything off that answers, as the service starts; what does not is latched."""
+        if self.rig_file.devices is None:
+            return
+        with self._talking:
+            stage = Stage.of(self.rig_file)
+            try:
+                self._learn(blackout(stage, attempts=1), stage)
             finally:
                 stage.close()
 
     def blackout(self) -> dict[str, Any]:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
 
-        Returns {"safe": bool, "detail": str}; not safe means unknown, and is to be treated as lit.
+        Returns {"safe": bool, "state": "dark" | "unknown, unsafe", "detail": str}; what is unknown
+        is to be treated as lit.
         """
         run = self._stop()
         with self._talking:
@@ -186,9 +270,10 @@ class CaptureManager:
                 stage = run.sequencer.stage if run is not None else Stage.of(self.rig_file)
                 try:
                     result = blackout(stage)
+                    self._learn(result, stage)
                 finally:
                     stage.close()
-        answer = {"safe": result.safe, "detail": result.detail}
+        answer = result.to_dict()
         self.events.publish("stage.blackout", answer)
         return answer
 
@@ -198,10 +283,11 @@ class CaptureManager:
             self._closed = True
         run = self._stop()
         if run is not None and run.sequencer.blackout is None:  # its thread is stuck somewhere
-            blackout(run.sequencer.stage)
+            self._learn(blackout(run.sequencer.stage), run.sequencer.stage)
         self._stay_on_exit()
+        self._root_lock.release()
 
-    def _stop(self) -> _Run | None:
+    def _stop(self) -> CaptureRun | None:
         """Stop the running capture within its step, and wait until it has ended in order."""
         with self._lock:  # until `start` has started its thread
             run = self._running
@@ -220,7 +306,7 @@ class CaptureManager:
         getattr(run.sequencer, action)()
         return self.get(capture_id)
 
-    def _run(self, run: _Run) -> None:
+    def _run(self, run: CaptureRun) -> None:
         # Not while a short connection of `devices` holds a serial port.
         with self._talking:
             pass
@@ -229,8 +315,13 @@ class CaptureManager:
         finally:
             # `devices` may have opened the links once more after the sequencer closed them.
             with self._talking, self._lock:
-                run.sequencer.stage.close()
+                stage = run.sequencer.stage
+                stage.close()
+                if run.sequencer.blackout is not None:
+                    self._learn(run.sequencer.blackout, stage)
                 status = run.status()
+                result = status.outcome or status.state
+                self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
                 self._done[run.id] = status
                 self._running = None
         if status.outcome == "completed" and self._on_complete is not None:
@@ -240,34 +331,14 @@ class CaptureManager:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
 
-
-class _Run:
-    """The capture that is being made."""
-
-    def __init__(
-        self, capture_id: str, stage: Stage, writer: CaptureWriter, retries: int, events: EventLog
-    ) -> None:
-        self.id = capture_id
-        self.thread: threading.Thread | None = None
-        self._events = events
-        self._writer = writer
-        self._first = read_status(writer.path)
-        self.sequencer = Sequencer(stage, writer, retries=retries, notify=self._notify)
-
-    def status(self) -> CaptureStatus:
-        sequencer = self.sequencer
-        written, missing = self._writer.counts()
-        return self._first.model_copy(
-            update={
-                "state": sequencer.state,
-                "outcome": sequencer.outcome if sequencer.state == "done" else None,
-                "error": sequencer.error,
-                "step": sequencer.steps_done,
-                "frames_written": written,
-                "frames_missing": missing,
-                "seconds": sequencer.seconds,
-            }
+    def _learn(self, result: Blackout, stage: Stage) -> None:
+        """Keep what a blackout came to, and latch or unlatch."""
+        beams = stage.projectors
+        reads_back = stage.lights.capabilities.reads_back and (
+            beams is None or beams.capabilities.reads_back
         )
-
-    def _notify(self, kind: str, data: dict[str, Any]) -> None:
-        self._events.publish(kind, {"id": self.id, **data})
+        self._dark = result
+        change = self.latch.learn(result, reads_back)
+        if change is not None:
+            self.audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
+            self.events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})

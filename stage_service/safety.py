@@ -12,20 +12,43 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 from stage_service.devices.errors import DeviceError, SafetyRefusal
+from stage_service.devices.lights.interface import LightCapabilities, LightStatus
+from stage_service.devices.projectors.interface import ProjectorCapabilities
 from stage_service.devices.stage import Stage
+from stage_service.devices.trigger.interface import TriggerStatus
 
 ATTEMPTS = 3
+Darkness = Literal["dark", "unknown, unsafe"]
 
 
 @dataclass(frozen=True)
 class Blackout:
-    """What a blackout came to: `safe` only if every lamp and projector was read back dark."""
+    """What a blackout came to: `safe` only if every lamp and projector was read back dark.
+
+    `accepted`: off was sent, nothing failed, and the rig file accepts that the light bank cannot
+    read it back (`accept_unverified_blackout`).
+    """
 
     safe: bool
     detail: str
+    accepted: bool = False
+
+    @property
+    def state(self) -> Darkness:
+        """What is known of the lamps."""
+        return "dark" if self.safe else "unknown, unsafe"
+
+    @property
+    def blocks(self) -> bool:
+        """Whether this fails a capture, and the next one may not begin."""
+        return not (self.safe or self.accepted)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the API, events and manifests tell of it."""
+        return {"safe": self.safe, "state": self.state, "detail": self.detail}
 
 
 class _Dark(Protocol):
@@ -40,33 +63,35 @@ def blackout(stage: Stage, attempts: int = ATTEMPTS) -> Blackout:
     A device that fails is tried again on a new connection. What cannot be verified is reported
     as "unknown, unsafe".
     """
-    problems = _darken(
-        stage.lights,
-        stage.lights.capabilities.reads_back,
-        lambda: stage.lights.status().lit == 0,
-        attempts,
-    )
-    if problems:
-        problems += f" Its watchdog puts the lamps off within {stage.config.watchdog_s:g} s."
-    beams = stage.projectors
+    lights, beams, config = stage.lights, stage.projectors, stage.config
+    problems = unread = ""
+    devices: list[tuple[_Dark, LightCapabilities | ProjectorCapabilities, Callable[[], bool]]]
+    devices = [(lights, lights.capabilities, lambda: lights.status().lit == 0)]
     if beams is not None:
-        problems += _darken(beams, beams.capabilities.reads_back, beams.is_dark, attempts)
-    if problems:
-        return Blackout(False, f"unknown, unsafe: {problems.strip()}")
-    return Blackout(True, "every lamp and projector was read back dark")
+        devices.append((beams, beams.capabilities, beams.is_dark))
+    for device, can, is_dark in devices:
+        problem = _darken(device, is_dark if can.reads_back else None, attempts)
+        if problem and can.dead_man:
+            problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
+        problems += problem
+        if not problem and not can.reads_back:
+            unread += f" {device.name}: off was sent, but cannot be read back."
+    if not problems and not unread:
+        return Blackout(True, "every lamp and projector was read back dark")
+    only_lamps = beams is None or beams.capabilities.reads_back
+    accepted = not problems and only_lamps and config.lights.accept_unverified_blackout
+    return Blackout(False, f"unknown, unsafe: {(problems + unread).strip()}", accepted)
 
 
-def _darken(device: _Dark, reads_back: bool, is_dark: Callable[[], bool], attempts: int) -> str:
-    """Empty when the device was read back dark, else what went wrong the last time."""
+def _darken(device: _Dark, is_dark: Callable[[], bool] | None, attempts: int) -> str:
+    """Empty when the device is dark as far as it can tell, else what went wrong the last time."""
     problem = ""
     for attempt in range(attempts):
         if attempt:
             time.sleep(0.05 * attempt)
         try:
             device.off()
-            if not reads_back:
-                return f" {device.name}: off was sent, but cannot be read back."
-            if is_dark():
+            if is_dark is None or is_dark():
                 return ""
             problem = f" {device.name}: still lit after off."
         except DeviceError as error:
@@ -78,21 +103,24 @@ def _darken(device: _Dark, reads_back: bool, is_dark: Callable[[], bool], attemp
 
 def check_interlocks(stage: Stage) -> None:
     """Raise `SafetyRefusal` while an interlock is open or the emergency stop is pressed."""
-    trigger, lights = stage.trigger.status(), stage.lights.status()
-    for seen, text in (
-        (trigger.estop_pressed, f"{stage.trigger.name}: emergency stop pressed"),
-        (trigger.interlock_open, f"{stage.trigger.name}: interlock open"),
-        (lights.estop_pressed, f"{stage.lights.name}: emergency stop pressed"),
-        (lights.interlock_open, f"{stage.lights.name}: interlock open"),
-    ):
-        if seen:
-            raise SafetyRefusal(
-                "stage",
-                "arming",
-                expected="interlock closed and emergency stop released",
-                received=text,
-                todo="Clear it at the stage; the service never does.",
-            )
+    inputs: list[tuple[str, TriggerStatus | LightStatus]] = [
+        (stage.trigger.name, stage.trigger.status())
+    ]
+    if stage.lights.capabilities.reads_back:
+        inputs.append((stage.lights.name, stage.lights.status()))
+    for name, status in inputs:
+        for seen, text in (
+            (status.estop_pressed, "emergency stop pressed"),
+            (status.interlock_open, "interlock open"),
+        ):
+            if seen:
+                raise SafetyRefusal(
+                    "stage",
+                    "arming",
+                    expected="interlock closed and emergency stop released",
+                    received=f"{name}: {text}",
+                    todo="Clear it at the stage; the service never does.",
+                )
 
 
 def off_on_exit(close: Callable[[], None]) -> Callable[[], None]:

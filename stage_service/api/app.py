@@ -16,7 +16,7 @@ from fastapi.responses import PlainTextResponse
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from stage_service.api import event_stream, routes
+from stage_service.api import event_stream, routes, steering
 from stage_service.api.problems import (
     PAGE,
     Problem,
@@ -79,6 +79,7 @@ def create_app(stage: Stage) -> FastAPI:
     app.state.stage = stage
     install_problems(app)
     app.include_router(routes.router)
+    app.include_router(steering.router)
     app.include_router(event_stream.router)
 
     @app.get(PAGE, include_in_schema=False)

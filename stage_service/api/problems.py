@@ -21,7 +21,10 @@ from stage_service.api.stage import (
     UnknownFrame,
 )
 from stage_service.captures import Busy, UnknownCapture
+from stage_service.flash import FlashRefusal
 from stage_service.jobs.queue import NoSuchJob
+from stage_service.latch import CannotAcknowledge, Unsafe
+from stage_service.lease import Leased, NoLease
 from stage_service.plan import PlanError
 from stage_service.states import WrongState
 
@@ -69,10 +72,45 @@ KINDS = {
             "The stage makes one capture at a time. Wait for `running`, or abort it.",
         ),
         Kind(
+            "flash-rate",
+            422,
+            "A living subject would see flashes of 3 to 30 Hz",
+            "`problems` has the ways out: a slower plan, or recorded consent that somebody at the "
+            "stage arms. docs/safety.md says why. No lamp was touched.",
+        ),
+        Kind(
+            "unsafe",
+            409,
+            "Nobody knows whether the lamps are off",
+            "The last blackout could not be verified. Look at the stage, put `detail` right, then "
+            "`POST /devices/blackout`; where the link cannot read back, `POST "
+            "/devices/acknowledge`.",
+        ),
+        Kind(
+            "cannot-acknowledge",
+            409,
+            "This is not for a person to say",
+            "Nothing is latched, or the light bank can tell by itself: `POST /devices/blackout`.",
+        ),
+        Kind(
+            "leased",
+            409,
+            "Somebody else steers the stage",
+            "`holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are "
+            "open to everybody.",
+        ),
+        Kind(
+            "no-lease",
+            409,
+            "The token is no lease's",
+            "The lease has expired or was released. `GET /lease` says who holds one now.",
+        ),
+        Kind(
             "wrong-state",
             409,
             "The capture's state does not allow this",
-            "`detail` lists what is possible now; `state` is where the capture is.",
+            "`detail` lists what is possible now; `state` is where the capture is. Steps that the "
+            "trigger box clocks cannot pause.",
         ),
         Kind(
             "not-finished",
@@ -128,6 +166,11 @@ BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",
     BadInput: "bad-input",
     Busy: "busy",
+    FlashRefusal: "flash-rate",
+    Unsafe: "unsafe",
+    CannotAcknowledge: "cannot-acknowledge",
+    Leased: "leased",
+    NoLease: "no-lease",
     WrongState: "wrong-state",
     NotFinished: "not-finished",
     UnknownCapture: "unknown-capture",
@@ -139,7 +182,7 @@ BY_ERROR: dict[type[Exception], str] = {
 }
 """Which error class becomes which kind; a subclass stands before its base."""
 
-EXTRA = ("problems", "running", "state")
+EXTRA = ("problems", "running", "state", "holder", "expires")
 """Attributes of an error that its problem document repeats."""
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import mimetypes
+from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request, Response, status
+from fastapi import APIRouter, Query, Response, status
 from fastapi.responses import FileResponse
 
 from stage_service.api.frames import png_preview
@@ -15,20 +16,12 @@ from stage_service.api.stage import (
     CaptureView,
     Health,
     JobRequest,
-    Stage,
 )
+from stage_service.api.steering import By, OnStage, ResumeRequest
 from stage_service.jobs.records import Job
 from stage_service.plan import CapturePlan, PlanCost
 
 router = APIRouter()
-
-
-def _stage(request: Request) -> Stage:
-    stage: Stage = request.app.state.stage
-    return stage
-
-
-OnStage = Annotated[Stage, Depends(_stage)]
 
 
 @router.post("/plans:validate", tags=["captures"])
@@ -38,9 +31,9 @@ def validate_plan(plan: CapturePlan, stage: OnStage) -> PlanCost:
 
 
 @router.post("/captures", status_code=status.HTTP_202_ACCEPTED, tags=["captures"])
-def start_capture(body: CaptureRequest, stage: OnStage, response: Response) -> CaptureView:
+def start_capture(body: CaptureRequest, stage: OnStage, by: By, response: Response) -> CaptureView:
     """Begin a capture. With `pipeline`, its completion enqueues that job by itself."""
-    view = stage.start_capture(body)
+    view = stage.start_capture(body, by)
     response.headers["Location"] = f"/captures/{view.id}"
     return view
 
@@ -58,21 +51,24 @@ def get_capture(capture: str, stage: OnStage) -> CaptureView:
 
 
 @router.post("/captures/{capture}/pause", tags=["captures"])
-def pause_capture(capture: str, stage: OnStage) -> CaptureView:
+def pause_capture(capture: str, stage: OnStage, by: By) -> CaptureView:
     """Pause at the next step boundary, lights off."""
-    return stage.view(stage.captures.pause(capture))
+    return stage.view(stage.control.pause(by, capture))
 
 
 @router.post("/captures/{capture}/resume", tags=["captures"])
-def resume_capture(capture: str, stage: OnStage) -> CaptureView:
-    """Go on after a pause."""
-    return stage.view(stage.captures.resume(capture))
+def resume_capture(
+    capture: str, stage: OnStage, by: By, body: ResumeRequest | None = None
+) -> CaptureView:
+    """Go on after a pause; of a capture that did not complete, shoot the frames that it lacks."""
+    armed_by = None if body is None else body.armed_by
+    return stage.view(stage.control.resume(by, capture, armed_by=armed_by))
 
 
 @router.post("/captures/{capture}/abort", tags=["captures"])
-def abort_capture(capture: str, stage: OnStage) -> CaptureView:
+def abort_capture(capture: str, stage: OnStage, by: By) -> CaptureView:
     """Abort at the next step boundary, lights off; finished frames stay."""
-    return stage.view(stage.captures.abort(capture))
+    return stage.view(stage.control.abort(by, capture))
 
 
 @router.get(
@@ -83,7 +79,8 @@ def abort_capture(capture: str, stage: OnStage) -> CaptureView:
 )
 def get_frame(capture: str, step: int, camera: str, stage: OnStage) -> Response:
     """A frame as it was written: scene-linear radiance, W/(sr m²)."""
-    return Response(stage.frame(capture, step, camera).read_bytes(), media_type="image/x-exr")
+    data = stage.frame(capture, step, camera, Path.read_bytes)
+    return Response(data, media_type="image/x-exr")
 
 
 @router.get(
@@ -100,9 +97,8 @@ def get_preview(
     percentile: Annotated[float, Query(ge=50, le=100, description="what becomes white")] = 99.5,
 ) -> Response:
     """A picture of a frame to look at: exposed by a percentile, sRGB."""
-    return Response(
-        png_preview(stage.frame(capture, step, camera), percentile), media_type="image/png"
-    )
+    picture = stage.frame(capture, step, camera, lambda file: png_preview(file, percentile))
+    return Response(picture, media_type="image/png")
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
@@ -149,18 +145,6 @@ def get_artifact(job: str, path: str, stage: OnStage) -> Response:
     file = stage.artifact(job, path)
     kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
     return FileResponse(file, media_type=kind)
-
-
-@router.get("/devices", tags=["devices"])
-def get_devices(stage: OnStage) -> dict[str, object]:
-    """Each device and whether it answers."""
-    return stage.captures.devices()
-
-
-@router.post("/devices/blackout", tags=["devices"])
-def blackout(stage: OnStage) -> dict[str, object]:
-    """All lamps and projectors off, verified. Aborts a running capture."""
-    return stage.captures.blackout()
 
 
 @router.get("/health", tags=["service"])

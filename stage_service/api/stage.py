@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 from pydantic import BaseModel, ConfigDict, Field
 
-from reconstruction.capture import Capture, MissingFrame
+from reconstruction.capture import Capture
 from reconstruction.mesh import read_obj
 from reconstruction.rig import Rig
 from stage_service.capture_status import CaptureStatus
 from stage_service.captures import CaptureManager, UnknownCapture
 from stage_service.config import RigFile
+from stage_service.control import Caller, Control
 from stage_service.events import EventLog
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
@@ -24,6 +26,7 @@ from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.jobs.slots import worker_is_alive
 from stage_service.plan import CapturePlan, PlanCost
 
+T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$"
 
 
@@ -47,6 +50,7 @@ class CaptureRequest(BaseModel):
     """A capture to make, and the job that follows it by itself when it completes.
 
     `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine.
+    `armed_by` says who at the stage answers for flashes that the plan has consent for.
     """
 
     model_config = ConfigDict(
@@ -71,6 +75,7 @@ class CaptureRequest(BaseModel):
     head: Path | None = None
     masks: Path | None = None
     pipeline: PipelineRequest | None = None
+    armed_by: str | None = Field(default=None, min_length=1, max_length=100)
 
 
 class JobRequest(BaseModel):
@@ -142,14 +147,15 @@ class Health(BaseModel):
 class Stage:
     """The captures, jobs and devices of one root folder.
 
-    `start()` begins to watch jobs for the event log; `close()` puts the lights off and may be
-    called more than once, from any thread.
+    `start()` puts the lights off and watches jobs for the event log; `close()` puts them off again
+    and may be called more than once, from any thread. `control` steers in a caller's name.
     """
 
     def __init__(self, rig_file: RigFile, root: Path) -> None:
         self.rig_file, self.root = rig_file, root
-        self.queue = JobQueue(root)
         self.captures = CaptureManager(rig_file, root, on_complete=self._enqueue_pipeline)
+        self.control = Control(self.captures)
+        self.queue = JobQueue(root)
         self._closing = threading.Lock()
         self._closed = threading.Event()
         self._watcher = threading.Thread(target=self._watch_jobs, name="job-events", daemon=True)
@@ -160,7 +166,8 @@ class Stage:
         return self.captures.events
 
     def start(self) -> None:
-        """Enqueue what a crash kept from being enqueued, and follow the jobs."""
+        """Lights off; enqueue what a crash kept from being enqueued, and follow the jobs."""
+        self.captures.darken()
         for status in self.captures.list():
             if status.outcome == "completed":
                 self._enqueue_pipeline(status)
@@ -183,8 +190,8 @@ class Stage:
         """Cost a plan without touching a device. Raises `PlanError`."""
         return plan.cost(self.rig_file)
 
-    def start_capture(self, request: CaptureRequest) -> CaptureView:
-        """Begin a capture. Raises `BadInput`, `PlanError`, `Busy`."""
+    def start_capture(self, request: CaptureRequest, by: Caller) -> CaptureView:
+        """Begin a capture. Raises `BadInput`, and what `Control.start` raises."""
         if request.pipeline is not None:
             _check_names(request.pipeline, self.rig_file.rig)
             if "reconstruct" not in PIPELINES[request.pipeline.name]:
@@ -202,8 +209,10 @@ class Stage:
                 head = read_obj(request.head)
             except (OSError, ValueError) as error:
                 raise BadInput(f"head: {error}") from error
-        capture = self.captures.start(
+        capture = self.control.start(
+            by,
             request.plan,
+            armed_by=request.armed_by,
             head=head,
             masks=self._masks(request.masks) if request.masks is not None else None,
             extra={"pipeline": request.pipeline.model_dump(mode="json")}
@@ -227,8 +236,11 @@ class Stage:
                 self._enqueue_pipeline(status)
         return CaptureView(**status.model_dump(), job=job)
 
-    def frame(self, capture_id: str, step: int, camera: str) -> Path:
-        """A frame's EXR file. Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`."""
+    def frame(self, capture_id: str, step: int, camera: str, read: Callable[[Path], T]) -> T:
+        """What `read` makes of a frame's EXR file, wherever compression has just put it.
+
+        Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`.
+        """
         capture = Capture(self.capture_path(capture_id))
         by_index = {s.index: s for s in capture.steps}
         cameras = [c.name for c in capture.rig.cameras]
@@ -237,11 +249,7 @@ class Stage:
                 f"{capture_id} has the steps {min(by_index)} to {max(by_index)} and the cameras "
                 f"{cameras}; got step {step}, camera {camera!r}"
             )
-        record = capture.records.get((step, camera))
-        if record is None or record.file is None:
-            why = record.reason if record is not None else "it was not shot yet"
-            raise MissingFrame(f"{capture_id}: step {step}, {camera}: {why}")
-        return capture.path / record.file
+        return capture.read_file(by_index[step], camera, read)
 
     def capture_path(self, capture_id: str) -> Path:
         """The capture's folder; one that was put there by hand or by `import` counts too."""

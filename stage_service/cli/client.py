@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, Self
 
 import httpx
@@ -13,14 +14,21 @@ from reconstruction.report import Progress
 from stage_service.cli.output import BAD_INPUT, FAILED, UNREACHABLE, CommandError
 
 DEFAULT_URL = "http://127.0.0.1:8331"
+LEASE = "Hairstage-Lease"
+LEASE_S = 120.0
+"""A command that dies blocks the stage for no longer."""
 
 
 class Service:
-    """A running service, for the length of a with-block. Its problems become `CommandError`s."""
+    """A running service, for the length of a with-block. Its problems become `CommandError`s.
 
-    def __init__(self, url: str | None = None) -> None:
+    `lease` is the token of the lease under which it steers.
+    """
+
+    def __init__(self, url: str | None = None, lease: str | None = None) -> None:
         self.url = url or os.environ.get("HAIRSTAGE_URL") or DEFAULT_URL
         self._http = httpx.Client(base_url=self.url, timeout=60.0, trust_env=False)
+        self._steer_with(lease)
 
     def __enter__(self) -> Self:
         return self
@@ -54,6 +62,38 @@ class Service:
         raise CommandError(
             f"{problem['title']}: {problem['detail']}", code, "Problem", problem=problem
         )
+
+    @contextmanager
+    def leased(self, holder: str) -> Iterator[Callable[[], None]]:
+        """Steer alone until the end of the block; call what it yields at least every minute.
+
+        Does nothing where this service already steers under a lease.
+        """
+        if LEASE in self._http.headers:
+            yield lambda: None
+            return
+        granted = self.post("/lease", {"holder": holder, "seconds": LEASE_S})
+        self._steer_with(granted["token"])
+        renewed = time.monotonic()
+
+        def renew() -> None:
+            nonlocal renewed
+            if time.monotonic() - renewed > LEASE_S / 4:
+                self.ask("PATCH", "/lease", json={"seconds": LEASE_S})
+                renewed = time.monotonic()
+
+        try:
+            yield renew
+        finally:
+            with suppress(CommandError):  # it has expired, or the service has gone
+                self.ask("DELETE", "/lease")
+            self._steer_with(None)
+
+    def _steer_with(self, token: str | None) -> None:
+        if token is None:
+            self._http.headers.pop(LEASE, None)
+        else:
+            self._http.headers[LEASE] = token
 
     def follow_capture(
         self, capture: str, progress: Progress, check: Callable[[], None] = lambda: None

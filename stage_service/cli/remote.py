@@ -1,9 +1,12 @@
-"""`capture` and `jobs`: a running service, from the command line."""
+"""`capture`, `lease` and `jobs`: a running service, from the command line."""
 
 from __future__ import annotations
 
 import argparse
+import getpass
 import json
+import os
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,15 +39,28 @@ def add(commands: Commands) -> None:
     start.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
     _pipeline(start.add_argument("--pipeline", help="job to enqueue when the capture completes"))
     start.add_argument("--options", help="the pipeline's options: JSON or a JSON file")
-    start.add_argument("--wait", action="store_true", help="wait for capture and job")
+    start.add_argument("--armed-by", help="who answers for flashes that the plan has consent for")
+    start.add_argument("--wait", action="store_true", help="wait for capture and job, steer alone")
     _remote(capture, "list", run_list_captures, "list captures, oldest first")
     for action, what in (
         ("show", "show where a capture is"),
         ("pause", "pause at the next step"),
-        ("resume", "go on after a pause"),
+        ("resume", "go on after a pause; shoot what an aborted or failed capture lacks"),
         ("abort", "abort at the next step, lights off"),
     ):
-        _remote(capture, action, run_capture_action, what).add_argument("capture", help="its id")
+        parser = _remote(capture, action, run_capture_action, what)
+        parser.add_argument("capture", help="its id")
+        if action == "resume":
+            parser.add_argument("--armed-by", help="as for start")
+
+    lease = add_group(commands, "lease", "steer a stage alone for some time")
+    take = _remote(lease, "take", run_take_lease, "take the lease; prints its token")
+    take.add_argument("--holder", help="in whose name; without it, this user and machine")
+    take.add_argument("--seconds", type=float, default=600.0)
+    _remote(lease, "show", run_show_lease, "show who steers, and until when")
+    renew = _remote(lease, "renew", run_renew_lease, "let the lease of --lease end later")
+    renew.add_argument("--seconds", type=float, default=600.0, help="from now")
+    _remote(lease, "release", run_release_lease, "end the lease of --lease")
 
     jobs = add_group(commands, "jobs", "submit, follow and cancel jobs on a running service")
     submit = _remote(jobs, "submit", run_submit, "enqueue a pipeline on a finished capture")
@@ -78,12 +94,15 @@ def run_start(args: argparse.Namespace, output: Output, service: Service) -> int
             body[field] = str(getattr(args, field).resolve())
     if args.pipeline is not None:
         body["pipeline"] = {"name": args.pipeline, "options": _options(args.options)}
-    capture = service.post("/captures", body)
+    if args.armed_by is not None:
+        body["armed_by"] = args.armed_by
     if not args.wait:
+        capture = service.post("/captures", body)
         output.result(capture, f"capture {capture['id']} runs")
         return 0
-    with progress_bar("capture") as progress:
-        capture = service.follow_capture(capture["id"], progress)
+    with service.leased(_me()) as renew, progress_bar("capture") as progress:
+        capture = service.post("/captures", body)
+        capture = service.follow_capture(capture["id"], progress, renew)
     if capture["outcome"] != "completed":
         output.result({"capture": capture}, f"{capture['outcome']}: {capture['error'] or ''}")
         return FAILED
@@ -108,9 +127,39 @@ def run_list_captures(args: argparse.Namespace, output: Output, service: Service
 def run_capture_action(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Show, pause, resume or abort."""
     path = f"/captures/{args.capture}"
-    output.result(
-        service.get(path) if args.action == "show" else service.post(f"{path}/{args.action}")
-    )
+    if args.action == "show":
+        output.result(service.get(path))
+        return 0
+    body = {"armed_by": args.armed_by} if args.action == "resume" else None
+    output.result(service.post(f"{path}/{args.action}", body))
+    return 0
+
+
+def run_take_lease(args: argparse.Namespace, output: Output, service: Service) -> int:
+    """Take the lease."""
+    granted = service.post("/lease", {"holder": args.holder or _me(), "seconds": args.seconds})
+    output.result(granted, granted["token"])
+    return 0
+
+
+def run_show_lease(_args: argparse.Namespace, output: Output, service: Service) -> int:
+    """Show who steers."""
+    held = service.get("/lease")
+    text = f"{held['holder']} until {held['expires']}" if held["holder"] else "nobody: anybody may"
+    output.result(held, text)
+    return 0
+
+
+def run_renew_lease(args: argparse.Namespace, output: Output, service: Service) -> int:
+    """Renew the lease."""
+    granted = service.ask("PATCH", "/lease", json={"seconds": args.seconds})
+    output.result(granted, f"until {granted['expires']}")
+    return 0
+
+
+def run_release_lease(_args: argparse.Namespace, output: Output, service: Service) -> int:
+    """End the lease."""
+    output.result(service.ask("DELETE", "/lease"), "released")
     return 0
 
 
@@ -164,12 +213,21 @@ def _remote(group: Commands, name: str, run: RemoteRun, help: str) -> argparse.A
     def connected(args: argparse.Namespace, output: Output) -> int:
         from stage_service.cli.client import Service
 
-        with Service(args.url) as service:
+        with Service(args.url, args.lease) as service:
             return run(args, output, service)
 
     parser = add_command(group, name, connected, help)
     parser.add_argument("--url", help="the service's URL (also: HAIRSTAGE_URL)")
+    parser.add_argument("--lease", help="token of the lease under which to steer")
     return parser
+
+
+def _me() -> str:
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError):  # a container's user may have no name
+        user = f"user {os.getuid()}"
+    return f"{user} on {socket.gethostname()}"
 
 
 def _pipeline(action: argparse.Action) -> None:

@@ -182,7 +182,7 @@ def test_steering_a_capture(http, world):
     until(lambda: http.get(f"/captures/{capture}").json()["state"] == "done")
     assert http.get(f"/captures/{capture}").json()["outcome"] == "aborted"
     assert not world.lit
-    assert problem(http.post(f"/captures/{capture}/resume"), "wrong-state")["state"] == "done"
+    assert problem(http.post(f"/captures/{capture}/pause"), "wrong-state")["state"] == "done"
     submit = http.post("/jobs", json={"capture": "nope", "pipeline": {"name": "fit"}})
     problem(submit, "unknown-capture")
 
@@ -313,6 +313,12 @@ def test_every_route_of_the_api_is_there_and_documented(http):
         "GET /jobs/{job}/artifacts/{path}",
         "GET /devices",
         "POST /devices/blackout",
+        "POST /devices/acknowledge",
+        "POST /lease",
+        "GET /lease",
+        "PATCH /lease",
+        "DELETE /lease",
+        "GET /audit",
         "GET /health",
         "GET /events",
     }

@@ -103,6 +103,7 @@ def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, wo
     until(manager, "capture.state", state="running")
     assert manager.blackout() == {
         "safe": True,
+        "state": "dark",
         "detail": "every lamp and projector was read back dark",
     }
     assert manager.get(capture_id).outcome == "aborted"
@@ -140,6 +141,7 @@ def test_an_interrupted_capture_is_listed_after_a_restart(manager, rig_file, wor
     damaged.mkdir()
     (damaged / "plan.json").write_text("{")
     (damaged / "rig.json").write_text("{")
+    manager.close()
     again = CaptureManager(rig_file, manager.folder.parent)
     (status,) = again.list()
     assert (status.state, status.outcome) == ("done", "interrupted")

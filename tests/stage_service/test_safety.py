@@ -2,6 +2,9 @@
 
 from types import SimpleNamespace
 
+from stage_service.devices.errors import DeviceTimeout
+from stage_service.devices.lights.interface import LightCapabilities
+from stage_service.devices.projectors.interface import ProjectorCapabilities
 from stage_service.safety import blackout
 
 
@@ -9,7 +12,7 @@ class Broken:
     """A light bank whose driver has a fault of its own."""
 
     name = "lights"
-    capabilities = SimpleNamespace(reads_back=True)
+    capabilities = LightCapabilities(reads_back=True, dead_man=True, table=0)
 
     def off(self):
         raise ZeroDivisionError("a fault of the driver")
@@ -17,7 +20,7 @@ class Broken:
 
 class Beams:
     name = "projectors"
-    capabilities = SimpleNamespace(reads_back=True)
+    capabilities = ProjectorCapabilities(reads_back=True, dead_man=False, table=0)
     lit = True
 
     def off(self):
@@ -27,12 +30,40 @@ class Beams:
         return not self.lit
 
 
+class Silent:
+    """A light bank that obeys and cannot say so."""
+
+    name = "lights"
+    capabilities = LightCapabilities(reads_back=False, dead_man=False, table=0)
+    dead = False
+
+    def off(self):
+        if self.dead:
+            raise DeviceTimeout("lights", "off", expected="an answer", received="", todo="")
+
+
+def stage(lights, beams, *, accepts=False):
+    accepted = SimpleNamespace(accept_unverified_blackout=accepts)
+    config = SimpleNamespace(watchdog_s=2.0, lights=accepted)
+    return SimpleNamespace(lights=lights, projectors=beams, config=config)
+
+
 def test_a_fault_of_one_driver_does_not_keep_the_projectors_lit():
     beams = Beams()
-    stage = SimpleNamespace(
-        lights=Broken(), projectors=beams, config=SimpleNamespace(watchdog_s=2.0)
-    )
-    result = blackout(stage, attempts=1)
+    result = blackout(stage(Broken(), beams), attempts=1)
     assert not beams.lit
     assert not result.safe
     assert "ZeroDivisionError: a fault of the driver" in result.detail
+    assert "Its watchdog darkens it within 2 s" in result.detail
+    assert result.blocks
+
+
+def test_what_cannot_be_read_back_is_unknown_and_blocks_unless_that_is_accepted():
+    unread = blackout(stage(Silent(), Beams()), attempts=1)
+    assert (unread.state, unread.blocks) == ("unknown, unsafe", True)
+    accepted = blackout(stage(Silent(), Beams(), accepts=True), attempts=1)
+    assert (accepted.state, accepted.blocks) == ("unknown, unsafe", False)
+    assert accepted.detail.endswith("off was sent, but cannot be read back.")
+    broken = Silent()
+    broken.dead = True
+    assert blackout(stage(broken, None, accepts=True), attempts=1).blocks
