@@ -3,7 +3,8 @@
 capture/
   rig.json        calibrated geometry (`Rig.to_dict`)
   plan.json       {"steps": [Step, ...], ...}: the commanded sequence
-  journal.jsonl   append-only, fsynced: one line per frame, shot or missing
+  journal.jsonl   append-only, fsynced: one line per frame, shot or missing; whoever writes or
+                  compresses the capture holds its lock
   frames/00012/cam_00.exr    (cam_00.zip.exr once compressed)
   masks/cam_00.png    hair masks from the user, optional
   head.obj            the digitised head, optional
@@ -14,11 +15,11 @@ capture/
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ from reconstruction.exr import read_exr
 from reconstruction.mesh import Mesh, read_obj
 from reconstruction.rig import Rig
 
+T = TypeVar("T")
 StepKind = Literal["dark", "all_on", "olat", "scanline", "tracking"]
 
 
@@ -196,12 +198,33 @@ class Capture:
             out.setdefault(step.light, []).append(step)
         return out
 
-    def _read(self, step: Step, camera: str) -> tuple[NDArray[np.float32], dict[str, float | str]]:
+    def read_file(self, step: Step, camera: str, read: Callable[[Path], T]) -> T:
+        """What `read` makes of a frame's file; raises what it raises, and `MissingFrame`.
+
+        Compression may put another file in its place at any moment: where it has gone, the
+        journal is read anew.
+        """
+        file = self._file(step, camera)
+        while True:
+            try:
+                return read(file)
+            except (OSError, ValueError):
+                if file.exists():
+                    raise
+                self.records = dict(self._journal())
+                gone, file = file, self._file(step, camera)
+                if file == gone:
+                    raise
+
+    def _file(self, step: Step, camera: str) -> Path:
         record = self.records.get((step.index, camera))
         if record is None or record.file is None:
             why = record.reason if record is not None else "it was never shot"
             raise MissingFrame(f"{self.path}: step {step.index} ({step.kind}), {camera}: {why}")
-        return read_exr(self.path / record.file)
+        return self.path / record.file
+
+    def _read(self, step: Step, camera: str) -> tuple[NDArray[np.float32], dict[str, float | str]]:
+        return self.read_file(step, camera, read_exr)
 
     def of_kind(self, kind: StepKind) -> tuple[Step, ...]:
         """Steps of one kind in the order they were shot."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 from pathlib import Path
@@ -17,7 +18,8 @@ def verify(path: str | Path, progress: Progress = silent) -> list[str]:
     """Re-read every file of a capture; returns one sentence per problem, none for a sound one.
 
     Checked: the small files and the journal against the manifest, every frame against its
-    checksum, that it decodes and has its camera's size, and that no planned frame is missing.
+    checksum, that it decodes and has its camera's size, that no planned frame is missing, and
+    that no file lies among the frames that is none.
     """
     path = Path(path)
     try:
@@ -27,9 +29,9 @@ def verify(path: str | Path, progress: Progress = silent) -> list[str]:
     problems = _journal(path) + _manifest(capture)
     recorded = [r for r in capture.records.values() if r.file is not None]
     for i, record in enumerate(recorded):
-        problems += _frame(capture, record)
+        problems += _frame(capture, _now(capture, record))
         progress("verifying frames", (i + 1) / len(recorded))
-    return problems + _absent(capture)
+    return problems + _absent(capture) + _left_over(path)
 
 
 def _journal(path: Path) -> list[str]:
@@ -74,6 +76,36 @@ def _journal_checksum(journal: Path, known: dict[str, Any]) -> list[str]:
     if hashlib.sha256(data[: known.get("bytes", 0)]).hexdigest() != known.get("sha256"):
         return ["journal.jsonl does not match its checksum in the manifest."]
     return []
+
+
+def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
+    """The record as it is now, where compression has put another file in its place."""
+    assert record.file is not None
+    if (capture.path / record.file).exists():
+        return record
+    now = Capture(capture.path).records[record.step, record.camera]
+    return record if now.file is None else now
+
+
+def _left_over(path: Path) -> list[str]:
+    """Files that an interrupted write or compression left; none can be told while one goes on."""
+    journal = path / "journal.jsonl"
+    if not journal.is_file():
+        return []
+    with journal.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return []
+        known = {path / r.file for r in Capture(path).records.values() if r.file is not None}
+        found = {p for p in path.glob("frames/**/*") if p.is_file()}
+    strangers = sorted(str(p.relative_to(path)) for p in found - known)
+    if not strangers:
+        return []
+    return [
+        f"{len(strangers)} files among the frames are in no line of the journal, left by a write "
+        f"or a compression that was interrupted; the first is {strangers[0]}."
+    ]
 
 
 def _frame(capture: Capture, record: FrameRecord) -> list[str]:

@@ -1,47 +1,66 @@
 """Writing capture folders: frames first, then their journal lines, the manifest last.
 
 A crash at any moment leaves every frame that the journal names whole: a frame's file is flushed
-and renamed before its line is appended and flushed. `reopen` continues such a folder.
+and renamed before its line is appended and flushed. `reopen` continues such a folder. A full disk
+raises `DiskFull`, before that while there is still room to `finish`.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import math
-import os
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.capture import Capture, CaptureError, FrameRecord, Step
-from reconstruction.exr import read_exr, replace_durably, write_exr
+from reconstruction.durable_files import (
+    RESERVE,
+    append_whole,
+    flush,
+    part,
+    replace_durably,
+    require_free,
+    write_pages,
+    write_whole,
+)
+from reconstruction.exr import UncompressedExr
 from reconstruction.mesh import Mesh, write_obj
-from reconstruction.report import Progress, silent
 from reconstruction.rig import Rig
+
+
+class JournalInUse(CaptureError):
+    """Somebody else is writing the capture."""
 
 
 class CaptureWriter:
     """Writes one capture folder; `write_frame` and `record_missing` may be called from any thread.
 
-    Get one from `create` or `reopen`. The layout is described in `reconstruction.capture`.
+    Get one from `create` or `reopen`. The layout is described in `reconstruction.capture`. It
+    has the folder for itself until `finish` or `close`; `reserve` bytes of the disk stay free.
     """
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: Capture, journal: FileIO) -> None:
+        self.reserve = RESERVE
         self.path = capture.path
         self.rig = capture.rig
         self.steps = capture.steps
         self.records: dict[tuple[int, str], FrameRecord] = dict(capture.records)
         self._known = {s.index: s for s in capture.steps}
         self._lock = threading.Lock()
-        self._journal = (self.path / "journal.jsonl").open("ab")
+        self._journal = journal
+        self._stored: set[Path] = set()
+        self._of_thread = threading.local()
 
     @classmethod
     def create(
@@ -71,30 +90,34 @@ class CaptureWriter:
         images = {name: _mask(rig, name, mask) for name, mask in (masks or {}).items()}
 
         (path / "frames").mkdir(parents=True)
-        _write_json(path / "rig.json", rig.to_dict())
+        write_json(path / "rig.json", rig.to_dict())
         if images:
             (path / "masks").mkdir()
         for name, image in images.items():
             done, png = cv2.imencode(".png", image)
             if not done:
                 raise CaptureError(f"masks/{name}.png: cannot be written")
-            _write_bytes(path / "masks" / f"{name}.png", png.tobytes())
+            write_whole(path / "masks" / f"{name}.png", png.tobytes())
         if head is not None:
             write_obj(path / "head.obj.part", head)
             replace_durably(path / "head.obj.part", path / "head.obj")
-        (path / "journal.jsonl").touch()
-        _write_json(path / "plan.json", {**plan, "steps": [s.to_dict() for s in steps]})
-        _sync_folder(path)
-        return cls(Capture(path))
+        journal = open_journal(path)
+        write_json(path / "plan.json", {**plan, "steps": [s.to_dict() for s in steps]})
+        flush(path)
+        return cls(Capture(path), journal)
 
     @classmethod
     def reopen(cls, path: str | Path) -> Self:
         """Continue a capture that was interrupted: a torn last journal line is cut off, the
-        manifest, if there is one, is removed until `finish` writes it anew."""
-        _cut_torn_line(Path(path) / "journal.jsonl")
+        manifest, if there is one, is removed until `finish` writes it anew. Raises `CaptureError`
+        where there is no capture, or another process writes or compresses it."""
+        Capture(path)
+        journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
-        return cls(capture)
+        for left_over in capture.path.glob("frames/*/*.part"):
+            left_over.unlink()
+        return cls(capture, journal)
 
     def missing(self) -> list[tuple[Step, str]]:
         """The frames (step, camera) that are not there yet, in the plan's order."""
@@ -144,10 +167,10 @@ class CaptureWriter:
         full_scale: float = math.inf,
         count_scale: float = 0.0,
     ) -> FrameRecord:
-        """Write and flush a frame's file; it belongs to the capture once `commit` has its record.
+        """Write a frame's file; `commit` makes it durable and a part of the capture.
 
-        Flushing waits for the disk, and disks flush many files together as fast as one: store
-        from several threads and commit what has gathered. Arguments and errors as `write_frame`.
+        Several threads may store side by side. Arguments and errors as `write_frame`, `DiskFull`
+        where the disk has no room for it beside the reserve.
         """
         self._check(step, camera)
         expected = (self.rig.camera(camera).height, self.rig.camera(camera).width, 3)
@@ -162,18 +185,38 @@ class CaptureWriter:
             attributes["fullScale"] = float(full_scale)
         if count_scale > 0:
             attributes["countScale"] = float(count_scale)
-        file = f"frames/{step.index:05d}/{camera}.exr"
-        (self.path / file).parent.mkdir(exist_ok=True)
-        write_exr(self.path / file, radiance, attributes, compress=False)
-        return FrameRecord(step.index, camera, file, sha256(self.path / file), recorded=utc_now())
+        file = self.path / "frames" / f"{step.index:05d}" / f"{camera}.exr"
+        whole = self._buffer(radiance.shape).fill(radiance, attributes)
+        require_free(self.path, len(whole), self.reserve)
+        file.parent.mkdir(exist_ok=True)
+        write_pages(part(file), whole)
+        with self._lock:
+            self._stored.add(part(file))
+        name, checksum = str(file.relative_to(self.path)), hashlib.sha256(whole).hexdigest()
+        return FrameRecord(step.index, camera, name, checksum, recorded=utc_now())
 
     def commit(self, records: Sequence[FrameRecord]) -> None:
-        """Make the records part of the capture: flush their folders, then the journal, once."""
-        for folder in {(self.path / r.file).parent for r in records if r.file is not None}:
-            _sync_folder(folder)
+        """Make the records part of the capture: flush the files, their names, then the journal.
+
+        A disk flushes many files together as fast as one: commit what has gathered.
+        """
+        files = [self.path / r.file for r in records if r.file is not None]
+        for file in files:
+            replace_durably(part(file), file)
+        folders = {file.parent for file in files}
+        for folder in folders | {folder.parent for folder in folders}:
+            flush(folder)
         with self._lock:
             append_lines(self._journal, records)
             self.records.update({(r.step, r.camera): r for r in records})
+            self._stored.difference_update(part(file) for file in files)
+
+    def _buffer(self, shape: tuple[int, ...]) -> UncompressedExr:
+        """A file in memory of this thread's own, made once."""
+        buffer: UncompressedExr | None = getattr(self._of_thread, "buffer", None)
+        if buffer is None or buffer.shape != shape:
+            buffer = self._of_thread.buffer = UncompressedExr(shape[0], shape[1])
+        return buffer
 
     def record_missing(
         self,
@@ -206,10 +249,10 @@ class CaptureWriter:
         """Write `manifest.json`, close the journal and return the manifest.
 
         It holds `state` ("done"), `outcome`, frame counts, checksums of the small files and of the
-        journal, whose lines hold the frames' checksums, and whatever `extra` adds.
+        journal, whose lines hold the frames' checksums, and whatever `extra` adds. Frames that
+        were stored and never committed are removed. Raises `OSError` where even that finds no room.
         """
-        with self._lock:
-            self._journal.close()
+        self.close()
         manifest = {
             **(extra or {}),
             "state": "done",
@@ -220,16 +263,19 @@ class CaptureWriter:
                 "written": self.counts()[0],
                 "missing": len(self.missing()),
             },
-            **_checksums(self.path),
+            **checksums(self.path),
         }
-        _write_json(self.path / "manifest.json", manifest)
-        _sync_folder(self.path)
+        write_json(self.path / "manifest.json", manifest)
+        flush(self.path)
         return manifest
 
     def close(self) -> None:
         """Close the journal without a manifest: the folder stays an interrupted capture."""
         with self._lock:
             self._journal.close()
+            for file in self._stored:
+                file.unlink(missing_ok=True)
+            self._stored.clear()
 
     def _has(self, step: Step, camera: Any) -> bool:
         record = self.records.get((step.index, camera.name))
@@ -242,58 +288,31 @@ class CaptureWriter:
             raise CaptureError(f"step {step.index}, {camera}: this frame is written already")
 
 
-def compress(path: str | Path, progress: Progress = silent) -> int:
-    """Rewrite the uncompressed frames of a capture with ZIP, losslessly; returns the bytes saved.
+def open_journal(path: Path) -> FileIO:
+    """Open the journal of the capture at `path` to append to it, for this process alone.
 
-    Each frame gets a new name, then a journal line, and only then is the old file removed, so a
-    crash leaves the capture whole; run it again to go on. Raises `CaptureError` for a frame
-    whose checksum is wrong: compression must not make damage look sound.
+    What a crash or a full disk left of a last line is cut off. Raises `CaptureError` where
+    another process (or another writer of this one) has it open.
     """
-    capture = Capture(path)
-    if capture.manifest is None:
-        raise CaptureError(f"{path}: not finished; compress a capture after its manifest is there")
-    _cut_torn_line(capture.path / "journal.jsonl")
-    todo = [r for r in capture.records.values() if r.file and not r.file.endswith(".zip.exr")]
-    saved = 0
-    with (capture.path / "journal.jsonl").open("ab") as journal:
-        for i, record in enumerate(todo):
-            assert record.file is not None
-            old = capture.path / record.file
-            if sha256(old) != record.sha256:
-                raise CaptureError(f"{old}: its checksum is not the journal's; run verify")
-            new = old.with_name(f"{record.camera}.zip.exr")
-            image, attributes = read_exr(old)
-            write_exr(new, image, _own_attributes(attributes), compress=True)
-            _sync_folder(new.parent)
-            file = str(new.relative_to(capture.path))
-            append_lines(journal, [replace(record, file=file, sha256=sha256(new))])
-            saved += old.stat().st_size - new.stat().st_size
-            old.unlink()
-            progress("compressing frames", (i + 1) / len(todo))
-    _write_json(capture.path / "manifest.json", {**capture.manifest, **_checksums(capture.path)})
-    return saved
+    journal = (path / "journal.jsonl").open("ab", buffering=0)
+    try:
+        fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        journal.close()
+        raise JournalInUse(f"{path}: it is being written or compressed; wait for that") from None
+    data = (path / "journal.jsonl").read_bytes()
+    journal.truncate(data.rfind(b"\n") + 1)
+    return journal
 
 
-def _cut_torn_line(journal: Path) -> None:
-    """Cut off what a crash or a full disk left of a last line, before anything is appended."""
-    if not journal.is_file():
-        return
-    data = journal.read_bytes()
-    whole = data[: data.rfind(b"\n") + 1]
-    if len(whole) < len(data):
-        with journal.open("r+b") as file:
-            file.truncate(len(whole))
-            os.fsync(file.fileno())
-
-
-def append_lines(journal: BinaryIO, records: Sequence[FrameRecord]) -> None:
-    """Append records to an open journal and flush it to disk."""
+def append_lines(journal: FileIO, records: Sequence[FrameRecord]) -> None:
+    """Append records to an open journal and flush it to disk; all of them or none."""
+    lines = []
     for record in records:
         line = {k: v for k, v in asdict(record).items() if v is not None}
         line.setdefault("file", None)
-        journal.write(json.dumps(line, allow_nan=False).encode() + b"\n")
-    journal.flush()
-    os.fsync(journal.fileno())
+        lines.append(json.dumps(line, allow_nan=False) + "\n")
+    append_whole(journal, "".join(lines).encode())
 
 
 def sha256(path: Path) -> str:
@@ -307,13 +326,7 @@ def utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _own_attributes(attributes: dict[str, float | str]) -> dict[str, float | str]:
-    return {
-        k: attributes[k] for k in ("exposureTime", "fullScale", "countScale") if k in attributes
-    }
-
-
-def _checksums(path: Path) -> dict[str, Any]:
+def checksums(path: Path) -> dict[str, Any]:
     """Checksums of the small files, and of the journal as long as it is now.
 
     Compression appends to the journal before it renews the manifest; the length lets `verify`
@@ -341,20 +354,5 @@ def _mask(rig: Rig, camera: str, mask: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(grey, np.uint8)
 
 
-def _write_json(path: Path, data: dict[str, Any]) -> None:
-    _write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(data)
-    replace_durably(temporary, path)
-
-
-def _sync_folder(path: Path) -> None:
-    """Make renames in the folder durable, not only the files' contents."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from reconstruction.exr import replace_durably
+from reconstruction.durable_files import replace_durably
 from reconstruction.report import Report, Series, Stage
 
 INK, QUIET, FAINT = "#22262b", "#6b737c", "#d9dde1"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 from dataclasses import dataclass, replace
@@ -10,8 +11,9 @@ from reconstruction.capture import FrameRecord, Step
 from reconstruction.capture_writer import CaptureWriter
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
-THREADS = 8
-"""Threads that flush side by side; a disk takes their flushes together."""
+THREADS = (os.cpu_count() or 1) + 2
+"""Threads that convert, hash and write side by side: one a processor, and one each that waits for
+the disk while it writes and while it flushes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,19 +29,22 @@ class Shot:
 
 
 class FrameWriter:
-    """Converts and writes frames on threads of its own; at most `capacity` wait.
+    """Converts and writes frames on threads of its own; at most `capacity` are under way.
 
     One thread puts. Frames are stored side by side and journalled in the order of `put`, so a
-    crash leaves a capture without gaps.
+    crash leaves a capture without gaps, and costs at most `capacity` frames.
     """
 
     def __init__(self, writer: CaptureWriter, capacity: int) -> None:
         self._writer = writer
-        self._queue: queue.Queue[tuple[int, Shot] | None] = queue.Queue(capacity)
+        self._queue: queue.SimpleQueue[tuple[int, Shot] | None] = queue.SimpleQueue()
+        self._room = threading.Semaphore(capacity)
+        self._batch = max(1, capacity // 2)
         self._error: Exception | None = None
         self._stored: dict[int, FrameRecord] = {}
         self._next_put = self._next_commit = 0
-        self._storing, self._committing = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
+        self._committing = False
         self._threads = [
             threading.Thread(target=self._run, name=f"frame-writer-{i}", daemon=True)
             for i in range(THREADS)
@@ -48,10 +53,16 @@ class FrameWriter:
             thread.start()
 
     def put(self, shot: Shot) -> None:
-        """Hand over a frame; waits while the queue is full. Raises what writing raised."""
-        self.check()
-        self._queue.put((self._next_put, shot))
-        self._next_put += 1
+        """Hand over a frame; waits while there are too many. Raises what writing raised."""
+        self._room.acquire()
+        try:
+            self.check()
+        except Exception:
+            self._room.release()  # for whoever tries again
+            raise
+        number = self._next_put
+        self._next_put += 1  # first: the frame that is put last must find itself the last
+        self._queue.put((number, shot))
 
     def check(self) -> None:
         """Raise what writing raised, if it did."""
@@ -64,16 +75,21 @@ class FrameWriter:
             self._queue.put(None)
         for thread in self._threads:
             thread.join()
-        self.check()
+        try:
+            if not self._committing:  # no commit failed: what a failed frame left is whole
+                self._commit_what_is_due()
+        finally:
+            self.check()
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
-            # After an error the queue is still emptied, or `put` would wait for ever.
-            if self._error is None:
-                try:
-                    self._write(*item)
-                except Exception as error:  # handed to the sequencer by `check`
-                    self._error = error
+            if self._error is not None:
+                continue
+            try:
+                self._write(*item)
+            except Exception as error:  # handed to the sequencer by `check`
+                self._error = self._error or error
+                self._room.release()  # or `put` would wait for ever
 
     def _write(self, number: int, shot: Shot) -> None:
         frame, info = shot.frame, shot.info
@@ -91,14 +107,27 @@ class FrameWriter:
             timestamp=frame.timestamp,
             attempt=shot.attempt,
         )
-        with self._storing:
+        with self._lock:
             self._stored[number] = record
-        # Whoever commits takes along what others stored meanwhile: one flush for all of it.
-        with self._committing:
-            batch = []
-            with self._storing:
-                while self._next_commit in self._stored:
-                    batch.append(self._stored.pop(self._next_commit))
-                    self._next_commit += 1
-            if batch:
-                self._writer.commit(batch)
+            if self._committing:  # whoever is at it goes on with this one
+                return
+            self._committing = True
+        self._commit_what_is_due()
+
+    def _commit_what_is_due(self) -> None:
+        while batch := self._next_in_order():
+            self._writer.commit(batch)
+            self._room.release(len(batch))
+
+    def _next_in_order(self) -> list[FrameRecord]:
+        """The stored frames whose turn it is, once they are many or no other is under way: a
+        flush holds up what others write meanwhile, and many flush as fast as one."""
+        batch = []
+        with self._lock:
+            many = len(self._stored) >= self._batch
+            last = self._next_commit + len(self._stored) == self._next_put
+            while (many or last or self._error is not None) and self._next_commit in self._stored:
+                batch.append(self._stored.pop(self._next_commit))
+                self._next_commit += 1
+            self._committing = bool(batch)
+        return batch

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.exr import replace_durably
+from reconstruction.durable_files import replace_durably
 from reconstruction.strand_files.errors import StrandFileError, strands_of
 from reconstruction.strands import Strands
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from reconstruction.exr import replace_durably
+from reconstruction.durable_files import replace_durably
 from reconstruction.strand_files.errors import StrandFileError, strands_of
 from reconstruction.strands import Strands
 

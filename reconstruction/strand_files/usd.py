@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
-from reconstruction.exr import replace_durably
+from reconstruction.durable_files import replace_durably
 from reconstruction.strand_files.errors import StrandFileError, strands_of
 from reconstruction.strands import Strands
 

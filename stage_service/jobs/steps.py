@@ -36,7 +36,7 @@ def compress(context: StepContext) -> Figures:
     """Rewrite the capture's frames compressed, losslessly."""
     if not context.options.compress:
         return {"left_out": "switched off by the option 'compress'"}
-    from reconstruction.capture_writer import compress as run
+    from reconstruction.capture_compression import compress as run
 
     return {"bytes_saved": run(context.capture, context.progress)}
 

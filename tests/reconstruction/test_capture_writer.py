@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +14,10 @@ import pytest
 
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture, CaptureError, MissingFrame, Step
+from reconstruction.capture_compression import compress
 from reconstruction.capture_verify import verify
-from reconstruction.capture_writer import CaptureWriter, compress
+from reconstruction.capture_writer import CaptureWriter
+from reconstruction.durable_files import DiskFull
 from reconstruction.lights import Light
 from reconstruction.mesh import Mesh
 from reconstruction.rig import Rig
@@ -216,6 +222,155 @@ def test_compression_does_not_bless_damage(path):
     frame.write_bytes(data)
     with pytest.raises(CaptureError, match="checksum"):
         compress(path)
+
+
+def test_two_compressions_side_by_side_do_every_frame_once(path):
+    first_began, second_waits = threading.Event(), threading.Event()
+    saved: list[int] = []
+
+    def first(_what: str, _share: float) -> None:
+        first_began.set()
+        assert second_waits.wait(10)
+
+    def second(what: str, _share: float) -> None:
+        if "waiting" in what:
+            second_waits.set()
+
+    thread = threading.Thread(target=lambda: saved.append(compress(path, first)))
+    thread.start()
+    assert first_began.wait(10)
+    assert compress(path, second) == 0
+    thread.join(10)
+    assert second_waits.is_set()
+    assert len(saved) == 1
+    assert verify(path) == []
+    assert len((path / "journal.jsonl").read_text().splitlines()) == 2 * len(EVERY)
+
+
+def test_a_reader_finds_a_frame_that_is_compressed_under_its_hands(path):
+    capture, step = Capture(path), STEPS[1]
+    expected = capture.read_file(step, "cam_1", Path.read_bytes)
+    compress(path)
+    np.testing.assert_array_equal(capture.frame(step, "cam_1"), image(step, "cam_1"))
+    stale = Capture(path)
+    new = stale.read_file(step, "cam_1", lambda file: file)
+    assert new.name == "cam_1.zip.exr"
+    assert new.read_bytes() != expected
+    new.unlink()
+    with pytest.raises(FileNotFoundError):  # lost for good: said, not looked for endlessly
+        stale.read_file(step, "cam_1", Path.read_bytes)
+    with pytest.raises(ValueError, match=r"cam_1\.zip\.exr: cannot be read"):
+        stale.frame(step, "cam_1")
+
+
+def test_what_a_crash_leaves_between_journal_and_removal_is_told_and_taken_away(path):
+    old = path / "frames/00001/cam_0.exr"
+    before = old.read_bytes()
+    compress(path)
+    old.write_bytes(before)
+    (path / "frames/00002/cam_1.zip.exr.part").write_bytes(b"half")
+    (problem,) = verify(path)
+    assert problem.startswith("2 files among the frames are in no line of the journal")
+    assert problem.endswith("the first is frames/00001/cam_0.exr.")
+    (path / "frames/00002/cam_1.zip.exr.part").unlink()
+    compress(path)
+    assert not old.exists()
+    assert verify(path) == []
+
+
+def test_verify_during_a_compression_finds_nothing_wrong(path):
+    found: list[list[str]] = []
+    compress(path, lambda _what, _share: found.append(verify(path)))
+    assert found == [[]] * len(EVERY)
+
+
+def test_a_capture_has_one_writer(tmp_path):
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
+    with pytest.raises(CaptureError, match="it is being written or compressed; wait for that"):
+        CaptureWriter.reopen(tmp_path / "c")
+    write(writer, *EVERY)
+    writer.close()
+    writer = CaptureWriter.reopen(tmp_path / "c")
+    assert writer.missing() == []
+    writer.close()
+
+
+def test_stored_frames_count_only_once_they_are_committed(tmp_path):
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
+    records = [writer.store_frame(STEPS[i], c, image(STEPS[i], c)) for i, c in EVERY[:4]]
+    assert not list((tmp_path / "c").glob("frames/*/*.exr"))
+    writer.commit(records[:3])
+    assert verify(tmp_path / "c")[1:] == [
+        "3 planned frames were never shot; the first is step 1 (olat), cam_1."
+    ]
+    writer.close()
+    assert len(list((tmp_path / "c").glob("frames/*/*"))) == 3
+
+
+KILLED = """
+import sys, os, signal
+import numpy as np
+from reconstruction.capture_writer import CaptureWriter
+writer = CaptureWriter.reopen(sys.argv[1])
+for n, (step, camera) in enumerate(writer.missing()):
+    record = writer.store_frame(step, camera, np.full((6, 8, 3), n, np.float32))
+    if n == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    writer.commit([record])
+"""
+
+
+def test_a_killed_writer_costs_the_frame_under_way(tmp_path):
+    path = tmp_path / "c"
+    CaptureWriter.create(path, RIG, {"steps": STEPS}).close()
+    subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
+    assert verify(path) == [
+        "manifest.json is missing: the capture was not finished.",
+        "3 planned frames were never shot; the first is step 1 (olat), cam_1.",
+        "1 files among the frames are in no line of the journal, left by a write or a compression "
+        "that was interrupted; the first is frames/00001/cam_1.exr.part.",
+    ]
+    again = CaptureWriter.reopen(path)
+    write(again, *EVERY[3:])
+    again.finish("completed")
+    assert verify(path) == []
+
+
+def test_a_frame_that_finds_the_disk_full_is_an_error_and_no_frame(tmp_path):
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
+    write(writer, EVERY[0])
+    (tmp_path / "c/frames/00000/cam_1.exr.part").symlink_to("/dev/full")
+    with pytest.raises(DiskFull, match=r"bytes are needed.* are free.*cam_1\.exr\.part") as error:
+        write(writer, EVERY[1])
+    assert error.value.errno == errno.ENOSPC
+    manifest = writer.finish("failed", {"error": str(error.value)})
+    assert manifest["frames"] == {"planned": 6, "written": 1, "missing": 5}
+    assert verify(tmp_path / "c") == [
+        "The capture's outcome is 'failed', not 'completed'.",
+        "5 planned frames were never shot; the first is step 0 (dark), cam_1.",
+    ]
+
+
+def test_a_journal_that_finds_the_disk_full_names_no_frame_that_is_not_whole(tmp_path):
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
+    write(writer, EVERY[0])
+    with Path("/dev/full").open("ab", buffering=0) as full:
+        journal, writer._journal = writer._journal, full
+        with pytest.raises(DiskFull, match="/dev/full"):
+            write(writer, EVERY[1])
+        writer._journal = journal
+    write(writer, EVERY[1])  # room was made
+    writer.close()
+    assert len(Capture(tmp_path / "c").records) == 2
+
+
+def test_the_reserve_stays_free(tmp_path):
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
+    writer.reserve = 1 << 60
+    with pytest.raises(DiskFull, match=r"a reserve of 1,152,921,504,606,846,976, [0-9,]+ are free"):
+        write(writer, EVERY[0])
+    writer.finish("failed")
+    assert not list((tmp_path / "c/frames").iterdir())
 
 
 def test_bad_input_is_named(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from reconstruction.exr import read_exr, write_exr
+from reconstruction.durable_files import PAGE
+from reconstruction.exr import UncompressedExr, read_exr, write_exr
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
@@ -78,3 +81,61 @@ def test_other_channels_are_refused(tmp_path: Path) -> None:
 def test_only_colour_images_are_written(tmp_path: Path, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"expected an image of shape \(H, W, 3\)"):
         write_exr(tmp_path / "x.exr", np.zeros(shape))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+@given(
+    image=hnp.arrays(
+        np.float32,
+        st.tuples(st.integers(1, 90), st.integers(1, 9), st.just(3)),
+        elements=st.floats(width=32, allow_nan=False),
+    ),
+    scale=st.floats(0.125, 8, width=32),
+)
+def test_our_uncompressed_file_is_the_reference_writers(
+    image: np.ndarray, scale: float, tmp_path: Path
+) -> None:
+    attributes = {"countScale": scale, "note": "tilt 2°"}
+    exr = UncompressedExr(image.shape[0], image.shape[1])
+    exr.fill(np.zeros_like(image), {"note": "longer than what comes after it", "other": 1.0})
+    whole = exr.fill(image, attributes)
+    assert len(whole) % PAGE == 0
+    (tmp_path / "ours.exr").write_bytes(whole)
+    write_exr(tmp_path / "reference.exr", image, attributes, compress=False)
+    ours, theirs = (OpenEXR.File(str(tmp_path / f"{n}.exr")) for n in ("ours", "reference"))
+    np.testing.assert_equal(
+        ours.header(), theirs.header() | {"channels": ours.header()["channels"]}
+    )
+    assert [str(c) for c in ours.header()["channels"]] == [
+        str(c) for c in theirs.header()["channels"]
+    ]
+    np.testing.assert_array_equal(
+        ours.channels()["RGB"].pixels.view(np.uint32),
+        theirs.channels()["RGB"].pixels.view(np.uint32),
+    )
+    np.testing.assert_array_equal(read_exr(tmp_path / "ours.exr")[0], image)
+
+
+BY_MITSUBA = """
+import sys
+import mitsuba, numpy as np
+mitsuba.set_variant("scalar_rgb")
+np.save(sys.argv[2], np.array(mitsuba.Bitmap(sys.argv[1])))
+"""
+
+
+def test_mitsuba_reads_our_uncompressed_file(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).normal(size=(37, 53, 3)).astype(np.float32)
+    whole = UncompressedExr(37, 53).fill(image, {"exposureTime": 0.01})
+    (tmp_path / "x.exr").write_bytes(whole)
+    files = [str(tmp_path / "x.exr"), str(tmp_path / "x.npy")]
+    subprocess.run([sys.executable, "-c", BY_MITSUBA, *files], check=True)
+    np.testing.assert_array_equal(np.load(tmp_path / "x.npy"), image)
+
+
+def test_attributes_that_do_not_fit_are_refused() -> None:
+    exr, image = UncompressedExr(2, 2), np.zeros((2, 2, 3), np.float32)
+    with pytest.raises(ValueError, match="the attributes do not fit"):
+        exr.fill(image, {"note": "x" * 9000})
+    with pytest.raises(ValueError, match="1 to 31 bytes"):
+        exr.fill(image, {"x" * 32: 1.0})

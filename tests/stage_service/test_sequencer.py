@@ -200,12 +200,15 @@ def test_keyboard_interrupt_leaves_darkness_and_a_manifest(rig_file, world, tmp_
     assert Capture(tmp_path / "c").manifest["outcome"] == "failed"
 
 
-def test_a_disk_error_fails_the_capture(rig_file, world, tmp_path, monkeypatch):
-    def full(*_args: Any, **_more: Any) -> None:
-        raise OSError(28, "No space left on device")
-
+def test_a_full_disk_fails_the_capture(rig_file, world, tmp_path):
     run = sequencer(rig_file, tmp_path / "c")
-    monkeypatch.setattr("reconstruction.capture_writer.write_exr", full)
+    step, camera = run._writer.missing()[-1]
+    folder = tmp_path / f"c/frames/{step.index:05d}"
+    folder.mkdir()
+    (folder / f"{camera}.exr.part").symlink_to("/dev/full")
     assert run.run() == "failed"
     assert "No space left" in str(run.error)
     assert is_dark(world)
+    failed, absent = verify(tmp_path / "c")
+    assert failed == "The capture's outcome is 'failed', not 'completed'."
+    assert absent.startswith("1 planned frames were never shot")

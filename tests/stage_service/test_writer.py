@@ -77,6 +77,61 @@ def test_a_slow_disk_makes_put_wait_instead_of_dropping(folder, monkeypatch):
     folder.close()
 
 
+def test_a_frame_alone_is_journalled_without_waiting_for_more(folder, monkeypatch):
+    committed, commit = threading.Event(), folder.commit
+
+    def tell(records: Any) -> None:
+        commit(records)
+        committed.set()
+
+    monkeypatch.setattr(folder, "commit", tell)
+    writer = FrameWriter(folder, 32)
+    writer.put(shot(STEPS[0]))
+    assert committed.wait(10)
+    assert folder.counts() == (1, 0)
+    writer.close()
+    folder.close()
+
+
+def test_many_frames_share_their_flushes(folder, monkeypatch):
+    batches: list[int] = []
+    commit, store, all_put = folder.commit, folder.store_frame, threading.Event()
+
+    def counted(records: Any) -> None:
+        batches.append(len(records))
+        commit(records)
+
+    def held(*args: Any, **more: Any) -> Any:
+        assert all_put.wait(10)
+        return store(*args, **more)
+
+    monkeypatch.setattr(folder, "commit", counted)
+    monkeypatch.setattr(folder, "store_frame", held)
+    writer = FrameWriter(folder, 20)
+    for step in STEPS:
+        writer.put(shot(step))
+    all_put.set()
+    writer.close()
+    assert sum(batches) == 20
+    assert len(batches) <= 6
+    folder.close()
+
+
+def test_put_goes_on_raising_after_an_error(folder, monkeypatch):
+    def full(*_args: Any, **_more: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(folder, "store_frame", full)
+    writer = FrameWriter(folder, 1)
+    writer.put(shot(STEPS[0]))
+    for step in STEPS[1:4]:
+        with pytest.raises(OSError, match="No space left"):
+            writer.put(shot(step))
+    with pytest.raises(OSError, match="No space left"):
+        writer.close()
+    folder.close()
+
+
 def test_what_writing_raises_reaches_the_sequencer(folder, monkeypatch):
     def full(*_args: Any, **_more: Any) -> Any:
         raise OSError(28, "No space left on device")

@@ -1,0 +1,133 @@
+"""Files that are whole on the disk, or not there: written, flushed, renamed."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
+from pathlib import Path
+
+PAGE = 4096
+"""Bytes; what goes past the page cache starts and ends on a multiple of it."""
+
+RESERVE = 256 << 20
+"""Bytes that stay free: for what is under way on other threads, the manifest, the jobs' records."""
+
+
+class DiskFull(OSError):
+    """The disk has no room for a file, or would have no reserve left; names path and bytes."""
+
+    def __init__(self, path: Path, needed: int, reserve: int = 0) -> None:
+        self.needed, self.free = needed, _free(path)
+        kept = f" and a reserve of {reserve:,}" if reserve else ""
+        super().__init__(
+            errno.ENOSPC,
+            f"No space left on device: {needed:,} bytes are needed{kept}, {self.free:,} are free; "
+            "make room, then resume",
+            str(path),
+        )
+
+
+def require_free(path: Path, needed: int, reserve: int = RESERVE) -> None:
+    """Raise `DiskFull` where a file of `needed` bytes would leave less than `reserve` free."""
+    if _free(path) < needed + reserve:
+        raise DiskFull(path, needed, reserve)
+
+
+@contextmanager
+def naming_full_disk(path: Path, needed: int) -> Iterator[None]:
+    """Turn the bare error of a disk (or a quota) that is full into `DiskFull`."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, DiskFull) or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise DiskFull(path, needed) from error
+
+
+def write_pages(path: Path, data: memoryview) -> None:
+    """Write whole pages (memory and length aligned to `PAGE`); `flush` makes them durable.
+
+    They go past the page cache where the file system lets them: copying into it and writing back
+    cost more processor time than all else but the checksum. A failed file is removed.
+    """
+    try:
+        with naming_full_disk(path, len(data)):
+            try:
+                _write(path, data, getattr(os, "O_DIRECT", 0))
+            except OSError as error:  # a file system without direct input and output
+                if error.errno != errno.EINVAL:
+                    raise
+                _write(path, data, 0)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _write(path: Path, data: memoryview, flags: int) -> None:
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags, 0o666)
+    try:
+        _write_all(handle, data)
+    finally:
+        os.close(handle)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a small file: temporary name, flush, rename. A failed one leaves nothing."""
+    temporary = part(path)
+    try:
+        with naming_full_disk(path, len(data)):
+            temporary.write_bytes(data)
+            replace_durably(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def append_whole(file: FileIO, data: bytes) -> None:
+    """Append to an unbuffered file and flush it; what fails is cut off again."""
+    before = os.fstat(file.fileno()).st_size
+    try:
+        with naming_full_disk(Path(os.fspath(file.name)), len(data)):
+            _write_all(file.fileno(), memoryview(data))
+            os.fsync(file.fileno())
+    except OSError:
+        with suppress(OSError):
+            file.truncate(before)
+        raise
+
+
+def part(path: Path) -> Path:
+    """The temporary name of a file that is not whole yet."""
+    return path.with_name(path.name + ".part")
+
+
+def replace_durably(temporary: Path, path: Path) -> None:
+    """Flush `temporary` to disk and rename it to `path`: afterwards it is whole or not there."""
+    flush(temporary)
+    temporary.replace(path)
+
+
+def flush(path: Path) -> None:
+    """Make a file's contents durable, or the names in a folder."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _write_all(handle: int, data: memoryview) -> None:
+    done = 0
+    while done < len(data):
+        done += os.write(handle, data[done:])
+
+
+def _free(path: Path) -> int:
+    """Bytes that this user may still write where `path` is, or will be."""
+    while not path.exists():
+        path = path.parent
+    disk = os.statvfs(path)
+    return disk.f_bavail * disk.f_frsize

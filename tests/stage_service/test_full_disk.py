@@ -1,0 +1,59 @@
+"""A disk that is really full: a file system of 40 MB in a name space of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SCRIPT = Path(__file__).with_name("full_disk.py")
+MOUNT = 'mount -t tmpfs -o size=40m tmpfs "$0" && exec "$@"'
+
+
+def on_small_disk(folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["unshare", "--map-root-user", "--mount", "sh", "-c", MOUNT, str(folder), *command],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def shoot(folder: Path, reserve: int) -> dict[str, Any]:
+    try:
+        possible = on_small_disk(folder, "true")
+    except FileNotFoundError as error:
+        pytest.skip(f"no file system of our own: {error}")
+    if possible.returncode:
+        pytest.skip(f"no file system of our own: {possible.stderr.strip()}")
+    done = on_small_disk(folder, sys.executable, str(SCRIPT), str(folder), str(reserve))
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_disk_that_fills_up_ends_the_capture_and_costs_no_journalled_frame(tmp_path):
+    out = shoot(tmp_path, reserve=0)
+    assert "No space left on device" in out["error"]
+    assert str(tmp_path / "capture") in out["error"]
+    assert 0 < out["written"] < 120
+    assert out["in_frames"] == out["written"]
+    missing = 120 - out["written"]
+    ended = "manifest.json is missing" if "finish" in out else "The capture's outcome is 'failed'"
+    assert out["verify"][0].startswith(ended)
+    assert out["verify"][1].startswith(f"{missing} planned frames were never shot")
+    assert len(out["verify"]) == 2
+    assert (out["resumed"], out["verify_resumed"], out["verify_compressed"]) == ("", [], [])
+
+
+def test_the_capture_stops_while_there_is_still_room_to_finish_it(tmp_path):
+    out = shoot(tmp_path, reserve=4 << 20)
+    assert "233,472 bytes are needed and a reserve of 4,194,304" in out["error"]
+    assert "finish" not in out
+    assert out["verify"][0] == "The capture's outcome is 'failed', not 'completed'."
+    assert len(out["verify"]) == 2
+    assert 0 < out["written"] == out["in_frames"] < 120
+    assert (out["resumed"], out["verify_resumed"], out["verify_compressed"]) == ("", [], [])
