@@ -1,0 +1,146 @@
+"""SIGKILL at each stage of a capture: the lamps go off, and another process goes on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reconstruction.capture import Capture
+from reconstruction.capture_verify import verify
+from reconstruction.capture_writer import CaptureWriter
+from simulators.stage import DEVICES_FILE
+from stage_service.config import load_rig_file
+from stage_service.devices.stage import Stage
+from stage_service.plan import CapturePlan
+from stage_service.sequencer import Sequencer
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
+STAGES = [
+    ("connecting", "after stage_service.devices.stage:Stage.connect", 1, "software"),
+    ("arming", "after stage_service.sequencer:Sequencer._arm", 1, "software"),
+    ("a lamp lit", "after stage_service.exposing:Exposing._light", 6, "software"),
+    ("all lamps lit", "after stage_service.exposing:Exposing._light", 2, "software"),
+    ("a scanline shown", "after stage_service.exposing:Exposing._light", 15, "software"),
+    ("after a pulse", "stage_service.exposing:Exposing._check_lit", 5, "software"),
+    ("reading frames", "stage_service.sequencer:Sequencer._account", 9, "software"),
+    ("storing a frame", "reconstruction.durable_files:_write", 9, "software"),
+    ("after storing frames", "reconstruction.capture_writer:CaptureWriter.commit", 4, "software"),
+    (
+        "after the journal",
+        "after reconstruction.capture_writer:CaptureWriter.commit",
+        4,
+        "software",
+    ),
+    ("before the manifest", "reconstruction.capture_writer:CaptureWriter.finish", 1, "software"),
+    (
+        "a table armed",
+        "after stage_service.devices.trigger.serial_box:SerialTriggerBox.load_table",
+        1,
+        "hardware",
+    ),
+    ("a table running", "stage_service.hardware_run:HardwareRun._collect", 1, "hardware"),
+]
+
+
+@pytest.mark.parametrize(("name", "place", "call", "stepping"), STAGES, ids=[s[0] for s in STAGES])
+def test_sigkill_of_the_service(name, place, call, stepping, simulated, tmp_path, told):
+    rig_file, world = simulated()
+    plan = CapturePlan(**PLAN, stepping=stepping)
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            Path(__file__).with_name("shoot.py"),
+            rig_file.path,
+            rig_file.path.with_suffix("") / DEVICES_FILE,
+            tmp_path / "c",
+            plan.model_dump_json(),
+            place,
+            str(call),
+        ],
+        stdout=subprocess.PIPE,
+        cwd=CHECKOUT,
+        env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"here\n"
+    if name == "a table running":
+        until(lambda: world.lamps.power().any(), 5)
+    child.kill()
+    child.wait()
+    child.stdout.close()
+    lit = bool(world.lamps.power().any() or world.projectors.show.level)
+    killed = time.monotonic()
+    until(lambda: not (world.lamps.power().any() or world.projectors.show.level), 1.5)
+    seconds = time.monotonic() - killed
+    kept = frames(tmp_path / "c")
+    writer = CaptureWriter.reopen(tmp_path / "c")
+    again = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, plan.steps(rig_file))[0])
+    assert again.run() == "completed", again.error
+    assert verify(tmp_path / "c") == []
+    assert kept.items() <= frames(tmp_path / "c").items(), "a finished frame was shot again"
+    told(
+        f"SIGKILL of the service: {name}",
+        stepping,
+        "resumed and completed",
+        0,
+        f"(dark {seconds:.1f} s after the kill, by the watchdog)" if lit else "(was dark)",
+    )
+
+
+def test_sigkill_of_the_devices(simulated, tmp_path, told):
+    """The whole simulated stage dies in mid-capture; the capture fails, and names a device."""
+    rig_file, _world = simulated()
+    rig = tmp_path / "rig.toml"
+    rig.write_text(rig_file.path.read_text())
+    state = tmp_path / "state"
+    with (tmp_path / "log").open("w") as log:
+        command = [sys.executable, "-m", "simulators", "--rig", rig, "--state", state]
+        peers = subprocess.Popen(
+            [*command, "--ports", "auto", "--spp", "1"], cwd=CHECKOUT, stdout=log, stderr=log
+        )
+    try:
+        until(lambda: (state / DEVICES_FILE).exists() or peers.poll() is not None, 60)
+        there = load_rig_file(rig, state / DEVICES_FILE)
+        plan = CapturePlan(projectors=())
+        writer = CaptureWriter.create(tmp_path / "c", there.rig, {"steps": plan.steps(there)})
+
+        def notify(kind: str, data: dict[str, Any]) -> None:
+            if kind == "capture.step" and data["steps_done"] == 6:
+                peers.kill()
+                peers.wait()
+
+        run = Sequencer(Stage.of(there), writer, notify=notify)
+        assert run.run() == "failed"
+    finally:
+        peers.kill()
+        peers.wait()
+    assert run.error is not None
+    assert "unknown, unsafe" in run.error  # nobody is there to say that the lamps are off
+    assert len(frames(tmp_path / "c")) >= 2 * 5
+    told("SIGKILL of the simulated stage", "software", str(run.outcome), 0, run.error)
+
+
+def frames(path: Path) -> dict[tuple[int, str], str]:
+    """Checksums of the frames that the journal names; each is readable."""
+    capture = Capture(path)
+    found = {}
+    for step in capture.steps:
+        for camera in ("cam_a", "cam_b"):
+            if capture.has(step, camera):
+                assert capture.frame(step, camera).shape == (12, 16, 3)
+                found[step.index, camera] = str(capture.records[step.index, camera].sha256)
+    return found
+
+
+def until(condition: Any, seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.005)
