@@ -51,7 +51,7 @@ def render_environment(
 
     if spp < 1 or max_depth < 1:
         raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
-    sky = _Sky.of(check_environment(envmap, "envmap"), rotation_deg)
+    sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
     if background:
         row, column = np.divmod(np.arange(len(image)), camera.width)
@@ -82,7 +82,7 @@ def _add(film: Any, slot: Any, value: Any, active: Any) -> None:
 
 
 @dataclass(frozen=True)
-class _Sky:
+class Sky:
     """A map on the device, constant over each texel."""
 
     texels: Any
@@ -92,7 +92,7 @@ class _Sky:
     turn: Any
 
     @classmethod
-    def of(cls, envmap: NDArray[np.float32], rotation_deg: float) -> _Sky:
+    def of(cls, envmap: NDArray[np.float32], rotation_deg: float) -> Sky:
         import mitsuba as mi
 
         height, width = envmap.shape[:2]
@@ -148,7 +148,7 @@ class _Gather:
     surface: Surface
     film: Any
     slot: Any
-    sky: _Sky
+    sky: Sky
 
     def __call__(self, si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
         import drjit as dr

@@ -1,0 +1,179 @@
+"""One image under any linear combination of lamps and environment maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from appearance.render.coverage import covered_pixels
+from appearance.render.environment import Sky
+from appearance.render.environment_maps import check_environment
+from appearance.render.lamps import LampBank
+from appearance.render.olat import render_olat
+from appearance.render.paths import Surface, Wave, each_sample, opaque, pixel_indices, walk
+from appearance.scene import HairScene
+from reconstruction.cameras import Camera
+from reconstruction.lights import Light
+
+_PILOT = 256  # pixels whose light from each lamp is looked at first
+_SPREAD = 0.1  # share of the choices that all lamps have alike
+_PILOT_STREAM = 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """A lat-long map `(h, w, 3)` as in `render_environment`, times `weight` (one or 3 numbers)."""
+
+    envmap: NDArray[np.floating]
+    rotation_deg: float = 0.0
+    weight: ArrayLike = 1.0
+
+
+def render_mixed(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light] = (),
+    environments: Sequence[Environment] = (),
+    *,
+    weights: ArrayLike = 1.0,
+    spp: int = 64,
+    max_depth: int = 24,
+    seed: int = 0,
+    pixels: ArrayLike | None = None,
+    rr_depth: int = 4,
+) -> NDArray[np.float32]:
+    """Radiance, W/(sr m²), of the subject under everything at once: `(H, W, 3)`, or `(P, 3)`.
+
+    `weights` broadcasts to `(L, 3)`: a factor for each light and channel, of any sign (a light may
+    be taken away). Every vertex asks one lamp, drawn in proportion to its mean contribution in a
+    pilot pass, and one direction of each environment. Without `pixels (P,)` (flat indices) those
+    that see the subject are rendered and the others are 0. Raises `ValueError` naming the fault.
+    """
+    if spp < 1 or max_depth < 1:
+        raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
+    weight = np.broadcast_to(np.asarray(weights, float), (len(lights), 3))
+    if not np.isfinite(weight).all():
+        raise ValueError("weights must be finite")
+    maps = [check_environment(e.envmap, f"environment {i}") for i, e in enumerate(environments)]
+    index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
+    radiance = np.zeros((len(index), 3), np.float32)
+    if len(index) and (lights or environments):
+        choice = _choice(scene, camera, lights, weight, index, (max_depth, rr_depth), seed)
+        radiance = _render(
+            scene,
+            camera,
+            LampBank.of(lights, weight / choice[:, None]) if lights else None,
+            choice,
+            [
+                (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
+                for m, e in zip(maps, environments, strict=True)
+            ],
+            index,
+            (spp, max_depth, rr_depth, seed),
+        )
+    if pixels is not None:
+        return radiance
+    image = np.zeros((camera.height * camera.width, 3), np.float32)
+    image[index] = radiance
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def _choice(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    weight: NDArray[np.float64],
+    index: NDArray[np.int64],
+    depths: tuple[int, int],
+    seed: int,
+) -> NDArray[np.float64]:
+    """Probabilities `(L,)` of asking each lamp; none is 0, so nothing is left out for good."""
+    if len(lights) < 2:
+        return np.ones(len(lights))
+    few = index[:: max(1, len(index) // _PILOT)]
+    depth, rr_depth = depths
+    mean = render_olat(
+        scene,
+        camera,
+        lights,
+        spp=4,
+        max_depth=depth,
+        rr_depth=rr_depth,
+        seed=seed + _PILOT_STREAM,
+        pixels=few,
+        thrift=0,
+    ).mean(axis=1)
+    share = np.abs(mean * weight).sum(axis=1)
+    uniform = np.full(len(lights), 1 / len(lights))
+    total = share.sum()
+    return uniform if total == 0 else (1 - _SPREAD) * share / total + _SPREAD * uniform
+
+
+def _render(
+    scene: HairScene,
+    camera: Camera,
+    bank: LampBank | None,
+    choice: NDArray[np.float64],
+    skies: Sequence[tuple[Sky, NDArray[np.float64]]],
+    index: NDArray[np.int64],
+    how: tuple[int, int, int, int],
+) -> NDArray[np.float32]:
+    import drjit as dr
+    import mitsuba as mi
+
+    spp, max_depth, rr_depth, seed = how
+    film = dr.zeros(mi.Float, 3 * len(index))
+    surface = Surface(scene)
+    draw = mi.DiscreteDistribution(mi.Float(choice)) if bank is not None else None
+
+    def trace(paths: Wave) -> None:
+        gather = _Gather(surface, film, paths.slot, bank, draw, skies)
+        walk(surface, paths.rays, paths.rng, gather, max_depth, rr_depth)
+
+    pixel = mi.UInt32(index.astype(np.uint32))
+    each_sample(camera, pixel, len(index), spp, (seed,), trace)
+    image = np.array(film).reshape(len(index), 3)
+    return np.asarray(image / np.float32(spp), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class _Gather:
+    """Light of one lamp and of one direction of each sky at a path's vertex."""
+
+    surface: Surface
+    film: Any
+    slot: Any
+    bank: LampBank | None
+    choice: Any
+    skies: Sequence[tuple[Sky, NDArray[np.float64]]]
+
+    def __call__(self, si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        if self.bank is not None:
+            light = self.choice.sample(rng.next_float32(), active)
+            # the bank's intensities are divided by the probability of the choice
+            target, intensity = self.bank.sample(light, si.p, rng, active)
+            towards = target - si.p
+            squared = dr.squared_norm(towards)
+            wo = si.to_local(towards * dr.rsqrt(squared))
+            value = throughput * self.surface.eval(si, wo, active) * (intensity / squared)
+            self._add(value, si.spawn_ray_to(target), active)
+        for sky, weight in self.skies:
+            direction, radiance = sky.sample(rng, active)
+            value = throughput * self.surface.eval(si, si.to_local(direction), active)
+            value = value * radiance * mi.Color3f(*opaque(weight))
+            self._add(value, si.spawn_ray(direction), active)
+
+    def _add(self, value: Any, ray: Any, active: Any) -> None:
+        import drjit as dr
+
+        lit = active & (dr.max(dr.abs(value)) > 0)
+        lit &= ~self.surface.scene.mi_scene.ray_test(ray, lit)
+        for channel in range(3):
+            dr.scatter_add(self.film, value[channel], self.slot * 3 + channel, lit)
