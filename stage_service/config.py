@@ -136,6 +136,18 @@ class SerialConfig(Strict):
     timeout_s: Seconds = 1.0
 
 
+class PjLinkConfig(Strict):
+    """`[devices.pjlink.<projector>]`: power and lamp hours; nothing of a capture's timing.
+
+    The password stands in a file of its own, not in the rig file.
+    """
+
+    host: str = Field(min_length=1)
+    port: Port = 4352
+    password_file: Path | None = None
+    timeout_s: Seconds = 5.0
+
+
 class LinkCamerasConfig(Strict):
     """`[devices.cameras]`: the camera link.
 
@@ -208,6 +220,7 @@ class DevicesConfig(Strict):
     lights: Annotated[LightBankConfig, BeforeValidator(_modbus_tcp_by_default)]
     trigger: SerialConfig
     projectors: SerialConfig | None = None
+    pjlink: dict[str, PjLinkConfig] = Field(default_factory=dict)
     cameras: Annotated[CamerasConfig, BeforeValidator(_link_by_default)]
 
     @model_validator(mode="after")

@@ -195,6 +195,8 @@ class Sequencer:
             stack.callback(self._black_out)
             stage.connect()
             check_interlocks(stage)
+            if any(s.kind in ("scanline", "tracking") for s in self._writer.steps):
+                stage.require_power()
             if stage.trigger.table_rows:
                 stage.trigger.stop()  # a table that a service which died has started
             stage.trigger.reset()

@@ -129,6 +129,12 @@ class Flat:
 
 
 @pytest.fixture
+def small_rig() -> str:
+    """The rig file's text that `simulated` uses."""
+    return SMALL_RIG
+
+
+@pytest.fixture
 def simulated(tmp_path: Path) -> Iterator[Callable[..., tuple[RigFile, World]]]:
     """`simulated(*faults, rig=text)`: the simulators' devices, without a renderer, in this process.
 

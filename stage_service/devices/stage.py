@@ -30,6 +30,7 @@ from stage_service.devices.lights.interface import LightBank
 from stage_service.devices.lights.limited import LimitedLightBank
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.interface import ProjectorController
+from stage_service.devices.projectors.pjlink import PjLinkProjector, Power
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.interface import TriggerBox
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
@@ -39,13 +40,17 @@ Device = LightBank | TriggerBox | ProjectorController | Camera
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The drivers of a stage; `projectors` is None where it has none."""
+    """The drivers of a stage; `projectors` is None where it has none.
+
+    `powers` are the projectors whose power can be asked for.
+    """
 
     config: DevicesConfig
     lights: LightBank
     trigger: TriggerBox
     projectors: ProjectorController | None
     cameras: tuple[Camera, ...]
+    powers: tuple[PjLinkProjector, ...] = ()
 
     @classmethod
     def of(cls, rig_file: RigFile) -> Self:
@@ -63,6 +68,7 @@ class Stage:
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(_camera(config.cameras, c) for c in rig.cameras),
+            _powers(rig_file, config),
         )
 
     def connect(self) -> None:
@@ -76,6 +82,19 @@ class Stage:
             cameras(lambda camera: camera.connect())
         finally:
             cameras.close()
+
+    def require_power(self) -> None:
+        """Raise `DeviceError` for a projector that is not on: its rows would be dark."""
+        for projector in self.powers:
+            state = projector.power()
+            if state is not Power.ON:
+                raise DeviceError(
+                    projector.name,
+                    "looking before a sweep",
+                    expected="power on",
+                    received=state.name.lower().replace("_", " "),
+                    todo="Switch it on, and wait until its lamp has warmed up.",
+                )
 
     def close(self) -> None:
         """Close every link; lamps and projectors stay as they are."""
@@ -103,6 +122,7 @@ class Stage:
             c.name: _ask(c, connect, partial(_info, c)) if connect else {"state": "in use"}
             for c in self.cameras
         }
+        out["projector_power"] = {p.projector: _power(p) for p in self.powers if connect}
         return out
 
     def _all(self) -> tuple[Device, ...]:
@@ -124,6 +144,30 @@ def _camera(config: CamerasConfig, geometry: Geometry) -> Camera:
             return LinkCamera(config, geometry)
         case BaslerConfig():
             return BaslerCamera(config, geometry)
+
+
+def _powers(rig_file: RigFile, config: DevicesConfig) -> tuple[PjLinkProjector, ...]:
+    known, out = {p.name for p in rig_file.rig.projectors}, []
+    for name, link in config.pjlink.items():
+        where = f"{rig_file.path}: devices.pjlink.{name}"
+        if name not in known:
+            raise RigError(f"{where}: the rig has no projector {name!r}")
+        password = ""
+        if link.password_file is not None:
+            try:
+                password = (rig_file.path.parent / link.password_file).read_text().strip()
+            except OSError as error:
+                raise RigError(f"{where}: password_file: {error}") from error
+        out.append(PjLinkProjector(name, link.host, link.port, password, link.timeout_s))
+    return tuple(out)
+
+
+def _power(projector: PjLinkProjector) -> dict[str, Any]:
+    try:
+        lamps = [asdict(lamp) for lamp in projector.lamps()]
+        return {"state": "ok", "power": projector.power().name, "lamps": lamps}
+    except DeviceError as error:
+        return {"state": "unreachable", "error": str(error)}
 
 
 def _lamps(lights: LightBank) -> dict[str, Any]:

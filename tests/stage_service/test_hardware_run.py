@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from reconstruction.capture import Capture
 from reconstruction.capture_verify import verify
 from reconstruction.capture_writer import CaptureWriter
 from simulators.faults import Fault
+from simulators.pjlink_projector import PjLinkServer, SimulatedProjector
 from stage_service.devices.stage import Stage
 from stage_service.plan import CapturePlan
 from stage_service.sequencer import CannotPause, Sequencer
@@ -74,7 +76,7 @@ def test_a_whole_capture_clocked_by_the_box(simulated, tmp_path):
 
 
 def test_a_dropped_frame_is_shot_again_by_itself(simulated, tmp_path):
-    rig_file, world = simulated(Fault("camera", "drop", 7, "cam_b"))
+    rig_file, _world = simulated(Fault("camera", "drop", 7, "cam_b"))
     heard: list[Any] = []
     run = sequencer(rig_file, tmp_path / "c", heard, projectors=())
     assert run.run() == "completed"
@@ -97,8 +99,6 @@ def test_trouble_in_a_run_ends_it_dark_and_named(simulated, tmp_path, fault, tex
     rig_file, world = simulated(fault)
     run = sequencer(rig_file, tmp_path / "c", [], projectors=())
     assert run.run() == "failed"
-    import re
-
     assert re.search(text, str(run.error))
     assert is_dark(world)
     capture = check_frames(tmp_path / "c")
@@ -122,3 +122,46 @@ def test_pause_is_refused_and_abort_stops_the_box_at_once(simulated, tmp_path):
     assert is_dark(world)
     check_frames(tmp_path / "c")
     assert np.count_nonzero([r.file is not None for r in Capture(tmp_path / "c").records.values()])
+
+
+def test_a_sweep_needs_projectors_that_are_on(simulated, small_rig, tmp_path):
+    now = [0.0]
+    lamp = SimulatedProjector(warm_up_s=60.0, clock=lambda: now[0])
+    server = PjLinkServer(lamp, "secret")
+    server.start()
+    (tmp_path / "password").write_text("secret\n")
+    link = f'[devices.pjlink.left]\nhost = "127.0.0.1"\nport = {server.port}\n'
+    rig_file, world = simulated(rig=small_rig + link + 'password_file = "password"\n')
+    try:
+        run = sequencer(rig_file, tmp_path / "c", [])
+        assert run.run() == "failed"
+        assert "left (PJLink" in str(run.error)
+        assert "expected power on, received standby" in str(run.error)
+        assert world.pulses == 0
+        (projector,) = Stage.of(rig_file).powers
+        projector.switch(True)
+        now[0] = 61.0
+        stage = Stage.of(rig_file)
+        power = stage.status(connect=True)["projector_power"]["left"]
+        stage.close()
+        assert (power["state"], power["power"]) == ("ok", "ON")
+        assert sequencer(rig_file, tmp_path / "d", []).run() == "completed"
+    finally:
+        server.stop()
+
+
+def test_brackets_are_clocked_one_exposure_at_a_time(simulated, tmp_path):
+    rig_file, _ = simulated()
+    plan = CapturePlan(brackets=(1.0, 0.25), projectors=())
+    runs, _why = plan.runs(rig_file, plan.steps(rig_file))
+    assert [(len(r.steps), r.stepping) for r in runs] == [
+        (26, "hardware"),  # dark, all on, the lights
+        (24, "hardware"),
+        (2, "software"),
+    ]
+    run = sequencer(rig_file, tmp_path / "c", [], brackets=(1.0, 0.25), projectors=())
+    assert run.run() == "completed", run.error
+    check_frames(tmp_path / "c")
+    response, saturated = Capture(tmp_path / "c").light("light_011", "cam_a")
+    assert response.mean() == pytest.approx(1.2, abs=0.03)
+    assert not saturated.any()
