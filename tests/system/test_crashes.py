@@ -57,11 +57,12 @@ def test_a_killed_service_leaves_no_lamp_lit_and_every_finished_frame(stage):
         assert left.frame(left.steps[record.step], record.camera).shape == (24, 24, 3)
     problems = stage.verify(path)
     missing = stage.FRAMES - len(frames)
-    assert problems == [
+    assert problems[:2] == [
         "manifest.json is missing: the capture was not finished.",
         f"{missing} planned frames were never shot; the first is step "
         f"{len(frames) // stage.CAMERAS} (olat), cam_{len(frames) % stage.CAMERAS}.",
     ]
+    assert all("are in no line of the journal" in left_over for left_over in problems[2:])
     stage.serve()
     known = stage.get(f"/captures/{capture['id']}")
     assert (known["state"], known["outcome"]) == ("done", "interrupted")
