@@ -229,7 +229,8 @@ class CaptureManager:
         with self._talking:
             run = self._running
             if run is not None:
-                return {**run.sequencer.stage.status(connect=False), "safety": self.darkness()}
+                lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
+                return {**run.sequencer.stage.status(connect=False), "safety": lit}
             stage = Stage.of(self.rig_file)
             try:
                 return {**stage.status(connect=True), "safety": self.darkness()}

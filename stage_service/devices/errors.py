@@ -41,7 +41,10 @@ class DeviceUnreachable(DeviceError):
 
 
 class SafetyRefusal(DeviceError):
-    """An interlock is open or the emergency stop is pressed; only people at the stage clear it."""
+    """What an interlock, the emergency stop or a limit of `[safety]` forbids.
+
+    Interlock and emergency stop are cleared by people at the stage, never from here.
+    """
 
 
 class IndexShift(DeviceError):

@@ -264,3 +264,8 @@ def test_the_longest_on_time_is_that_of_the_plain_search(gaps, window):
         for at in range(-window, now + 1)
     )
     assert longest_on(spans, window) == plain
+
+
+def test_the_page_on_safety_names_every_limit():
+    page = (RIGS.parents[1] / "docs" / "safety.md").read_text()
+    assert [f for f in SafetyLimits.model_fields if f"`{f}`" not in page] == []
