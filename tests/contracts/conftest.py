@@ -22,7 +22,7 @@ from stage_service.devices.projectors.serial_controller import SerialProjectorCo
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
 FIRMWARE = Path(__file__).resolve().parents[2] / "deploy" / "firmware"
-TIMEOUT_S = 0.3
+TIMEOUT_S = 0.2
 
 Edge = tuple[float, str, bool]
 """When, which output (L, P, C), and whether it went up; a camera pulse is the way up alone."""
@@ -86,7 +86,7 @@ class SerialStage:
     def __init__(self, folder: Path, faults: Faults, stack: ExitStack) -> None:
         places = {"left": [0.0, 1.0, 0.3], "right": [0.5, 1.0, 0.3]}
         rig = [Projector.look_at(n, 8, 768, p, [0, 0, 0], 20.0) for n, p in places.items()]
-        self.faults = faults
+        self.folder, self.faults = folder, faults
         self.controller = ProjectorController(rig, self.blank)
         self.wires = Wires(self.controller, faults)
         self.box = TriggerBox(self.wires, faults)
@@ -113,6 +113,17 @@ class SerialStage:
 
     def strikes(self, name: str) -> Callable[[str], Fault | None]:
         return lambda line: self.faults.on_request(name, line, self.wires.pulses + 1)
+
+    def port_of(self, device: str) -> str:
+        """The port of the trigger box or of the projector controller."""
+        return str(self.folder / ("trigger" if device == "trigger box" else "projectors"))
+
+    def plugged(self, name: str) -> bool:
+        return (self.folder / name).is_symlink()
+
+    def open_gates(self) -> set[str]:
+        state = {name: up for _, name, up in list(self.wires.edges) if name != "C"}
+        return {name for name, up in state.items() if up}
 
     def blank(self) -> bool:
         return self.faults.since("projectors", "blank", self.wires.pulses)

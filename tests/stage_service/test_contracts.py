@@ -17,7 +17,7 @@ import pytest
 from stage_service.config import RigFile, load_rig_file
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.stage import Stage
-from stage_service.safety import blackout, check_interlocks
+from stage_service.safety import blackout
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 NEVER = threading.Event()
@@ -107,30 +107,6 @@ def test_light_bank(stage):
     with pytest.raises(DeviceError, match="Modbus exception 3"):
         lights.set_watchdog(0.05)
     lights.select(5)
-
-
-def test_trigger_box(stage):
-    trigger = stage.trigger
-    trigger.reset()
-    assert [trigger.pulse(1e-6), trigger.pulse(10.0), trigger.count()] == [1, 2, 2]
-    trigger.reset()
-    assert trigger.count() == 0
-    check_interlocks(stage)
-    with pytest.raises(DeviceError, match="ERR 1"):
-        trigger._lines.ask("FIRE", "OK", "firing")
-
-
-def test_projectors(stage):
-    projectors = stage.projectors
-    assert "left" in projectors.names
-    projectors.line("left", 11, 0.5)
-    assert not projectors.is_dark()
-    projectors.all_on(1.0)
-    assert not projectors.is_dark()
-    projectors.off()
-    assert projectors.is_dark()
-    with pytest.raises(DeviceError, match="ERR 2"):
-        projectors.line("nobody", 0, 1.0)
 
 
 def test_camera(stage):
