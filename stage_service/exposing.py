@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from reconstruction.capture import Step
@@ -24,7 +25,8 @@ class Pulse:
 class Exposing:
     """Exposes a step on a connected stage, at most `rate_hz` times a second.
 
-    Raises `DeviceError` where a device fails, `Cancelled` when `cancel` is set meanwhile.
+    `watch` is called right before a step's light, and raises what forbids it. Raises `DeviceError`
+    where a device fails, `Cancelled` when `cancel` is set meanwhile.
     """
 
     def __init__(
@@ -33,8 +35,11 @@ class Exposing:
         lamp: dict[str, int],
         cancel: threading.Event,
         spent: Spent,
+        *,
         rate_hz: float | None,
+        watch: Callable[[Step], None],
     ) -> None:
+        self._watch = watch
         self._stage, self._lamp, self._cancel, self._spent = stage, lamp, cancel, spent
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
@@ -45,6 +50,7 @@ class Exposing:
         with spent.on("rate limit"):
             self._sleep(self._next - time.monotonic())
         self._next = time.monotonic() + self._period
+        self._watch(step)
         with spent.on("lights"):
             self._light(step)
         with spent.on("settle"):

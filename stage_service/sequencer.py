@@ -47,9 +47,10 @@ class Sequencer:
     stopped. `run` blocks; the other methods may be called from any thread.
 
     `runs` says who clocks which steps (default: the service all), `rate_hz` how many steps a
-    second there are at most. `watch` is called before each step that lights something, and raises
-    what forbids it. `notify(kind, data)` hears "capture.state", "capture.step" and
-    "capture.frame_missing". Whatever ends the run, lamps and projectors are put off and read back.
+    second there are at most. `watch` is called before the service lights a step, and raises what
+    forbids it; what the box clocks keeps to the plan's prediction. `notify(kind, data)` hears
+    "capture.state", "capture.step" and "capture.frame_missing". Whatever ends the run, lamps and
+    projectors are put off and read back.
     """
 
     def __init__(
@@ -73,7 +74,6 @@ class Sequencer:
         self._retries = retries
         self._runs = [Run(writer.steps, "software")] if runs is None else list(runs)
         self._rate_hz = rate_hz
-        self._watch = watch
         self._notify = notify
         self._machine = Machine()
         self._changed = threading.Condition()
@@ -86,7 +86,9 @@ class Sequencer:
         self._clocked = 0  # steps of the hardware-stepped run that is under way
         self._unclear: dict[str, str] = {}
         self._spent = Spent()
-        self._exposing = Exposing(stage, self._lamp, self._cancel, self._spent, rate_hz)
+        self._exposing = Exposing(
+            stage, self._lamp, self._cancel, self._spent, rate_hz=rate_hz, watch=watch
+        )
         self._pulses = PulseAccount(stage.trigger.name)
         self._accounts = {
             c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in stage.cameras
@@ -166,7 +168,7 @@ class Sequencer:
         return self.outcome
 
     def _finish(self) -> None:
-        if self.blackout is not None and not self.blackout.safe:
+        if self.blackout is not None and self.blackout.blocks:
             self._fail(RuntimeError(f"blackout: {self.blackout.detail}"))
         extra: dict[str, Any] = {
             "seconds": self.seconds,
@@ -176,7 +178,7 @@ class Sequencer:
             "sentinels_unclear": self._unclear,
         }
         if self.blackout is not None:
-            extra["blackout"] = {"safe": self.blackout.safe, "detail": self.blackout.detail}
+            extra["blackout"] = self.blackout.to_dict()
         try:
             self._writer.finish(str(self.outcome), extra)
         except Exception as error:  # a full disk: the journal keeps the frames, state the reason
@@ -243,8 +245,6 @@ class Sequencer:
     def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
         """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
         steps = list(todo)
-        for step in steps:
-            self._watch(step)
         with self._spent.on("arm"):
             self._arm(steps[0].exposure, cameras)
         run = HardwareRun(self.stage, steps, self._lamp, rate_hz=self._rate_hz)
@@ -290,7 +290,6 @@ class Sequencer:
             if self._doubtful or self._armed != step.exposure:
                 with self._spent.on("arm"):
                     self._arm(step.exposure, cameras)
-            self._watch(step)
             pulse = self._exposing.expose(step)
             self._pulses.fired(pulse.count)
             with self._spent.on("cameras"):
@@ -359,7 +358,7 @@ class Sequencer:
             return
         self._move("pause")
         dark = blackout(self.stage)
-        if not dark.safe:
+        if dark.blocks:
             raise RuntimeError(f"pausing: {dark.detail}")
         with self._changed:
             self._changed.wait_for(lambda: self._abort_asked or not self._pause_asked)

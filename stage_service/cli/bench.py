@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ def add(commands: Commands) -> None:
         run_bench,
         "measure error against run time",
         "olat: our renderer of many lights against Mitsuba's own path integrator, light by light. "
+        "acquisition: steps and bytes a second beside what wires and disk allow. "
         "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
     )
     bench.add_argument("name", choices=[*BENCHES, "all"])
@@ -73,7 +76,33 @@ def _olat(args: argparse.Namespace) -> dict[str, Any]:
         )
 
 
-BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {"olat": _olat}
+def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
+    from stage_service.bench_acquisition import run
+    from stage_service.cli.children import Children
+    from stage_service.config import RigFile, load_rig_file
+
+    with tempfile.TemporaryDirectory() as scratch, progress_bar("bench acquisition") as progress:
+        numbers = iter(range(1000))
+
+        @contextmanager
+        def simulate(rig: str) -> Iterator[RigFile]:
+            folder = Path(scratch) / str(next(numbers))
+            folder.mkdir()
+            (folder / "rig.toml").write_text(rig)
+            command = [sys.executable, "-m", "simulators", "--rig", str(folder / "rig.toml")]
+            command += ["--state", str(folder), "--ports", "auto", "--spp", "1", "--paced"]
+            with Children(folder / "logs") as children:
+                peers = children.start("simulators", command, answers=True)
+                children.first_line("simulators", peers, 120)
+                yield load_rig_file(folder / "rig.toml", folder / "devices.toml")
+
+        return run(args.out, simulate, progress)
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "olat": _olat,
+    "acquisition": _acquisition,
+}
 
 
 def _write_truth(args: argparse.Namespace, folder: Path) -> None:
