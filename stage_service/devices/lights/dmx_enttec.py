@@ -2,7 +2,8 @@
 
 The widget keeps sending the newest frame by itself, forty times a second: it is no dead-man, and
 nothing comes back from the lamps. After each frame the widget is asked for its parameters: its
-answer says that the frame has reached the widget, not that a lamp followed. No other request is
+answer says that the frame has reached the widget, not that a lamp followed, and how long it takes
+until the frame is out, which every command waits for. No other request is
 ever sent: the widget stops its output for all but these two.
 """
 
@@ -28,6 +29,8 @@ FULL = 255
 GET_PARAMETERS, SEND_DMX = 3, 6
 _START, _END, _START_CODE = 0x7E, 0xE7, 0
 _NO_USER_DATA = b"\0\0"
+SLOWEST_FRAME_S = 0.023
+"""A frame of 512 channels at full speed (ANSI E1.11)."""
 _PARAMETERS = struct.Struct("<HBBB")  # firmware, break, mark after break, frames a second
 
 
@@ -136,8 +139,10 @@ class DmxLightBank:
         with self._lock:
             self._open()
             self._send(SEND_DMX, bytes([_START_CODE]) + channels, doing)
-            self._ask_parameters(doing)
+            rate = self._ask_parameters(doing)
             self._on = on
+            # The frame that is on the wire ends first, then ours is sent.
+            time.sleep(2 / rate if rate else 2 * SLOWEST_FRAME_S)
 
     def _open(self) -> None:
         """Have an open port; what came before is dropped."""
@@ -158,14 +163,15 @@ class DmxLightBank:
         except OSError as error:
             raise self._lost(doing, error) from error
 
-    def _ask_parameters(self, doing: str) -> None:
-        """Wait until the widget has taken all that was sent to it."""
+    def _ask_parameters(self, doing: str) -> int:
+        """Wait until the widget has taken all that was sent to it; returns its frames a second, 0
+        for as many as it can."""
         assert self._port is not None
         self._send(GET_PARAMETERS, _NO_USER_DATA, doing)
         deadline = time.monotonic() + self.config.timeout_s
         came = b""
         try:
-            while not _has_parameters(came):
+            while (rate := _frames_per_second(came)) is None:
                 wait = deadline - time.monotonic()
                 if wait <= 0 or not select.select([self._port], [], [], wait)[0]:
                     self.close()
@@ -181,6 +187,7 @@ class DmxLightBank:
                 came += self._port.read(max(1, self._port.in_waiting))
         except OSError as error:
             raise self._lost(doing, error) from error
+        return rate
 
     def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
         self.close()
@@ -195,12 +202,12 @@ class DmxLightBank:
         )
 
 
-def _has_parameters(data: bytes) -> bool:
-    """Whether a whole answer to `GET_PARAMETERS` is in `data`, among whatever else came."""
+def _frames_per_second(data: bytes) -> int | None:
+    """What a whole answer to `GET_PARAMETERS` in `data`, among whatever else came, says."""
     for start in range(len(data) - 4):
         first, label, size = struct.unpack_from("<BBH", data, start)
         end = start + 4 + size
         whole = end < len(data) and data[end] == _END
         if (first, label) == (_START, GET_PARAMETERS) and size >= _PARAMETERS.size and whole:
-            return True
-    return False
+            return int(_PARAMETERS.unpack_from(data, start + 4)[3])
+    return None
