@@ -7,12 +7,24 @@ from typing import Protocol
 
 from simulators.dmx_widget import DmxWidget
 from simulators.faults import Fault
+from simulators.lamps import Lamps
 from simulators.modbus_faults import DisturbedUnit
 from simulators.modbus_rtu import ModbusRtuPeer
 from simulators.modbus_tcp import ModbusTcpPeer
 from simulators.modbus_unit import ModbusUnit
-from simulators.world import World
 from stage_service.config import DmxConfig, LightBankConfig, ModbusRtuConfig
+
+
+class Wired(Protocol):
+    """Lamps, and the faults of the wire to them, as `World` has them."""
+
+    lamps: Lamps
+
+    def begun(self, device: str, kind: str) -> bool:
+        """Whether a lasting fault shows."""
+
+    def strikes(self, device: str, request: str) -> Fault | None:
+        """The fault of this request."""
 
 
 class LightBankPeer(Protocol):
@@ -28,7 +40,7 @@ class LightBankPeer(Protocol):
 
 
 def light_bank(
-    config: LightBankConfig, world: World, link: Path, tcp: tuple[str, int], paced: bool = False
+    config: LightBankConfig, world: Wired, link: Path, tcp: tuple[str, int], paced: bool = False
 ) -> LightBankPeer:
     """The peer for `config`: at `tcp` (port 0: a free one), or on a serial port at `link`.
 

@@ -66,7 +66,7 @@ class ModbusUnit:
             (r.heartbeat, 1, lambda: lamps.control()[1:2], lambda _, v: lamps.beat(v[0])),
             (r.watchdog, 1, lambda: lamps.control()[2:], _accepted(lamps.watch)),
             (r.sequence, 1, lambda: lamps.sequence()[:1], _accepted(lamps.arm)),
-            (r.table, 2 * ENTRIES, lamps.table, lamps.load),
+            (r.table, 2 * ENTRIES, self._table, self._load),
         )
         signature = r.signature or (None, 0)
         self._inputs = _there(
@@ -142,11 +142,27 @@ class ModbusUnit:
             values = values[count:]
 
     def _levels(self) -> list[int]:
-        return [round(level * self._full / FULL) for level in self._lamps.levels()]
+        return [self._told(level) for level in self._lamps.levels()]
 
     def _dim(self, first: int, levels: Sequence[int]) -> None:
-        _check(max(levels) <= self._full)
-        self._lamps.dim(first, [round(level * FULL / self._full) for level in levels])
+        self._lamps.dim(first, [self._meant(level) for level in levels])
+
+    def _table(self) -> list[int]:
+        words = self._lamps.table()
+        return [self._told(word) if at % 2 else word for at, word in enumerate(words)]
+
+    def _load(self, first: int, words: Sequence[int]) -> None:
+        meant = [self._meant(w) if at % 2 else w for at, w in enumerate(words, first)]
+        self._lamps.load(first, meant)
+
+    def _meant(self, level: int) -> int:
+        """The lamps' level for a register's."""
+        _check(level <= self._full)
+        return round(level * FULL / self._full)
+
+    def _told(self, level: int) -> int:
+        """The register's level for the lamps'."""
+        return round(level * self._full / FULL)
 
     def _status(self) -> tuple[int, int]:
         bits, lit = self._lamps.status()

@@ -1,0 +1,233 @@
+"""Light banks: each driver with a peer at the other end of a real wire, and a look at its lamps."""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pyModbusTCP.server import DataHandler, ModbusServer
+
+from simulators.faults import Fault, Faults
+from simulators.lamps import Lamps
+from simulators.light_bank import light_bank
+from stage_service.config import (
+    DmxConfig,
+    LightBankConfig,
+    LightRegisters,
+    ModbusRtuConfig,
+    ModbusTcpConfig,
+)
+from stage_service.devices.lights.dmx_enttec import DmxLightBank
+from stage_service.devices.lights.interface import LightBank
+from stage_service.devices.lights.modbus import ModbusLightBank
+
+LAMPS = 200
+TIMEOUT_S = 0.2
+COILS_ALONE = LightRegisters(
+    levels=None,
+    selector=None,
+    heartbeat=None,
+    watchdog=None,
+    sequence=None,
+    table=None,
+    status=None,
+    lit=None,
+    count=None,
+    signature=None,
+    position=None,
+)
+ELSEWHERE = LightRegisters(
+    coils=50,
+    levels=5000,
+    level_full=255,
+    selector=10,
+    heartbeat=20,
+    watchdog=30,
+    sequence=40,
+    table=20000,
+    status=9,
+    lit=7,
+    count=100,
+    signature=(200, 4711),
+    position=3,
+)
+
+
+class Bench:
+    """A driver and what its peer's lamps give; `gate` is None where the peer has no gate.
+
+    Simulated peers take `faults`; they strike once `pulses` has reached theirs.
+    """
+
+    def __init__(self, driver: LightBank, powers: Callable[[], Any]) -> None:
+        self.driver = driver
+        self.powers = powers
+        self.lamps: Any = None
+        self.faults = Faults()
+        self.pulses = 0
+        self.seen: list[str] = []
+        self.link: Path | None = None
+
+    def lit(self) -> list[int]:
+        """The numbers of the lamps that give light."""
+        return [i for i, power in enumerate(self.powers()) if power > 0]
+
+    def begun(self, device: str, kind: str) -> bool:
+        return self.faults.since(device, kind, self.pulses)
+
+    def strikes(self, device: str, request: str) -> Fault | None:
+        self.seen.append(request)
+        return self.faults.on_request(device, request, self.pulses)
+
+    def plugged(self) -> bool:
+        return self.link is None or self.link.is_symlink()
+
+
+def driver_for(config: LightBankConfig, lamps: int) -> LightBank:
+    """A driver that is not connected."""
+    if isinstance(config, DmxConfig):
+        return DmxLightBank(config, lamps)
+    return ModbusLightBank(config, lamps)
+
+
+CONFIGS: dict[str, Callable[[str], LightBankConfig]] = {
+    "simulated TCP": lambda _link: ModbusTcpConfig(port=1, timeout_s=TIMEOUT_S),
+    "simulated RTU": lambda link: ModbusRtuConfig(
+        kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, unit=7
+    ),
+    "simulated RTU, other registers": lambda link: ModbusRtuConfig(
+        kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, registers=ELSEWHERE, parity="N"
+    ),
+    "simulated TCP, coils alone": lambda _link: ModbusTcpConfig(
+        port=1, timeout_s=TIMEOUT_S, registers=COILS_ALONE, accept_unverified_blackout=True
+    ),
+    "simulated DMX": lambda link: DmxConfig(
+        kind="dmx_enttec",
+        port=link,
+        timeout_s=TIMEOUT_S,
+        first_channel=5,
+        accept_unverified_blackout=True,
+    ),
+}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    """`bench(kind, *faults, lamps=…, connect=…, clock=…)`: a driver and its peer."""
+    with ExitStack() as stack:
+
+        def start(
+            kind: str,
+            *faults: Fault,
+            lamps: int = LAMPS,
+            connect: bool = True,
+            clock: Callable[[], float] = time.monotonic,
+            paced: bool = False,
+        ) -> Bench:
+            if kind in CONFIGS:
+                one = _simulated(kind, faults, Lamps(lamps, clock), tmp_path, stack, paced)
+            elif kind == "pyModbusTCP":
+                one = _foreign(lamps, stack)
+            else:
+                one = _own(lamps, stack)
+            stack.callback(one.driver.close)
+            if connect:
+                one.driver.connect()
+            return one
+
+        yield start
+
+
+def _simulated(
+    kind: str,
+    faults: tuple[Fault, ...],
+    lamps: Lamps,
+    folder: Path,
+    stack: ExitStack,
+    paced: bool,
+) -> Bench:
+    config = CONFIGS[kind](str(folder / "lights"))
+    one = Bench(driver_for(config, lamps.count), lamps.power)
+    one.lamps, one.faults = lamps, Faults(faults)
+    peer = light_bank(config, one, folder / "lights", ("127.0.0.1", 0), paced)
+    place = peer.start()
+    stack.callback(peer.stop)
+    if isinstance(place, int):
+        assert isinstance(config, ModbusTcpConfig)
+        one.driver = driver_for(config.model_copy(update={"port": place}), lamps.count)
+    else:
+        one.link = Path(place)
+    return one
+
+
+class Foreign(DataHandler):  # type: ignore[misc]
+    """The light bank's register map on a server that nobody here wrote."""
+
+    def __init__(self, lamps: int) -> None:
+        super().__init__()
+        self.on = [False] * lamps
+        self.holding = dict.fromkeys(range(lamps), 65535)
+        self.holding |= {1000: 0, 1001: 0, 1002: 2000, 1003: 0}
+        self.holding |= dict.fromkeys(range(2000, 2000 + 8192), 0)
+
+    def powers(self) -> list[float]:
+        return [self.holding[i] / 65535 if on else 0.0 for i, on in enumerate(self.on)]
+
+    def read_i_regs(self, address: int, count: int, srv_info: Any) -> Any:
+        lit = sum(self.on)
+        bits = 8 * bool(lit) | 16 * bool(self.holding[1003])
+        words = [bits, lit, len(self.on), 0x4853, 0]
+        return self.Return(0, words[address : address + count])
+
+    def read_h_regs(self, address: int, count: int, srv_info: Any) -> Any:
+        return self.Return(0, [self.holding[a] for a in range(address, address + count)])
+
+    def write_h_regs(self, address: int, words_l: list[int], srv_info: Any) -> Any:
+        if address == 1002 and not 100 <= words_l[0] <= 60000:
+            return self.Return(3)
+        if address == 1000 and self.holding[1003]:
+            return self.Return(4)
+        self.holding |= dict(enumerate(words_l, address))
+        if address in (1000, 1003):
+            what = words_l[0] if address == 1000 else 0
+            self.on = [what in (i + 1, 65535) for i in range(len(self.on))]
+        return self.Return(0)
+
+
+def _foreign(lamps: int, stack: ExitStack) -> Bench:
+    handler = Foreign(lamps)
+    server = ModbusServer("127.0.0.1", 0, no_block=True, data_hdl=handler)
+    server.start()
+    stack.callback(server._service.server_close)
+    stack.callback(server._service.shutdown)
+    port = server._service.socket.getsockname()[1]
+    return Bench(driver_for(ModbusTcpConfig(port=port, timeout_s=TIMEOUT_S), lamps), handler.powers)
+
+
+def _own(lamps: int, stack: ExitStack) -> Bench:
+    """The hand-written peer that the service's tests use."""
+    file = Path(__file__).resolve().parents[2] / "stage_service" / "conftest.py"
+    spec = importlib.util.spec_from_file_location("service_peers", file)
+    assert spec is not None
+    assert spec.loader is not None
+    peers = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(peers)
+    assert lamps == peers.LAMPS
+    world = peers.World()
+    server = peers.Server(("127.0.0.1", 0), peers.Lights)
+    server.world = world
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    stack.callback(server.server_close)
+    stack.callback(server.shutdown)
+    config = ModbusTcpConfig(port=server.server_address[1], timeout_s=TIMEOUT_S)
+
+    def powers() -> list[float]:
+        return [world.levels[i] / 65535 if i in world.lit else 0.0 for i in range(lamps)]
+
+    return Bench(driver_for(config, lamps), powers)
