@@ -46,6 +46,7 @@ class HairParameters:
         self.scale = float(props.get("scale", 1.0))
         self.strands = {name: props[name] for name in NAMES if name in props}
         self._constant: dict[str, Any] = {}
+        self._turns = False
         self.refresh()
         missing = sorted(set(NAMES) - set(self.strands))
         tables = [n for n, v in self.values.items() if _cells(v) > 1 or n == "rotation"]
@@ -60,6 +61,9 @@ class HairParameters:
         for name in ("sigma_a", "rotation"):
             if name in self.values:
                 self._constant[name] = _constant(self.values[name])
+        if "rotation" in self.values:
+            constant = self._constant["rotation"]
+            self._turns = constant is None or any(x[0] != 0 for x in constant)
 
     def fibre(self, place: Place) -> Fibre:
         """The fibre at a hit."""
@@ -88,19 +92,12 @@ class HairParameters:
 
         if "rotation" not in self.values:
             return None
-        constant = self._known("rotation")
-        if constant is not None and not np.any(np.array(constant)):
+        if not self._turns and not dr.grad_enabled(self.values["rotation"]):
             return None
         turn = self._look_up("rotation", mi.Vector2f, place)
         frame, normal = place.si.sh_frame, place.normal
         across = dr.dot(normal, frame.s), dr.dot(normal, frame.n)
         return mi.Vector3f(*axis_in_frame(turn.x, turn.y, *across))
-
-    def _known(self, name: str) -> Any | None:
-        """The constant in table `name`; None where it varies or is being differentiated."""
-        import drjit as dr
-
-        return None if dr.grad_enabled(self.values[name]) else self._constant[name]
 
     def _look_up(self, name: str, kind: Any, place: Place) -> Any:
         import drjit as dr
@@ -111,8 +108,10 @@ class HairParameters:
             return value
         if _cells(value) == 1:
             return dr.gather(kind, value.array, mi.UInt32(0))
-        constant = self._known(name)
-        return place.cell(value, kind) if constant is None else kind(constant)
+        constant = self._constant[name]
+        if constant is None or dr.grad_enabled(value):  # a gradient belongs to its cell
+            return place.cell(value, kind)
+        return kind(constant)
 
 
 class Place:

@@ -7,7 +7,7 @@ import pytest
 from appearance.bsdf import lobes, reference
 from appearance.bsdf.measure import Case, panels
 
-BETAS = [0.001, 0.002, 0.005, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9, 1.0]
+BETAS = [0.001, 0.003, 0.01, 0.1, 0.3, 0.6, 1.0]
 THETAS = np.radians([-89.99, -85.0, -45.0, 0.0, 10.0, 80.0, 89.9, 89.99])
 ETAS = [1.0001, 1.01, 1.3, 1.55, 2.0, 3.0]
 HS = [-1.0, -0.9999999, -0.7, 0.0, 0.3, 0.99, 1.0]

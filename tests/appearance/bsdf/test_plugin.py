@@ -329,18 +329,11 @@ def test_gradients_of_volume_and_correctives_match_differences(tuft):
         assert got[cell] == pytest.approx((ends[1] - ends[0]) / 0.04, rel=0.01)
 
 
-def test_path_replay_reaches_every_parameter(tuft):
-    scene, curves, _, _ = tuft
-    given = {
-        "sigma_a": mi.TensorXf(np.full((2, 2, 2, 3), 0.3, np.float32)),
-        "rotation": mi.TensorXf(np.full((2, 2, 2, 2), 0.02, np.float32)),
-    }
-    bsdf = hair(**given, **curves)
-    scene.hair_shape.set_bsdf(bsdf)
-    lit = mi.load_dict(
+def lit_scene(shape):
+    return mi.load_dict(
         {
             "type": "scene",
-            "hair": scene.hair_shape,
+            "hair": shape,
             "light": {"type": "point", "position": [0, -30, 20], "intensity": 500.0},
             "sensor": {
                 "type": "perspective",
@@ -350,14 +343,38 @@ def test_path_replay_reaches_every_parameter(tuft):
             },
         }
     )
+
+
+def test_path_replay_reaches_every_parameter(tuft):
+    scene, curves, _, _ = tuft
+    given = {
+        "sigma_a": mi.TensorXf(np.full((2, 2, 2, 3), 0.3, np.float32)),
+        "rotation": mi.TensorXf(np.full((2, 2, 2, 2), 0.02, np.float32)),
+    }
+    bsdf = hair(**given, **curves)
+    scene.hair_shape.set_bsdf(bsdf)
     parameters = mi.traverse(bsdf)
     for key in list(parameters.keys()):
         dr.enable_grad(parameters[key])
     integrator = mi.load_dict({"type": "prb", "max_depth": 4})
-    image = mi.render(lit, parameters, integrator=integrator, spp=16, seed=1)
+    image = mi.render(lit_scene(scene.hair_shape), parameters, integrator=integrator, spp=16)
     assert np.isfinite(np.array(image)).all()
     dr.backward(dr.mean(image))
     for key in list(parameters.keys()):
         gradient = np.array(dr.grad(parameters[key]))
         assert np.isfinite(gradient).all(), key
         assert np.abs(gradient).max() > 0, key
+
+
+def test_a_uniform_volume_renders_like_a_constant(tuft):
+    scene, curves, _, _ = tuft
+    volume = mi.TensorXf(np.full((2, 2, 2, 3), 0.3, np.float32))
+    still = mi.TensorXf(np.zeros((2, 2, 2, 2), np.float32))
+    images = []
+    for bsdf in (hair(sigma_a=0.3), hair(sigma_a=volume, rotation=still, **curves)):
+        scene.hair_shape.set_bsdf(bsdf)
+        integrator = mi.load_dict({"type": "path", "max_depth": 5})
+        image = mi.render(lit_scene(scene.hair_shape), integrator=integrator, spp=8, seed=2)
+        images.append(np.array(image))
+    assert images[0].max() > 0
+    assert images[1] == pytest.approx(images[0], rel=1e-4, abs=1e-6)
