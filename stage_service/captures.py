@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from reconstruction.capture import Capture
 from reconstruction.capture_writer import CaptureWriter, utc_now
+from reconstruction.durable_files import RESERVE
 from reconstruction.mesh import Mesh
 from stage_service.audit import SERVICE, AuditLog
 from stage_service.capture_run import CaptureRun, plan_of
@@ -106,7 +107,7 @@ class CaptureManager:
         cost = plan.cost(self.rig_file)
         self._check_flashing(plan, cost, armed_by)
         free = shutil.disk_usage(self.folder).free
-        if cost.bytes > free:
+        if cost.bytes + RESERVE > free:
             need, have = cost.bytes / 1e9, free / 1e9
             raise PlanError(
                 [f"the plan writes {need:.1f} GB, {self.folder} has {have:.1f} GB free"]

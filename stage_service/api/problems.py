@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
 from reconstruction.capture import CaptureError, MissingFrame
+from reconstruction.capture_writer import JournalInUse
 from stage_service.api.stage import (
     BadInput,
     NotFinished,
@@ -106,6 +107,12 @@ KINDS = {
             "The lease has expired or was released. `GET /lease` says who holds one now.",
         ),
         Kind(
+            "journal-in-use",
+            409,
+            "The capture is being written or compressed",
+            "Wait until that is done; `GET /jobs` shows a compression.",
+        ),
+        Kind(
             "wrong-state",
             409,
             "The capture's state does not allow this",
@@ -166,6 +173,7 @@ BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",
     BadInput: "bad-input",
     Busy: "busy",
+    JournalInUse: "journal-in-use",
     FlashRefusal: "flash-rate",
     Unsafe: "unsafe",
     CannotAcknowledge: "cannot-acknowledge",

@@ -50,6 +50,7 @@ class ModbusLightBank:
         self._armed: int | None = None  # entries; None: not known
         self._link: ModbusLink | None = None
         self._identified = False
+        self._out_of_step = False
         self._falls = 0
         self._lock = threading.RLock()
 
@@ -257,17 +258,14 @@ class ModbusLightBank:
         """Have an open link to the right bank on which no answer is late."""
         if self._identified:
             return
-        self._open("connecting")
         for attempt in range(1, _ATTEMPTS_TO_FALL_INTO_STEP + 1):
+            self._open("connecting")
             try:
                 self._fall_into_step()
                 break
             except _OutOfStep:
                 if attempt == _ATTEMPTS_TO_FALL_INTO_STEP:
                     raise
-                # Late answers come one after the other now: let them pass.
-                self._open("connecting")
-                self._drain()
         self._identify()
         self._identified = True
 
@@ -282,14 +280,6 @@ class ModbusLightBank:
         else:
             count = 1 + 8 * self._falls % min(self._lamps, MOST_COILS)
             self._exchange(doing, "read_coils", self._map.coils, count)
-
-    def _drain(self) -> None:
-        assert self._link is not None
-        try:
-            self._link.drain(self.config.timeout_s)
-        except OSError:
-            self.close()
-            self._open("connecting")
 
     def _identify(self) -> None:
         r, doing = self._map, "identifying"
@@ -321,7 +311,12 @@ class ModbusLightBank:
             return
         try:
             self._link = open_link(self.config)
+            if self._out_of_step:
+                # Late answers come one after the other now: let them pass.
+                self._link.drain(self.config.timeout_s)
+                self._out_of_step = False
         except OSError as error:
+            self.close()
             raise DeviceUnreachable(
                 self.name,
                 doing,
@@ -367,6 +362,7 @@ class ModbusLightBank:
             )
         if got != wanted:
             self.close()
+            self._out_of_step = True
             raise _OutOfStep(
                 self.name,
                 doing,

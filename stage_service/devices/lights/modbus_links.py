@@ -84,13 +84,6 @@ class _Deadline:
         self.received += data
         return data
 
-    def drain(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for `quiet_s`; not for ever."""
-        for _ in range(_MOST_DRAINED):
-            self._sent(quiet_s)
-            if not self.recv(None):
-                return
-
 
 class _TcpLink(_Deadline, ModbusTcpClient):
     def __init__(self, config: ModbusTcpConfig) -> None:
@@ -109,12 +102,15 @@ class _TcpLink(_Deadline, ModbusTcpClient):
         self.socket.sendall(request)
         return len(request)
 
+    def drain(self, quiet_s: float) -> None:
+        """A new connection carries nothing old."""
+
 
 class _RtuLink(_Deadline, ModbusSerialClient):
     def __init__(self, config: ModbusRtuConfig) -> None:
         super().__init__(config.port, timeout=config.timeout_s, retries=0)
         self._config = config
-        self._quiet_since = 0.0
+        self._quiet_since = time.monotonic()
 
     def connect(self) -> bool:
         if self.socket is None:
@@ -141,6 +137,12 @@ class _RtuLink(_Deadline, ModbusSerialClient):
         self._sent(self._config.timeout_s + len(request) * character_s(self._config))
         self.socket.write(request)
         return len(request)
+
+    def drain(self, quiet_s: float) -> None:
+        for _ in range(_MOST_DRAINED):
+            self._sent(quiet_s)
+            if not self.recv(None):
+                return
 
     def recv(self, size: int | None) -> bytes:
         data = super().recv(size)
