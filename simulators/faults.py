@@ -34,21 +34,20 @@ class Fault:
     way. camera repeat: its frame has the number of the one before. camera stray: it makes one more
     frame than was asked for. camera late_frame: the frame is not to be had before the next pulse.
     camera mute: `camera` answers nothing from that pulse on. trigger interlock or estop: open or
-    pressed after that pulse, for good. trigger double: fires twice, counts once; dropped: counts, does not fire; uncounted: fires, does
-    not count; late_trigger: fires `seconds` late. projectors blank: after that pulse no pattern
-    comes up any more, for good. lights hang: the bank answers nothing after that pulse, and its
-    watchdog goes on; lies: it reports no lamp as lit after that pulse, for good; stuck: the lamps
-    that are lit at that pulse cannot be put off any more.
+    pressed after that pulse, for good. trigger double: fires twice, counts once; dropped: counts,
+    does not fire; uncounted: fires, does not count; late_trigger: fires `seconds` late. projectors
+    blank: after that pulse no pattern comes up any more, for good. lights hang: the bank answers
+    nothing after that pulse, and its watchdog goes on; lies: it reports no lamp as lit after that
+    pulse, for good; stuck: the lamps that are lit at that pulse cannot be put off any more.
 
     Serial faults strike once, at the first request from that pulse on that begins with `request`;
     without it any of the projectors and the lights, and PULSE of the trigger box. The lights'
-    requests begin with function code and address on Modbus ("6 1000": the selector), with the
-    label on DMX. Theirs are also crc: the answer's checksum is wrong (RTU); echo: a write is
-    answered with another value. silent: carried out, not
-    answered. garbage: carried out, the reply is broken. nak: not carried out, answered with an
-    error. late: carried out, answered `seconds` later. noise: carried out, a line of garbage comes
-    before the reply. unplug: the port goes away before it is carried out, and comes back
-    after `seconds`.
+    requests begin with function code and address on Modbus ("6 1000": the selector), with the label
+    on DMX. Theirs are also crc: the answer's checksum is wrong (RTU); echo: a write is answered
+    with another value. silent: carried out, not answered. garbage: carried out, the reply is
+    broken. nak: not carried out, answered with an error. late: carried out, answered `seconds`
+    later. noise: carried out, a line of garbage comes before the reply. unplug: the port goes away
+    before it is carried out, and comes back after `seconds`.
     """
 
     device: str

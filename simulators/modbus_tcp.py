@@ -62,7 +62,8 @@ class ModbusTcpPeer:
                 continue
             reply = self._bank.reply(request, framed)
             if reply.unplugged_s is not None:
-                threading.Thread(target=self._unplug, args=(reply.unplugged_s,)).start()
+                self._hang_up()
+                threading.Thread(target=self._plug_in, args=(reply.unplugged_s,)).start()
                 return
             if reply.frame is not None and not self._stopping.wait(reply.delay_s):
                 connection.sendall(reply.frame)
@@ -79,8 +80,7 @@ class ModbusTcpPeer:
             server.server_close()
             server.close_connections()
 
-    def _unplug(self, seconds: float) -> None:
-        self._hang_up()
+    def _plug_in(self, seconds: float) -> None:
         if not self._stopping.wait(seconds):
             self._server = self._listen(self._address)
 

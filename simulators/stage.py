@@ -17,7 +17,7 @@ from simulators.sensor import Sensor
 from simulators.serial_peer import SerialPeer
 from simulators.trigger_box import TriggerBox
 from simulators.world import World
-from stage_service.config import DevicesConfig, LinkCamerasConfig, ModbusTcpConfig
+from stage_service.config import DevicesConfig, LinkCamerasConfig, ModbusRtuConfig, ModbusTcpConfig
 
 HOST = "127.0.0.1"
 DEVICES_FILE = "devices.toml"
@@ -84,6 +84,9 @@ class SimulatedStage:
         light: dict[str, Any] = {"kind": light_kind.kind, "port": lights.start()}
         if isinstance(light_kind, ModbusTcpConfig):
             light["host"] = light_tcp[0]
+        if isinstance(light_kind, ModbusRtuConfig):
+            # A pseudo-terminal has no parity bit; a second stop bit keeps a character as long.
+            light |= {"parity": "N", "stop_bits": 2}
         cameras = CameraLink(world, self._sensor, camera_host, camera_port)
         stack.callback(cameras.stop)
         camera_port = cameras.start()

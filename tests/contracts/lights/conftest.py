@@ -99,7 +99,7 @@ def driver_for(config: LightBankConfig, lamps: int) -> LightBank:
 CONFIGS: dict[str, Callable[[str], LightBankConfig]] = {
     "simulated TCP": lambda _link: ModbusTcpConfig(port=1, timeout_s=TIMEOUT_S),
     "simulated RTU": lambda link: ModbusRtuConfig(
-        kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, unit=7
+        kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, unit=7, parity="N", stop_bits=2
     ),
     "simulated RTU, other registers": lambda link: ModbusRtuConfig(
         kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, registers=ELSEWHERE, parity="N"
