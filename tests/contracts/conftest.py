@@ -22,7 +22,7 @@ from stage_service.devices.projectors.serial_controller import SerialProjectorCo
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
 FIRMWARE = Path(__file__).resolve().parents[2] / "deploy" / "firmware"
-TIMEOUT_S = 0.2
+TIMEOUT_S = 5.0  # a busy machine is no fault of a device
 
 Edge = tuple[float, str, bool]
 """When, which output (L, P, C), and whether it went up; a camera pulse is the way up alone."""
@@ -83,7 +83,7 @@ class Wires:
 class SerialStage:
     """A simulated trigger box and projector controller, wired, each with its driver."""
 
-    def __init__(self, folder: Path, faults: Faults, stack: ExitStack) -> None:
+    def __init__(self, folder: Path, faults: Faults, stack: ExitStack, timeout_s: float) -> None:
         places = {"left": [0.0, 1.0, 0.3], "right": [0.5, 1.0, 0.3]}
         rig = [Projector.look_at(n, 8, 768, p, [0, 0, 0], 20.0) for n, p in places.items()]
         self.folder, self.faults = folder, faults
@@ -97,7 +97,7 @@ class SerialStage:
             peer.start()
             stack.callback(peer.stop)
         self.requests: list[str] = []
-        config = {n: SerialConfig(port=str(folder / n), timeout_s=TIMEOUT_S) for n in replies}
+        config = {n: SerialConfig(port=str(folder / n), timeout_s=timeout_s) for n in replies}
         self.trigger = SerialTriggerBox(config["trigger"])
         self.projectors = SerialProjectorController(config["projectors"], ("left", "right"))
         for driver in (self.trigger, self.projectors):
@@ -133,7 +133,11 @@ class SerialStage:
 def serial_stage(tmp_path: Path) -> Iterator[Callable[..., SerialStage]]:
     """`serial_stage(*faults)`: simulated trigger box and projectors on pseudo-terminals."""
     with ExitStack() as stack:
-        yield lambda *faults: SerialStage(tmp_path, Faults(faults), stack)
+
+        def start(*faults: Fault, timeout_s: float = TIMEOUT_S) -> SerialStage:
+            return SerialStage(tmp_path, Faults(faults), stack, timeout_s)
+
+        yield start
 
 
 @pytest.fixture

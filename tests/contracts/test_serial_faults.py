@@ -9,15 +9,15 @@ from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnrea
 from stage_service.devices.projectors.interface import Pattern
 from stage_service.devices.trigger.interface import TableRow
 
-LATE_S = 0.3  # after the driver's deadline of 0.2 s, before that of the next request
+LATE_S = 0.37  # after the driver's deadline of 0.25 s, before that of the next request
 LONG = TableRow(1, "LP", 0.0, 9.0, 0.0)
 WIRE = {
-    "silent": (DeviceTimeout, "expected a line within 0.2 s, received nothing"),
-    "garbage": (DeviceError, r"expected an answer to .* within 0.2 s, received '.\\x7f"),
+    "silent": (DeviceTimeout, "expected a line within 0.25 s, received nothing"),
+    "garbage": (DeviceError, r"expected an answer to .* within 0.25 s, received '.\\x7f"),
     "nak": (DeviceError, "received 'ERR 4 busy'"),
-    "late": (DeviceTimeout, "expected a line within 0.2 s, received nothing"),
+    "late": (DeviceTimeout, "expected a line within 0.25 s, received nothing"),
     "noise": (DeviceError, r"received '\\\\xff\\x00\\x1b\[A~~'"),
-    "unplug": (DeviceUnreachable, "expected an open serial port within 0.2 s, received"),
+    "unplug": (DeviceUnreachable, "expected an open serial port within 0.25 s, received"),
 }
 TRIGGER = {
     "PULSE": ("firing the cameras", lambda s: s.trigger.pulse(0.001)),
@@ -49,7 +49,7 @@ def start(serial_stage):
     """A stage whose trigger box may run `LONG`: the projectors' first pattern is armed."""
 
     def begin(*faults):
-        stage = serial_stage(*faults)
+        stage = serial_stage(*faults, timeout_s=0.25)
         for line in ("WATCHDOG 60000", "SEQ 1", "ENTRY 0 LINE left 0 1 99 9", "ARM"):
             assert stage.controller.reply(line).startswith("OK")
         return stage
@@ -64,7 +64,7 @@ def fails(kind, device, operation, call, stage):
     assert type(caught.value) is error
     assert caught.value.device == f"{device} ({stage.port_of(device)})"
     assert caught.value.operation == operation
-    assert caught.value.deadline_s == 0.2
+    assert caught.value.deadline_s == 0.25
     assert caught.value.todo
 
 
@@ -75,7 +75,7 @@ def test_trigger_box(start, until, kind, request_word):
     operation, call = TRIGGER[request_word]
     fails(kind, "trigger box", operation, call, stage)
     if kind == "unplug":
-        with pytest.raises(DeviceUnreachable, match=r"opening the serial port: .*within 0.2 s"):
+        with pytest.raises(DeviceUnreachable, match=r"opening the serial port: .*within 0.25 s"):
             stage.trigger.status()
         until(lambda: stage.plugged("trigger"))
     # What was lost may have been carried out, and is never sent again by itself.
@@ -158,7 +158,7 @@ def test_counted_and_fired_pulses_can_differ(start, until, kind, count, fired):
 
 def test_a_trigger_that_comes_after_its_deadline_is_counted_later(start):
     stage = start(Fault("trigger", "late_trigger", 1, seconds=LATE_S))
-    with pytest.raises(DeviceTimeout, match=r"firing the cameras: expected a line within 0.2 s"):
+    with pytest.raises(DeviceTimeout, match=r"firing the cameras: expected a line within 0.25 s"):
         stage.trigger.pulse(0.001)
     assert stage.wires.fired == 0
     assert stage.trigger.count() == 1  # it fired meanwhile; nobody may take it for the next
