@@ -11,6 +11,7 @@ import numpy as np
 from appearance.bsdf.absorption import of_colour, of_melanin
 from appearance.bsdf.corrective import axis_in_frame
 from appearance.bsdf.lobes import Fibre
+from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
 
 INFINITE = float("inf")
@@ -21,6 +22,9 @@ SCALARS = {
     "eta": (1.55 / 1.000277, 1.0001, 5.0),
 }
 """Name: default, least and greatest value."""
+MITSUBAS_SEGMENTS = 1 << 20
+"""Number of segments above which Mitsuba's tangents are those of a place a tenth of a segment off:
+it finds a hit's segment back from one float32 coordinate, in the worst case the next strand's."""
 PIGMENTS = {"eumelanin": (1.3, 0.0, INFINITE), "pheomelanin": (0.2, 0.0, INFINITE)}
 
 
@@ -85,19 +89,26 @@ class HairParameters:
             -dr.deg2rad(place.scalar(self.values["scale_tilt"])),
         )
 
-    def axis(self, place: Place) -> Any | None:
-        """Axis-angle in the shading frame that corrects it at a hit; None where nothing turns."""
+    def frame(self, place: Place) -> ShadingFrame:
+        """The fibre's frame at a hit: its own direction, and the corrective of its cell."""
         import drjit as dr
         import mitsuba as mi
 
+        tangent = place.tangent if self._many_segments() else None
         if "rotation" not in self.values:
-            return None
+            return ShadingFrame(tangent, None)
         if not self._turns and not dr.grad_enabled(self.values["rotation"]):
-            return None
+            return ShadingFrame(tangent, None)
         turn = self._look_up("rotation", mi.Vector2f, place)
-        frame, normal = place.si.sh_frame, place.normal
-        across = dr.dot(normal, frame.s), dr.dot(normal, frame.n)
-        return mi.Vector3f(*axis_in_frame(turn.x, turn.y, *across))
+        normal = ShadingFrame(tangent, None).enter(place.si.to_local(place.normal))
+        return ShadingFrame(
+            tangent, mi.Vector3f(*axis_in_frame(turn.x, turn.y, normal.x, normal.z))
+        )
+
+    def _many_segments(self) -> bool:
+        """Whether the curves have more segments than Mitsuba finds a frame for."""
+        indices = self.strands.get("segment_indices")
+        return indices is not None and len(indices) > MITSUBAS_SEGMENTS
 
     def _look_up(self, name: str, kind: Any, place: Place) -> Any:
         import drjit as dr
@@ -133,14 +144,30 @@ class Place:
 
         first = self._gather("UInt32", "first_segment", self.strand)
         end = self._gather("UInt32", "first_segment", self.strand + 1)
-        inside = place_in_segment(
+        inside, _ = self._in_segment
+        whole = mi.Float(self.si.prim_index - first)
+        return dr.minimum((whole + inside) / mi.Float(end - first), 1)
+
+    @cached_property
+    def tangent(self) -> tuple[Any, Any]:
+        """The fibre's direction at the hit, in the plane of the shading frame's x and y."""
+        import drjit as dr
+        import mitsuba as mi
+
+        along = self.si.to_local(mi.Vector3f(self._in_segment[1]))
+        length = dr.rsqrt(along.x * along.x + along.y * along.y + 1e-30)
+        return along.x * length, along.y * length
+
+    @cached_property
+    def _in_segment(self) -> tuple[Any, Any]:
+        import mitsuba as mi
+
+        return place_in_segment(
             mi.Vector3f(self.si.p),
             self.strands["control_points"],
             self._gather("UInt32", "segment_indices", self.si.prim_index),
             self.active,
         )
-        whole = mi.Float(self.si.prim_index - first)
-        return dr.minimum((whole + inside) / mi.Float(end - first), 1)
 
     @cached_property
     def normal(self) -> Any:

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from appearance.bsdf.corrective import rodrigues
 from appearance.bsdf.lobes import evaluate, sample
 from appearance.bsdf.parameters import HairParameters, Place
 
@@ -54,11 +53,11 @@ def plugin() -> Any:
         def sample(
             self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True
         ) -> tuple[Any, Any]:
-            fibre, axis = self._at(si, active)
-            wi = si.wi if axis is None else rodrigues(-axis, si.wi)
+            fibre, frame = self._at(si, active)
+            wi = frame.enter(si.wi)
             wo, pdf, weight = sample(fibre, wi, sample1, sample2.x, sample2.y)
             bs: Any = mi.BSDFSample3f()
-            bs.wo = wo if axis is None else rodrigues(axis, wo)
+            bs.wo = frame.leave(wo)
             bs.pdf = dr.select(active, pdf, 0)
             bs.eta = 1
             bs.sampled_type = +mi.BSDFFlags.Glossy
@@ -72,11 +71,8 @@ def plugin() -> Any:
             return self.eval_pdf(ctx, si, wo, active)[1]
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            fibre, axis = self._at(si, active)
-            wi = si.wi
-            if axis is not None:
-                wi, wo = rodrigues(-axis, wi), rodrigues(-axis, wo)
-            value, pdf = evaluate(fibre, wi, wo)
+            fibre, frame = self._at(si, active)
+            value, pdf = evaluate(fibre, frame.enter(si.wi), frame.enter(wo))
             return dr.select(active, mi.Color3f(value), 0), dr.select(active, pdf, 0)
 
         def to_string(self) -> str:
@@ -84,6 +80,6 @@ def plugin() -> Any:
 
         def _at(self, si: Any, active: Any) -> tuple[Any, Any]:
             place = Place(self.parameters.strands, si, active)
-            return self.parameters.fibre(place), self.parameters.axis(place)
+            return self.parameters.fibre(place), self.parameters.frame(place)
 
     return ExtendedHair

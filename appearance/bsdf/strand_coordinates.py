@@ -125,9 +125,10 @@ def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
 
 
-def place_in_segment(p: Any, control_points: Any, first: Any, active: Any) -> Any:
-    """Parameter in [0, 1] of the point of a cubic B-spline segment that lies nearest to `p`.
+def place_in_segment(p: Any, control_points: Any, first: Any, active: Any) -> tuple[Any, Any]:
+    """Where on a cubic B-spline segment the point nearest to `p` lies, and the tangent there.
 
+    The place is the segment's parameter in [0, 1]; the tangent is in scene units per segment.
     `first` is the segment's first control point, in `control_points` (x, y, z, radius, …). From the
     projection on the chord, two steps of Gauss-Newton.
     """
@@ -135,17 +136,24 @@ def place_in_segment(p: Any, control_points: Any, first: Any, active: Any) -> An
     import mitsuba as mi
 
     c = [dr.gather(mi.Point4f, control_points, first + i, active) for i in range(4)]
-    a, b, d, e = (mi.Vector3f(q.x, q.y, q.z) for q in c)
-    start, end = (a + 4 * b + d) / 6, (b + 4 * d + e) / 6
-    v = _projected(p - start, end - start)
-    for _ in range(2):
+    # relative to p: far from the origin, sums of coordinates would round a tangent away
+    a, b, d, e = (mi.Vector3f(q.x, q.y, q.z) - p for q in c)
+
+    def point(v: Any) -> Any:
         w = 1 - v
-        here = (w**3 * a + (3 * v**3 - 6 * v**2 + 4) * b + (3 * w**3 - 6 * w**2 + 4) * d) / 6
-        here = here + v**3 / 6 * e
-        slope = v**2 * e - w**2 * a + v * (3 * v - 4) * b + (1 + v * (2 - 3 * v)) * d
-        slope = 0.5 * slope
-        v = v + _projected(p - here, slope)
-    return dr.clip(v, 0, 1)
+        inner = (3 * v**3 - 6 * v**2 + 4) * b + (3 * w**3 - 6 * w**2 + 4) * d
+        return (w**3 * a + inner + v**3 * e) / 6
+
+    def tangent(v: Any) -> Any:
+        inner = v * (3 * v - 4) * b + (1 + v * (2 - 3 * v)) * d
+        return 0.5 * (v**2 * e - (1 - v) ** 2 * a + inner)
+
+    start, end = (a + 4 * b + d) / 6, (b + 4 * d + e) / 6
+    v = _projected(-start, end - start)
+    for _ in range(2):
+        v = v + _projected(-point(v), tangent(v))
+    v = dr.clip(v, 0, 1)
+    return v, tangent(v)
 
 
 def _projected(p: Any, direction: Any) -> Any:

@@ -1,5 +1,6 @@
 """The plugin `extended_hair` in Mitsuba: parameters, tables over strands, correctives, renders."""
 
+import math
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from appearance.bsdf import reference
 from appearance.bsdf.measure import Case
 from appearance.bsdf.parameters import Place
+from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import strand_parameters
 from appearance.curves import spline_control_points
 from appearance.hair_appearance import HairAppearance
@@ -213,6 +215,16 @@ def test_lookups_are_exact_among_millions_of_segments():
     got = np.array(bsdf.parameters.fibre(place).sigma_a).T
     assert (got == table[strand]).all()
     assert np.array(place.along) == pytest.approx((segment + inside) / each, abs=1e-6)
+    # strands run along x: a frame whose y is off by 10 degrees, as Mitsuba's may be, is put right
+    for off in (0.0, 0.17):
+        s, c = math.sin(off), math.cos(off)
+        si.sh_frame = mi.Frame3f(
+            mi.Vector3f(-s, -c, 0), mi.Vector3f(c, -s, 0), mi.Vector3f(0, 0, 1)
+        )
+        frame = bsdf.parameters.frame(Place(bsdf.parameters.strands, si, mi.Bool(True)))
+        world = mi.Vector3f(0.36, 0.48, 0.8)
+        assert np.array(frame.enter(si.to_local(world)))[:, 0] == pytest.approx([-0.48, 0.36, 0.8])
+        assert np.array(frame.leave(frame.enter(world)))[:, 0] == pytest.approx([0.36, 0.48, 0.8])
 
 
 def test_every_parameter_may_be_one_per_strand(tuft):
@@ -245,7 +257,7 @@ def test_a_table_that_is_the_same_everywhere_costs_no_lookup(tuft):
     bsdf = hair(sigma_a=same, rotation=mi.TensorXf(np.zeros((5, 4, 3, 2), np.float32)), **curves)
     place = Place(bsdf.parameters.strands, si, si.is_valid())
     assert np.array(bsdf.parameters.fibre(place).sigma_a)[:, 0] == pytest.approx([0.7] * 3)
-    assert bsdf.parameters.axis(place) is None
+    assert bsdf.parameters.frame(place) == ShadingFrame(None, None)
     assert not {"strand", "along", "normal"} & set(vars(place))
     parameters = mi.traverse(bsdf)
     changed = np.full((5, 4, 3, 3), 0.7, np.float32)
