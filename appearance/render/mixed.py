@@ -62,7 +62,7 @@ def render_mixed(
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
     radiance = np.zeros((len(index), 3), np.float32)
     if len(index) and (lights or environments):
-        choice = _choice(scene, camera, lights, weight, index, (max_depth, rr_depth), seed)
+        choice = _choice(scene, camera, lights, weight, index, max_depth, seed)
         radiance = _render(
             scene,
             camera,
@@ -88,21 +88,19 @@ def _choice(
     lights: Sequence[Light],
     weight: NDArray[np.float64],
     index: NDArray[np.int64],
-    depths: tuple[int, int],
+    max_depth: int,
     seed: int,
 ) -> NDArray[np.float64]:
     """Probabilities `(L,)` of asking each lamp; none is 0, so nothing is left out for good."""
     if len(lights) < 2:
         return np.ones(len(lights))
     few = index[:: max(1, len(index) // _PILOT)]
-    depth, rr_depth = depths
     mean = render_olat(
         scene,
         camera,
         lights,
         spp=4,
-        max_depth=depth,
-        rr_depth=rr_depth,
+        max_depth=max_depth,
         seed=seed + _PILOT_STREAM,
         pixels=few,
         thrift=0,
