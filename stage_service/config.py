@@ -163,7 +163,7 @@ class LinkCamerasConfig(Strict):
     busy_s: Seconds = 60.0
     readout_s: float = Field(default=0.02, ge=0.0)
     bytes_per_s: float = Field(default=100e6, gt=0.0)
-    buffers: int = Field(default=64, ge=1)
+    buffers: int = Field(default=64, ge=1, le=4096)
 
 
 class BaslerConfig(Strict):
@@ -190,7 +190,7 @@ class BaslerConfig(Strict):
     frame_s: Seconds = 0.5
     readout_s: float = Field(default=0.02, ge=0.0)
     bytes_per_s: float = Field(default=100e6, gt=0.0)
-    buffers: int = Field(default=16, ge=1)
+    buffers: int = Field(default=16, ge=1, le=4096)
 
     @field_validator("serials")
     @classmethod

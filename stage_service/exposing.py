@@ -63,7 +63,8 @@ class Exposing:
         with spent.on("exposure"):
             self._sleep(step.exposure)
         with spent.on("lights"):
-            self._check_lit(step)
+            self._check_lamps(step)
+            self._check_projectors(step)
             self.dark(step)
         return pulse
 
@@ -99,7 +100,7 @@ class Exposing:
             assert step.row is not None
             projectors.line(step.projector, step.row, step.level)
 
-    def _check_lit(self, step: Step) -> None:
+    def _check_lamps(self, step: Step) -> None:
         """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
         lights = self._stage.lights
         if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
@@ -112,6 +113,19 @@ class Exposing:
                 expected=f"{expected} lamps lit",
                 received=f"{lit} lit",
                 todo="Watchdog, interlock or emergency stop put them off: clear the cause.",
+            )
+
+    def _check_projectors(self, step: Step) -> None:
+        """The same for projectors, which go dark when nobody feeds their watchdog."""
+        beams = self._stage.projectors
+        projected = step.kind in ("scanline", "tracking")
+        if projected and beams is not None and beams.capabilities.reads_back and beams.is_dark():
+            raise DeviceError(
+                beams.name,
+                f"looking after the exposure of step {step.index}",
+                expected="the row shown",
+                received="darkness",
+                todo="Its watchdog put it dark, or it lost power: check its cable.",
             )
 
     def _sleep(self, seconds: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -23,7 +24,8 @@ def told() -> Iterator[Callable[[str, str, str, int, str | None], None]]:
     rows: list[str] = []
 
     def add(fault: str, stepping: str, outcome: str, missing: int, error: str | None) -> None:
-        text = (error or "").replace("|", "\\|").replace("\n", " ")
+        text = re.sub(r"/\S*/(small\d+|state)/|:\d{5}\b", "", error or "")
+        text = text.replace("|", "\\|").replace("\n", " ")
         rows.append(f"| {fault} | {stepping} | {outcome} | {missing} | {text} |\n")
 
     yield add

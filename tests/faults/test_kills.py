@@ -28,7 +28,7 @@ STAGES = [
     ("a lamp lit", "after stage_service.exposing:Exposing._light", 6, "software"),
     ("all lamps lit", "after stage_service.exposing:Exposing._light", 2, "software"),
     ("a scanline shown", "after stage_service.exposing:Exposing._light", 15, "software"),
-    ("after a pulse", "stage_service.exposing:Exposing._check_lit", 5, "software"),
+    ("after a pulse", "stage_service.exposing:Exposing._check_lamps", 5, "software"),
     ("reading frames", "stage_service.sequencer:Sequencer._account", 9, "software"),
     ("storing a frame", "reconstruction.durable_files:_write", 9, "software"),
     ("after storing frames", "reconstruction.capture_writer:CaptureWriter.commit", 4, "software"),

@@ -33,6 +33,8 @@ class Case:
     error: str = ""
     missing: int = 0
     stepping: tuple[str, ...] = ("software", "hardware")
+    links: tuple[str, ...] = ("Modbus TCP",)
+    dark: bool = True
 
 
 def case(name: str, device: str, kind: str, outcome: str, error: str = "", **more: Any) -> Case:
@@ -206,16 +208,44 @@ CASES = [
         missing=1,
         stepping=SOFTWARE,
     ),
-    case("light bank: hangs", "lights", "hang", "failed", "light bank.*within 0.3 s"),
 ]
 
 
+BOTH = ("Modbus TCP", "Modbus RTU")
+SELECT = {"request": "6 1000", "stepping": SOFTWARE, "links": BOTH}
+CASES += [
+    case("light bank: hangs", "lights", "hang", "failed", "light bank.*within 0.3 s", links=BOTH),
+    case("light bank: timeout", "lights", "silent", "failed", "light bank.*within 0.3 s", **SELECT),
+    case("light bank: exception reply", "lights", "nak", "failed", "light bank.*exception",
+         **SELECT),
+    case("light bank: garbage in a reply", "lights", "garbage", "failed", "light bank", **SELECT),
+    case("light bank: late reply", "lights", "late", "failed", "light bank.*within 0.3 s",
+         seconds=0.45, **SELECT),
+    case("light bank: wrong echo", "lights", "echo", "failed", "light bank.*answer", **SELECT),
+    case("light bank: CRC error", "lights", "crc", "failed", "light bank",
+         **{**SELECT, "links": ("Modbus RTU",)}),
+    case("light bank: unplugged and plugged in again", "lights", "unplug", "failed", "light bank",
+         seconds=0.4, **SELECT),
+    case("light bank: reports no lamp lit", "lights", "lies", "failed", "light bank.*0 lit",
+         stepping=SOFTWARE, links=BOTH),
+    case("light bank: a lamp cannot be put off", "lights", "stuck", "failed", "unknown, unsafe",
+         stepping=SOFTWARE, links=BOTH, dark=False),
+]  # fmt: skip
+RTU = '[devices.lights]\nkind = "modbus_rtu"\nport = "lights"'
+
+
 @pytest.mark.parametrize(
-    ("one", "stepping"),
-    [pytest.param(c, s, id=f"{c.name}, {s}") for c in CASES for s in c.stepping],
+    ("one", "stepping", "link"),
+    [
+        pytest.param(c, s, k, id=f"{c.name}, {s}, {k}")
+        for c in CASES
+        for s in c.stepping
+        for k in c.links
+    ],
 )
-def test_a_fault_on_the_wire(one, stepping, simulated, tmp_path, told):
-    rig_file, world = simulated(*one.faults)
+def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, tmp_path, told):
+    rig = small_rig if link == "Modbus TCP" else small_rig.replace("[devices.lights]", RTU)
+    rig_file, world = simulated(*one.faults, rig=rig)
     plan = CapturePlan(lights=LIGHTS, stepping=stepping)
     steps = plan.steps(rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
@@ -223,7 +253,7 @@ def test_a_fault_on_the_wire(one, stepping, simulated, tmp_path, told):
     run.run()
     assert run.outcome == one.outcome, run.error
     until = time.monotonic() + rig_file.devices.watchdog_s + 1.0
-    while world.lamps.power().any() or world.projectors.show.level:
+    while one.dark and (world.lamps.power().any() or world.projectors.show.level):
         assert time.monotonic() < until, "still lit"
     capture = Capture(tmp_path / "c")
     check_frames(capture)
@@ -237,7 +267,8 @@ def test_a_fault_on_the_wire(one, stepping, simulated, tmp_path, told):
     else:
         assert run.error is None
         assert len(capture.records) == len(steps) * 2
-    told(one.name, stepping, run.outcome, missing, run.error)
+    name = one.name if len(one.links) == 1 else f"{one.name} ({link})"
+    told(name, stepping, run.outcome, missing, run.error)
 
 
 def check_frames(capture: Capture) -> None:

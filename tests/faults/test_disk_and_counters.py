@@ -1,0 +1,69 @@
+"""A disk without room and block ids that begin again, in the middle of a capture."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+import simulators.world
+import stage_service.devices.cameras.link
+from reconstruction.capture_verify import verify
+from reconstruction.capture_writer import CaptureWriter
+from stage_service.devices.stage import Stage
+from stage_service.plan import CapturePlan
+from stage_service.sequencer import Sequencer
+
+STEPPING = pytest.mark.parametrize("stepping", ["software", "hardware"])
+
+
+@STEPPING
+def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monkeypatch):
+    """65535 frames take long: a camera that wraps at 21, and a driver that knows it."""
+    monkeypatch.setattr(stage_service.devices.cameras.link, "BLOCK_WRAP", 21)
+    monkeypatch.setattr(simulators.world, "BLOCK_IDS", 21)
+    rig_file, world = simulated(
+        rig=small_rig.replace("[devices.cameras]", "[devices.cameras]\nbuffers = 16")
+    )
+    plan = CapturePlan(stepping=stepping)
+    steps = plan.steps(rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
+    run = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, steps)[0])
+    assert run.run() == "completed", run.error
+    assert verify(tmp_path / "c") == []
+    assert world.pulses == len(steps) > 2 * 21
+    assert max(r.block_id for r in writer.records.values()) == 21
+    told("camera: wrapped block ids", stepping, "completed", 0, None)
+
+
+@STEPPING
+def test_a_full_disk(stepping, simulated, tmp_path, told):
+    rig_file, world = simulated()
+    plan = CapturePlan(stepping=stepping)
+    steps = plan.steps(rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
+    filled = []
+
+    def notify(kind: str, data: dict[str, object]) -> None:
+        if kind == "capture.step" and data["steps_done"] == 1:
+            filled.append(writer.counts()[0])
+            # As if another program had taken what was left.
+            writer.reserve = 2 * shutil.disk_usage(tmp_path).total
+
+    runs = plan.runs(rig_file, steps)[0]
+    if stepping == "hardware":
+        writer.reserve = 2 * shutil.disk_usage(tmp_path).total
+    run = Sequencer(Stage.of(rig_file), writer, runs=runs, notify=notify)
+    assert run.run() == "failed"
+    assert "bytes are needed and a reserve" in str(run.error)
+    assert not world.lamps.power().any()
+    assert not world.projectors.show.level
+    (outcome, never) = verify(tmp_path / "c")
+    assert "outcome is 'failed'" in outcome
+    assert "never shot" in never
+    told("disk: no room left", stepping, "failed", 0, run.error)
+
+    again = CaptureWriter.reopen(tmp_path / "c")
+    run = Sequencer(Stage.of(rig_file), again, runs=runs)
+    assert run.run() == "completed", run.error
+    assert verify(tmp_path / "c") == []
