@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from appearance.longitudinal import LEAST_COLOUR
+
 EUMELANIN = (0.419, 0.697, 1.37)
 """Absorption of black-brown pigment per unit of concentration (d'Eon et al. 2011), linear RGB."""
 PHEOMELANIN = (0.187, 0.4, 1.05)
 """Absorption of red-yellow pigment per unit of concentration (d'Eon et al. 2011), linear RGB."""
-LEAST_COLOUR = 1e-6
-"""Albedo below which a channel counts as black."""
 
 
 def of_melanin(eumelanin: Any, pheomelanin: Any) -> tuple[Any, Any, Any]:

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, i0e
+from scipy.special import expit
+
+from appearance.longitudinal import longitudinal, variance_of_roughness
 
 Array = NDArray[np.float64]
 LOBES = 4
@@ -40,8 +42,7 @@ def direction(theta: ArrayLike, gamma: ArrayLike) -> Array:
 
 def variance(p: int, beta_m: ArrayLike) -> Array:
     """v of lobe `p`: Chiang's map of the longitudinal roughness, a quarter for TT, four for TRT."""
-    b = np.asarray(beta_m, float)
-    return np.asarray((1, 0.25, 4, 4)[p] * (0.726 * b + 0.812 * b**2 + 3.7 * b**20) ** 2)
+    return np.asarray((1, 0.25, 4, 4)[p] * variance_of_roughness(beta_m))
 
 
 def logistic_scale(beta_n: ArrayLike) -> Array:
@@ -59,12 +60,9 @@ def tilted(p: int, theta: ArrayLike, tilt: ArrayLike) -> Array:
 def m_p(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
     """M_p: the longitudinal lobe (d'Eon 2011, eq. 7), of unit integral over cos(theta_o) dtheta_o.
 
-    The printed exponent (c - s - 1)/v is -2 sin²((theta_i + theta_o)/2)/v.
+    `appearance.longitudinal` has it, and is tested against arbitrary precision.
     """
-    theta_i, theta_o, v = (np.asarray(a, float) for a in (theta_i, theta_o, v))
-    c = np.abs(np.cos(theta_i) * np.cos(theta_o))
-    exponent = -2 * np.sin(0.5 * (theta_i + theta_o)) ** 2 / v
-    return np.asarray(i0e(c / v) * np.exp(exponent) / (-v * np.expm1(-2 / v)))
+    return longitudinal(theta_i, theta_o, v)
 
 
 def refracted_azimuth(theta: ArrayLike, gamma: ArrayLike, eta: ArrayLike) -> Array:
