@@ -211,7 +211,8 @@ def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut
     weights /= weights.sum()
     total = np.zeros(1)
     for k, weight in zip(nearest, weights, strict=True):
-        gain = light.intensity / np.maximum(others[k].intensity, 1e-12)
+        here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
+        gain = here / np.maximum(there, 1e-12)
         gain *= (distance[k] / own) ** 2
         total = total + weight * gain * capture.light(others[k].name, camera)[0]
     return np.asarray(total)

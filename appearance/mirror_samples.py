@@ -84,10 +84,11 @@ def mirror_samples(
         observed, fibres, tilt_deg, least_share, most_spread
     )
     light, pixel = np.nonzero(near)
-    intensity = np.array([lamp.intensity[channel] for lamp in observed.lights])
-    tangent = fibres.tangent[pixel].astype(float)
-    value = observed.radiance[light, pixel, channel] * squared[light, pixel] / intensity[light]
     middle = _middle(fibres)
+    shines = np.array([lamp.intensity_towards(middle)[:, channel] for lamp in observed.lights])
+    tangent = fibres.tangent[pixel].astype(float)
+    intensity = np.maximum(shines[light, pixel], 1e-12)
+    value = observed.radiance[light, pixel, channel] * squared[light, pixel] / intensity
     to_camera = _unit(observed.camera.center - middle)
     theta_o = _angle(np.einsum("pi,pki->pk", to_camera, fibres.tangent)) + 2 * np.radians(tilt_deg)
     return MirrorSamples(

@@ -196,7 +196,8 @@ def light_contrast(
     if len(names) < 8:
         return None
     names = names[:: max(1, len(names) // lights)]
-    power = np.array([max(capture.rig.light(n).intensity.mean(), 1e-12) for n in names])
+    lamps = [capture.rig.light(n).intensity_towards(np.zeros(3)) for n in names]
+    power = np.array([max(intensity.mean(), 1e-12) for intensity in lamps])
     values = capture.olat(camera, names).mean(axis=-1) / power[:, None, None]
     mean = np.maximum(values.mean(axis=0), 0)
     ratio = np.divide(values.std(axis=0), mean, out=np.ones_like(mean), where=mean > 0)

@@ -80,8 +80,8 @@ def observe(
     away = np.stack([light.position for light in lights])[None] - points[index][:, None]
     square = (away**2).sum(axis=2)
     to_light = (away / np.sqrt(square)[..., None]).astype(np.float32)
-    strength = np.array([max(float(light.intensity.mean()), 1e-30) for light in lights])
-    response = np.maximum(olat[:, y, x].T, 0) * square / strength
+    strength = np.stack([x.intensity_towards(points[index]).mean(axis=-1) for x in lights], axis=1)
+    response = np.maximum(olat[:, y, x].T, 0) * square / np.maximum(strength, 1e-30)
     facing = np.einsum("pld,pd->pl", to_light, normals[index].astype(np.float32))
     front = facing > _GRAZING
     mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)
