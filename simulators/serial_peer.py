@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import select
 import threading
-import tty
 from collections.abc import Callable
 from pathlib import Path
 
 from simulators.faults import Fault
+from simulators.terminal import Terminal
 
 _LONGEST_LINE = 96
 _NOISE = b"\xff\x00\x1b[A~~\n"
@@ -43,46 +41,24 @@ class SerialPeer:
         self.link = link
         self._reply = reply
         self._strikes = strikes
-        self._near, self._far = _terminal()
-        self._wake_read, self._wake_write = os.pipe()
+        self._terminal = Terminal(link)
         self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
-
-    @property
-    def path(self) -> str:
-        """The device path behind the link."""
-        return os.ttyname(self._far)
 
     def start(self) -> None:
         """Make the link and answer from now on."""
-        self._make_link()
+        self._terminal.make_link()
         self._thread.start()
 
     def stop(self) -> None:
         """Remove the link and close the terminal."""
-        os.write(self._wake_write, b"x")
+        self._terminal.wake()
         self._thread.join()
-        self._remove_link()
-        for end in (self._near, self._far, self._wake_read, self._wake_write):
-            os.close(end)
-
-    def _make_link(self) -> None:
-        fresh = self.link.with_name(self.link.name + ".new")
-        fresh.unlink(missing_ok=True)
-        fresh.symlink_to(self.path)
-        fresh.replace(self.link)
-
-    def _remove_link(self) -> None:
-        if self.link.is_symlink() and str(self.link.readlink()) == self.path:
-            self.link.unlink()
+        self._terminal.close()
 
     def _run(self) -> None:
         pending = b""
-        while True:
-            ready, _, _ = select.select([self._near, self._wake_read], [], [])
-            if self._wake_read in ready:
-                return
-            pending += os.read(self._near, 4096)
-            *lines, pending = pending.split(b"\n")
+        while (data := self._terminal.receive()) is not None:
+            *lines, pending = (pending + data).split(b"\n")
             # Of a line that is too long the tail must not pass for a request.
             pending = pending[: _LONGEST_LINE + 1]
             for line in lines:
@@ -96,14 +72,15 @@ class SerialPeer:
         fault = self._strikes(text)
         kind = None if fault is None else fault.kind
         if fault is not None and kind == "unplug":
-            return self._unplug(fault.seconds)
+            self._terminal.unplug(fault.seconds)
+            return False
         answer = f"ERR {NOT_NOW} busy" if kind == "nak" else self._answer(line)
-        if fault is not None and kind == "late" and self._stops_within(fault.seconds):
+        if fault is not None and kind == "late" and self._terminal.stops_within(fault.seconds):
             return False
         if kind == "garbage":
             answer = f"{answer[0]}\x7f{answer[2:]}"
         if kind != "silent":
-            os.write(self._near, (_NOISE if kind == "noise" else b"") + answer.encode() + b"\n")
+            self._terminal.send((_NOISE if kind == "noise" else b"") + answer.encode() + b"\n")
         return True
 
     def _answer(self, line: bytes) -> str:
@@ -115,28 +92,6 @@ class SerialPeer:
             return f"ERR {UNKNOWN} not ASCII"
         except Refusal as refusal:
             return f"ERR {refusal.code} {refusal}"
-
-    def _unplug(self, seconds: float) -> bool:
-        """Close the terminal and make another one later; False, as the request is lost."""
-        self._remove_link()
-        os.close(self._near)
-        os.close(self._far)
-        gone = self._stops_within(seconds)
-        self._near, self._far = _terminal()
-        if not gone:
-            self._make_link()
-        return False
-
-    def _stops_within(self, seconds: float) -> bool:
-        ready, _, _ = select.select([self._wake_read], [], [], seconds)
-        return bool(ready)
-
-
-def _terminal() -> tuple[int, int]:
-    """Both ends. The far one stays open here, or the near one would fail between two clients."""
-    near, far = os.openpty()
-    tty.setraw(far)
-    return near, far
 
 
 def whole(text: str, low: int, high: int, what: str) -> int:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from stage_service.config import RigFile, load_rig_file
-from stage_service.devices.errors import DeviceError
 from stage_service.devices.stage import Stage
 from stage_service.safety import blackout
 
@@ -88,27 +87,6 @@ def stage(request: pytest.FixtureRequest) -> Iterator[Stage]:
     one.close()
 
 
-def test_light_bank(stage):
-    lights = stage.lights
-    lights.set_watchdog(60.0)
-    assert lights.count == 200
-    lights.select(0)
-    assert lights.status().lit == 1
-    lights.select(199)
-    assert lights.status().lit == 1
-    lights.all_on()
-    assert lights.status().lit == 200
-    lights.heartbeat()
-    lights.set_level(0.25)
-    lights.set_level(1.0)
-    lights.off()
-    status = lights.status()
-    assert (status.lit, status.watchdog_tripped, status.estop_pressed) == (0, False, False)
-    with pytest.raises(DeviceError, match="Modbus exception 3"):
-        lights.set_watchdog(0.05)
-    lights.select(5)
-
-
 def test_camera(stage):
     camera, trigger = stage.cameras[0], stage.trigger
     stage.lights.off()
@@ -144,20 +122,3 @@ def test_blackout_is_read_back(stage):
     assert blackout(stage).safe
     assert stage.lights.status().lit == 0
     assert stage.projectors.is_dark()
-
-
-def test_the_simulated_bank_goes_dark_when_the_heartbeat_stops(simulators):
-    stage = Stage.of(simulators)
-    stage.lights.connect()
-    stage.lights.set_watchdog(0.1)
-    stage.lights.all_on()
-    deadline = time.monotonic() + 5
-    while stage.lights.status().lit:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert stage.lights.status().watchdog_tripped
-    stage.lights.heartbeat()
-    status = stage.lights.status()
-    assert (status.watchdog_tripped, status.lit) == (False, 0)
-    stage.lights.set_watchdog(2.0)
-    stage.close()

@@ -104,8 +104,13 @@ class ModbusLightBank:
             self._armed = 0
 
     def set_level(self, level: float) -> None:
-        """Set every lamp's level in chunks, unless it is set already."""
+        """Set every lamp's level in chunks, unless it is set already.
+
+        A bank without level registers has its lamps at 1.
+        """
         doing = f"setting the level to {level:g}"
+        if self._map.levels is None and level == 1.0:
+            return
         first = self._required(self._map.levels, doing, "level registers")
         value = self._level_word(level)
         with self._lock:

@@ -1,0 +1,60 @@
+"""Whole captures over the wires that have less than Modbus TCP, from rig file to frames."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import TypeAdapter
+
+from reconstruction.capture import Capture
+from reconstruction.capture_writer import CaptureWriter
+from stage_service.config import LightBankConfig
+from stage_service.devices.stage import Stage
+from stage_service.plan import CapturePlan
+from stage_service.sequencer import Sequencer
+
+WIRE_PAGE = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
+DMX = """[devices.lights]
+kind = "dmx_enttec"
+port = "lights"
+accept_unverified_blackout = true
+settle_s = 0.0"""
+COILS_ALONE = """[devices.lights.registers]
+levels = "none"
+selector = "none"
+heartbeat = "none"
+sequence = "none"
+lit = "none"
+signature = "none"
+[devices.lights]
+kind = "modbus_rtu"
+port = "lights"
+baud = 38400
+accept_unverified_blackout = true"""
+
+
+@pytest.mark.parametrize("wire", [DMX, COILS_ALONE], ids=["DMX", "coils alone"])
+def test_a_capture_over_a_bank_without_read_back(wire, simulated, small_rig, tmp_path):
+    rig = small_rig.replace("[devices.lights]", wire) + "[capture.level]\nall_on = 1.0\n"
+    rig_file, world = simulated(rig=rig)
+    plan = CapturePlan(lights=("light_003", "light_004"), stepping="software")
+    steps = plan.steps(rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
+    stage = Stage.of(rig_file)
+    run = Sequencer(stage, writer, runs=plan.runs(rig_file, steps)[0])
+    run.run()
+    assert run.outcome == "completed", run.error
+    assert not world.lamps.power().any()
+    capture = Capture(tmp_path / "c")
+    lit = {s.light: capture.frame(s, "cam_a").mean() for s in capture.steps if s.light}
+    assert lit == pytest.approx({"light_003": 0.4, "light_004": 0.5}, abs=0.045)
+
+
+def test_the_examples_of_the_wire_page_are_read():
+    examples = re.findall(r"```toml\n(.*?)```", WIRE_PAGE.read_text(), re.DOTALL)
+    tables = [tomllib.loads(e)["devices"]["lights"] for e in examples if "devices.lights" in e]
+    read = [TypeAdapter(LightBankConfig).validate_python(table) for table in tables]
+    assert {r.kind for r in read} == {"modbus_tcp", "modbus_rtu", "dmx_enttec"}
