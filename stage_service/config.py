@@ -108,14 +108,13 @@ class ModbusRtuConfig(_LightBank):
 class DmxConfig(_LightBank):
     """`[devices.lights]`: lamps on DMX channels `first_channel` … through an Enttec USB Pro.
 
-    A new level waits for the frame that is under way and then takes a frame itself: 50 ms at the
-    widget's 40 frames a second. `settle_s` covers them, or the pulse sees the lamps of before.
+    A command is over when the frame under way and its own are out: 50 ms at the widget's 40 frames
+    a second.
     """
 
     kind: Literal["dmx_enttec"]
     port: str = Field(min_length=1)
     first_channel: int = Field(default=1, ge=1, le=512)
-    settle_s: float = Field(default=0.06, ge=0.0, le=1.0)
 
 
 def _modbus_tcp_by_default(table: Any) -> Any:
