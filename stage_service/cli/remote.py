@@ -33,6 +33,7 @@ def add(commands: Commands) -> None:
     capture = add_group(commands, "capture", "make and steer captures on a running service")
     check = _remote(capture, "check", run_check, "cost a plan without lighting a lamp")
     start = _remote(capture, "start", run_start, "begin a capture")
+    check.add_argument("--rig", type=Path, help="ask this rig file, not a service")
     for parser in (check, start):
         parser.add_argument("--plan", type=Path, help="plan as JSON; without it, everything")
     start.add_argument("--head", type=Path, help="the digitised head (.obj)")
@@ -81,9 +82,37 @@ def add(commands: Commands) -> None:
 
 
 def run_check(args: argparse.Namespace, output: Output, service: Service) -> int:
-    """Cost a plan."""
-    output.result(service.post("/plans:validate", _read_json(args.plan)))
+    """Cost a plan; with a rig file, without a service or a device."""
+    if args.rig is not None:
+        from stage_service.config import load_rig_file
+        from stage_service.plan import CapturePlan
+
+        plan = CapturePlan.model_validate(_read_json(args.plan))
+        cost = plan.cost(load_rig_file(args.rig)).model_dump(mode="json")
+    else:
+        cost = service.post("/plans:validate", _read_json(args.plan))
+    output.result(cost, _costed(cost))
     return 0
+
+
+def _costed(cost: dict[str, Any]) -> str:
+    """A plan's cost, for people."""
+    flash = cost["flash"]
+    kinds = ", ".join(f"{n} {kind}" for kind, n in cost["frames_by_kind"].items())
+    causes = ", ".join(f"{c} {s:.1f}" for c, s in cost["seconds_by_cause"].items() if s)
+    lines = [
+        f"{cost['steps']} steps, {cost['frames']} frames ({kinds}), {cost['bytes'] / 1e9:.1f} GB",
+        f"{cost['seconds']:.1f} s: {causes}; limited by {cost['limited_by']}",
+        cost["stepping_why"]
+        if cost["stepping"]["hardware"]
+        else f"the service clocks every step: {cost['stepping_why']}",
+        f"flashes at {flash['hz']:.1f} Hz ({flash['band']})"
+        + (": needs consent, or rate_hz; see docs/safety.md" if flash["needs_consent"] else ""),
+        f"light: {cost['lamp_seconds']:.1f} lamp seconds, "
+        f"{', '.join(f'{d:.3g}' for d in cost['dose'])} J/m² (R, G, B) at the head",
+    ]
+    lines += [f"left out: {x['what']}: {x['why']}" for x in cost["left_out"]]
+    return "\n".join(lines)
 
 
 def run_start(args: argparse.Namespace, output: Output, service: Service) -> int:

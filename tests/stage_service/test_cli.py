@@ -243,3 +243,18 @@ def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path)
     with pytest.raises(CommandError, match=r"bad: ended with exit code 1; .*no such camera"):
         command()
     assert not alive(pids[0])
+
+
+def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
+    words = ("capture", "check", "--rig", RIGS / "stage331.toml")
+    code, cost = run(capsys, *words)
+    assert (code, cost["frames"]) == (0, 50 * (331 + 3 * (768 + 76) + 4))
+    assert main([*map(str, words)]) == 0
+    told = capsys.readouterr().out
+    assert "limited by link" in told
+    assert "the trigger box clocks 2867 of 2867 steps" in told
+    assert "needs consent, or rate_hz" in told
+    plan = tmp_path / "plan.json"
+    plan.write_text('{"lights": ["lamp"]}')
+    code, data = run(capsys, *words, "--plan", plan)
+    assert (code, "'lamp'" in data["error"]["detail"]) == (3, True)
