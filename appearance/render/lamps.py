@@ -209,6 +209,7 @@ def _interval(nodes: Any, count: int, x: Any) -> tuple[Any, Any, Any]:
 
 
 def _floats(values: ArrayLike) -> Any:
+    """`values` in Dr.Jit's own memory: kernels are compiled anew for each alignment of NumPy's."""
     import mitsuba as mi
 
-    return mi.Float(np.asarray(values, np.float32).ravel())
+    return mi.Float(np.asarray(values, np.float32).ravel().tolist())
