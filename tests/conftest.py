@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +23,9 @@ from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
 
 CHECKOUT = Path(__file__).resolve().parents[1]
+
+# What runs in the background starts with Ctrl-C ignored, and so would the processes of the tests.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -75,10 +75,13 @@ def test_a_whole_capture_clocked_by_the_box(simulated, tmp_path):
     assert manifest["sentinels_unclear"] == {}
 
 
-def test_a_dropped_frame_is_shot_again_by_itself(simulated, tmp_path):
-    rig_file, _world = simulated(Fault("camera", "drop", 7, "cam_b"))
+def test_a_dropped_frame_is_shot_again_by_itself(simulated, small_rig, tmp_path):
+    # Far enough apart for a busy machine's clock to tell the pulses from each other.
+    rig = small_rig.replace("readout_s = 0.001", "readout_s = 0.15")
+    rig_file, _world = simulated(Fault("camera", "drop", 7, "cam_b"), rig=rig)
     heard: list[Any] = []
-    run = sequencer(rig_file, tmp_path / "c", heard, projectors=())
+    lights = tuple(f"light_{i:03d}" for i in range(8))
+    run = sequencer(rig_file, tmp_path / "c", heard, projectors=(), lights=lights)
     assert run.run() == "completed"
     capture = check_frames(tmp_path / "c")
     again = {k for k, r in capture.records.items() if r.pulse > len(capture.steps)}
