@@ -13,7 +13,7 @@ import numpy as np
 from appearance.hair_appearance import HairAppearance
 from reconstruction.mesh import Mesh, read_obj
 from reconstruction.rig import Rig
-from reconstruction.strand_files import read_strands
+from reconstruction.strand_files import READABLE, read_strands
 from reconstruction.strands import Strands
 from simulators.grooms import GROOMS, covering_radius, grow
 from simulators.head import hair_field, head_mesh
@@ -68,7 +68,7 @@ def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subjec
     if name not in GROOMS:
         raise SubjectError(
             f"no subject called {name!r}: choose one of {', '.join(GROOMS)}, or give a strand file "
-            "(.npz, .hair, .tfx, .usda, .usdc, .usd)"
+            f"({', '.join(READABLE)})"
         )
     head = head_mesh()
     # The three grooms of one seed are three heads of hair, not one with three settings.

@@ -1,4 +1,5 @@
-"""Strand files in and out: `.npz`, cyHair `.hair`, TressFX `.tfx` (in), USD curves.
+"""Strand files in and out: `.npz`, cyHair `.hair`, USD curves; TressFX `.tfx` and USC `.data` in;
+Alembic curves out.
 
     strands = read_strands("groom.hair")
     write_strands("groom.usdc", strands)
@@ -16,9 +17,11 @@ from typing import Literal
 
 import numpy as np
 
+from reconstruction.strand_files.alembic import write_abc
 from reconstruction.strand_files.cyhair import read_hair, write_hair
 from reconstruction.strand_files.errors import StrandFileError
 from reconstruction.strand_files.npz import read_npz, write_npz
+from reconstruction.strand_files.photobooth import read_data
 from reconstruction.strand_files.tressfx import read_tfx
 from reconstruction.strand_files.usd import read_usd, write_usd
 from reconstruction.strands import Strands
@@ -29,6 +32,7 @@ _READERS: dict[str, Callable[[Path], Strands]] = {
     ".npz": read_npz,
     ".hair": read_hair,
     ".tfx": read_tfx,
+    ".data": read_data,
     ".usd": read_usd,
     ".usda": read_usd,
     ".usdc": read_usd,
@@ -39,6 +43,7 @@ _WRITERS: dict[str, Callable[[Path, Strands], None]] = {
     ".usd": write_usd,
     ".usda": write_usd,
     ".usdc": write_usd,
+    ".abc": write_abc,
 }
 READABLE = tuple(_READERS)
 WRITABLE = tuple(_WRITERS)
@@ -49,9 +54,9 @@ _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
     """Read strands from a file of any of the formats `READABLE`, root first.
 
-    `.npz`, `.hair` and `.tfx` do not say which way is up or what their unit is: they are read as
-    metres, and `up_axis="y"` turns a y-up file so that z is up ((x, y, z) becomes (x, -z, y)). USD
-    does say, and comes out in metres with z up whatever `up_axis` is.
+    Only USD says which way is up and what its unit is, and comes out in metres with z up whatever
+    `up_axis` is. The others are read as metres, and `up_axis="y"` turns a y-up file so that z is up
+    ((x, y, z) becomes (x, -z, y)).
 
     Raises `StrandFileError` (a `ValueError`) naming the file and what is wrong with it.
     """
@@ -74,6 +79,7 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
 def write_strands(path: str | Path, strands: Strands) -> None:
     """Write strands in the format that the suffix names (one of `WRITABLE`), in metres, z up.
 
+    Alembic alone is y up, as is its custom, and needs the extra `alembic`.
     Written under a temporary name, flushed and renamed: afterwards the file is whole or not there.
     Raises `StrandFileError` when the format is unknown or cannot hold these strands.
     """

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.durable_files import replace_durably
-from reconstruction.strand_files.errors import StrandFileError, strands_of
+from reconstruction.strand_files.errors import StrandFileError, require_finite, strands_of
 from reconstruction.strands import Strands
 
 HEADER = struct.Struct("<4s4I5f88s")
@@ -65,7 +65,9 @@ def read_hair(path: Path) -> Strands:
                 f"{path}: the segments make {segments.sum() + strands} points, "
                 f"the header says {points}"
             )
+        start = file.tell()
         xyz = np.frombuffer(file.read(12 * points), "<f4").reshape(-1, 3)
+        require_finite(path, xyz, range(start, start + 12 * points, 12))
         width = np.full(points, thickness, np.float32)
         if flags & THICKNESS:
             width = np.frombuffer(file.read(4 * points), "<f4")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.strands import Strands
@@ -22,3 +23,16 @@ def strands_of(
         return Strands(points, offsets, radius)
     except (ValueError, TypeError, OverflowError) as error:
         raise StrandFileError(f"{path}: {error}") from error
+
+
+def require_finite(path: Path, points: NDArray[Any], byte_of: NDArray[np.int64] | range) -> None:
+    """Raise `StrandFileError` where one of `points (N, 3)` is not finite.
+
+    `byte_of (N,)` says where in the file each point begins.
+    """
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise StrandFileError(
+            f"{path}: byte {byte_of[bad[0]]}: expected a finite position, got "
+            f"{points[bad[0]].tolist()}; {len(bad)} of {len(points)} points are not finite"
+        )

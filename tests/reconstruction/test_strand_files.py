@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,8 @@ from reconstruction.strand_files import (
     write_strands,
 )
 from reconstruction.strands import Strands
+
+BOTH_WAYS = [suffix for suffix in WRITABLE if suffix in READABLE]
 
 metres = st.floats(-2, 2, width=32)
 radii = st.floats(2**-17, 2**-10, width=32)
@@ -41,7 +44,7 @@ def two() -> Strands:
     return Strands.from_list([line, line[:2] + 0.1], radius=2e-4)
 
 
-@pytest.mark.parametrize("suffix", WRITABLE)
+@pytest.mark.parametrize("suffix", BOTH_WAYS)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
 @given(strands=some_strands())
 def test_read_back(suffix: str, strands: Strands, tmp_path: Path) -> None:
@@ -64,7 +67,7 @@ def test_a_scalar_radius_stays_a_scalar(suffix: str, two: Strands, tmp_path: Pat
     assert radius == pytest.approx(2e-4, rel=1e-6)
 
 
-@pytest.mark.parametrize("suffix", WRITABLE)
+@pytest.mark.parametrize("suffix", BOTH_WAYS)
 def test_cut_files_are_errors_that_name_the_file(suffix: str, two: Strands, tmp_path: Path) -> None:
     path = tmp_path / f"hair{suffix}"
     write_strands(path, two)
@@ -138,7 +141,7 @@ def test_hair_with_every_array_and_an_empty_strand(tmp_path: Path) -> None:
         ({"strands": 4_000_000_000, "points": 4_000_000_000}, "need .* bytes, the file has"),
         ({"strands": 3}, "do not make"),
         ({"flags": 3, "body": b"\x07\0\x07\0" + bytes(72)}, "the segments make"),
-        ({"body": np.full(18, np.nan, "<f4").tobytes()}, "finite"),
+        ({"body": np.full(18, np.nan, "<f4").tobytes()}, "byte 128: expected a finite position"),
     ],
 )
 def test_lying_hair_headers(bad: dict[str, object], words: str, tmp_path: Path) -> None:
@@ -154,36 +157,155 @@ def test_hair_cannot_hold_endless_strands(tmp_path: Path) -> None:
         write_strands(tmp_path / "x.hair", long)
 
 
-def tfx_bytes(version: float = 4, strands: int = 2, vertices: int = 3, start: int = 160) -> bytes:
-    xyzw = np.arange(24, dtype="<f4")
-    return struct.pack("<f7I128s", version, strands, vertices, start, 0, 0, 0, 0, b"") + bytes(
-        xyzw.tobytes()
-    )
+def tfx_bytes(
+    version: float = 4,
+    strands: int = 2,
+    vertices: int = 3,
+    start: int | None = None,
+    xyz: object = None,
+) -> bytes:
+    """A `.tfx` file whose vertex i is at (3i, 3i + 1, 3i + 2)."""
+    points = np.arange(18, dtype="<f4").reshape(6, 3) if xyz is None else np.asarray(xyz, "<f4")
+    counts = struct.pack("<f2I", version, strands, vertices)
+    if version == 3:
+        header = counts + bytes(132) + struct.pack("<I", 296 if start is None else start)
+        return header.ljust(296, b"\0") + points.tobytes()
+    header = counts + struct.pack("<I", 160 if start is None else start)
+    masses = np.full((len(points), 1), 7, "<f4")
+    return header.ljust(160, b"\0") + np.hstack([points, masses]).tobytes()
 
 
-def test_tfx_drops_the_mass_and_can_be_turned(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", [3, 4])
+def test_tfx_of_both_versions_and_turned(version: int, tmp_path: Path) -> None:
     path = tmp_path / "x.TFX"
-    path.write_bytes(tfx_bytes())
+    path.write_bytes(tfx_bytes(version))
     strands = read_strands(path)
     assert strands.offsets.tolist() == [0, 3, 6]
-    assert strands.points[1].tolist() == [4, 5, 6]
-    assert read_strands(path, up_axis="y").points[1].tolist() == [4, -6, 5]
+    np.testing.assert_array_equal(strands.points.ravel(), np.arange(18))
+    assert read_strands(path, up_axis="y").points[1].tolist() == [3, -5, 4]
 
 
+@pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        ({"version": 3}, "version 3, only version 4"),
-        ({"vertices": 1}, "at least 2"),
-        ({"strands": 2**32 - 1, "vertices": 2**32 - 1}, "the file has 256"),
+        ({"vertices": 1}, "byte 8: 1 vertices a strand, at least 2"),
+        ({"strands": 2**32 - 1, "vertices": 2**32 - 1}, "end at byte .*, the file has"),
+        ({"strands": 3}, "3 strands of 3 vertices .* the file has"),
         ({"start": 8}, "from byte 8"),
+        ({"start": 2**32 - 1}, "from byte 4294967295"),
+        ({"xyz": np.full((6, 3), np.inf)}, r"byte \d+: expected a finite .*6 of 6"),
     ],
 )
-def test_lying_tfx_headers(bad: dict[str, int], words: str, tmp_path: Path) -> None:
+def test_lying_tfx_headers(
+    version: int, bad: dict[str, object], words: str, tmp_path: Path
+) -> None:
     path = tmp_path / "x.tfx"
-    path.write_bytes(tfx_bytes(**bad))
-    with pytest.raises(StrandFileError, match=words):
+    path.write_bytes(tfx_bytes(version, **bad))  # type: ignore[arg-type]
+    with pytest.raises(StrandFileError, match=rf"x\.tfx: .*{words}"):
         read_strands(path)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_cut_tfx_files(version: int, tmp_path: Path) -> None:
+    path = tmp_path / "x.tfx"
+    whole = tfx_bytes(version)
+    for keep in (0, 11, 100, 159, len(whole) - 1):
+        path.write_bytes(whole[:keep])
+        with pytest.raises(StrandFileError, match=r"x\.tfx: .*truncated"):
+            read_strands(path)
+
+
+def test_other_tfx_versions_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.tfx"
+    path.write_bytes(tfx_bytes(2))
+    with pytest.raises(StrandFileError, match="byte 0: TressFX version 2, only 3 and 4"):
+        read_strands(path)
+
+
+def data_bytes(*strands: list[list[float]], count: int | None = None) -> bytes:
+    out = struct.pack("<i", len(strands) if count is None else count)
+    for points in strands:
+        out += struct.pack("<i", len(points)) + np.asarray(points, "<f4").tobytes()
+    return out
+
+
+A_STRAND = [[0.0, 0, 0], [0, 0, 1], [0, 1, 2]]
+
+
+def test_data_leaves_out_roots_without_hair(tmp_path: Path) -> None:
+    path = tmp_path / "x.data"
+    path.write_bytes(data_bytes([[9, 9, 9]], A_STRAND, [], [[5, 6, 7]], [[1, 2, 3], [4, 5, 6]]))
+    strands = read_strands(path)
+    assert strands.offsets.tolist() == [0, 3, 5]
+    assert strands.points.tolist() == [*A_STRAND, [1, 2, 3], [4, 5, 6]]
+    assert strands.radius == 4e-5
+    path.write_bytes(data_bytes())
+    assert len(read_strands(path)) == 0
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@given(strands=some_strands())
+def test_data_of_any_strands(strands: Strands, tmp_path: Path) -> None:
+    path = tmp_path / "x.data"
+    path.write_bytes(data_bytes(*(strands[i].tolist() for i in range(len(strands)))))
+    again = read_strands(path)
+    np.testing.assert_array_equal(again.points, strands.points)
+    np.testing.assert_array_equal(again.offsets, strands.offsets)
+
+
+@pytest.mark.parametrize(
+    ("raw", "words"),
+    [
+        (b"", "0 bytes, a .data file has at least 4"),
+        (data_bytes(count=-1), "byte 0: -1 strands"),
+        (data_bytes(A_STRAND, count=2**31 - 1), "byte 0: 2147483647 strands need at least"),
+        (data_bytes(A_STRAND, count=2), "byte 44: strand 1 of 2 .* the file has 44"),
+        (data_bytes(A_STRAND)[:-1], "byte 4: strand 0 of 1 has 3 points, .* byte 44, .* has 43"),
+        (data_bytes(A_STRAND)[:9], "byte 4: strand 0"),
+        (data_bytes(A_STRAND) + b"abc", "byte 44: the 1 strands end here, the file has 47"),
+        (struct.pack("<ii", 1, -5), "byte 4: strand 0 of 1 has -5 points"),
+        (struct.pack("<ii", 1, 2**31 - 1), "byte 4: strand 0 of 1 has 2147483647 points"),
+        (data_bytes(A_STRAND, [[0, 0, 0], [0, np.nan, 0]]), r"byte 60: .*nan.*1 of 5"),
+    ],
+)
+def test_lying_data_files(raw: bytes, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.data"
+    path.write_bytes(raw)
+    with pytest.raises(StrandFileError, match=rf"x\.data: {words}"):
+        read_strands(path)
+
+
+@pytest.mark.parametrize("vary", [False, True])
+def test_alembic_curves_are_y_up(vary: bool, two: Strands, tmp_path: Path) -> None:
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    from alembic3d import Abc, AbcGeom
+
+    radius = np.arange(1, 6, dtype=np.float32) * 1e-5 if vary else 2e-4
+    path = tmp_path / "hair.abc"
+    write_strands(path, Strands(two.points, two.offsets, radius))
+    schema = AbcGeom.ICurves(Abc.IArchive(str(path)).getTop(), "hair").getSchema()
+    sample = schema.getValue()
+    assert sample.getType() == AbcGeom.CurveType.kLinear
+    assert np.asarray(memoryview(sample.getCurvesNumVertices())).tolist() == [3, 2]
+    points = np.asarray(memoryview(sample.getPositions()))
+    np.testing.assert_array_equal(points, two.points[:, [0, 2, 1]] * np.float32([1, 1, -1]))
+    widths = schema.getWidthsParam().getExpandedValue()
+    np.testing.assert_allclose(list(widths.getVals()), 2 * np.atleast_1d(radius), rtol=1e-6)
+
+
+def test_alembic_that_is_not_installed_or_has_no_folder(
+    two: Strands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imath", None)
+    with pytest.raises(StrandFileError, match=r"hair\.abc: .*pip install 'hairstage\[alembic\]'"):
+        write_strands(tmp_path / "hair.abc", two)
+    monkeypatch.undo()
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    with pytest.raises(StrandFileError, match=r"hair\.abc: cannot be written"):
+        write_strands(tmp_path / "absent" / "hair.abc", two)
+    write_strands(tmp_path / "bald.abc", Strands.from_list([]))
+    assert (tmp_path / "bald.abc").stat().st_size > 0
 
 
 def write_npy(path: Path, name: str, header: bytes, data: bytes) -> None:
@@ -280,3 +402,13 @@ def test_sintels_groom(shared_data: Callable[[str], Path]) -> None:
     np.testing.assert_array_equal(strands.offsets, truth.offsets)
     moved = strands.points - np.array([0, 0, 1.56])
     np.testing.assert_allclose(moved, truth.points, atol=2e-6)
+
+
+def test_the_ponytail(shared_data: Callable[[str], Path]) -> None:
+    folder = shared_data("ponytail")
+    names = ("front_top", "side", "back", "tail")
+    parts = [read_strands(folder / f"{name}.tfx", up_axis="y") for name in names]
+    truth = read_strands(folder / "ponytail.npz")
+    assert [len(part) for part in parts] == [876, 3066, 517, 474]
+    points = np.concatenate([part.points for part in parts]) * 0.003 - np.array([0, 0, 0.24])
+    np.testing.assert_allclose(points, truth.points, atol=1e-6)
