@@ -142,10 +142,10 @@ def _cameras(path: Path) -> dict[str | int, Camera]:
             raise ImportProblem(f"{where}.id: {id_!r} is there twice")
         width, height = _count(entry, "width", where), _count(entry, "height", where)
         K, R = (_numbers(entry, f, (3, 3), where) for f in ("K", "R"))
+        t = _numbers(entry, "t", (3,), where)
+        lens = _numbers(entry, "distortion", (5,), where) if "distortion" in entry else np.zeros(5)
         try:
-            out[id_] = Camera(name, width, height, K, R, _numbers(entry, "t", (3,), where))
-        except ImportProblem:
-            raise
+            out[id_] = Camera(name, width, height, K, R, t, distortion=lens)
         except ValueError as error:
             raise ImportProblem(f"{where}: {error}") from error
         if "center" in entry:

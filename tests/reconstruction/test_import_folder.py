@@ -62,6 +62,15 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path.write_text(json.dumps(data))
 
 
+def test_lenses_are_imported(folder: Path, tmp_path: Path) -> None:
+    lens = [-0.1, 0.02, 1e-3, 0, 0]
+    edit(folder / "cameras.json", lambda d: d["cameras"][1].update(distortion=lens))
+    capture = import_folder(folder, tmp_path / "out", lambda _, share: None)
+    straight, bent = capture.rig.cameras
+    assert not straight.distorted
+    assert bent.distortion.tolist() == lens
+
+
 def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
     shares: list[float] = []
     capture = import_folder(folder, tmp_path / "out", lambda _, share: shares.append(share))
@@ -88,6 +97,16 @@ def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
         ("cameras.json", lambda d: d["cameras"][1].pop("K"), r"cameras\[1\]: the field 'K'"),
         ("cameras.json", lambda d: d["cameras"][0].update(t=[1, 2]), r"cameras\[0\]\.t: expected"),
         ("cameras.json", lambda d: d["cameras"][0].update(t="abc"), r"cameras\[0\]\.t: expected"),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(distortion=[1]),
+            r"\.distortion: expected",
+        ),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(distortion=[-999, 0, 0, 0, 0]),
+            r"cameras\[0\]: .*folds over",
+        ),
         ("cameras.json", lambda d: d["cameras"][0].update(width=8.5), r"\.width: expected a whole"),
         (
             "cameras.json",

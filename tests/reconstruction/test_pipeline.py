@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -178,6 +179,10 @@ def test_what_cannot_be_done_without_is_named(
     write_obj(bare.path / "head.obj", ball(HEAD))
     with pytest.raises(CaptureError, match="no OLAT frames"):
         reconstruct(Capture(bare.path), tmp_path, options=QUICK)
+    bent = shoot(cameras=[replace(around[0], distortion=[-0.1]), around[1]], projectors=[])
+    write_obj(bent.path / "head.obj", ball(HEAD))
+    with pytest.raises(CaptureError, match=rf"lenses of \['{around[0].name}'\] bend lines"):
+        reconstruct(Capture(bent.path), tmp_path, options=QUICK)
     few = ReconstructOptions(held_out=("c0", "c72", "c144", "c216"))
     with pytest.raises(CaptureError, match="1 cameras are left, at least 2"):
         reconstruct(unswept, tmp_path, options=few)
