@@ -23,8 +23,7 @@ class Quality:
     """Paths per pixel and lights per vertex: what a frame costs and how noisy the truth is.
 
     `lamps` paths serve all lamps of a camera at once, `sweep` paths all rows of a camera and pose,
-    `together` paths one light vector. The `thrift`s put dim shadow rays to roulette, at a gain in
-    equal-error time that skin pays for with a little noise. The demo's capture takes five to six
+    `together` paths one light vector. The demo's capture takes five to six
     minutes of rendering on two cores with these numbers.
     """
 
@@ -33,8 +32,6 @@ class Quality:
     together: int = 24
     depth: int = 16
     sweep_depth: int = 6
-    lamp_thrift: float = 2.0
-    sweep_thrift: float = 1.0
 
     @classmethod
     def scaled(cls, spp: int) -> Quality:
@@ -109,7 +106,6 @@ class MitsubaResponder:
             self._rig.lights,
             spp=self._quality.lamps,
             max_depth=self._quality.depth,
-            thrift=self._quality.lamp_thrift,
             seed=self._seeds(camera, 0, 1),
             pixels=pixels,
         )
@@ -151,7 +147,6 @@ class MitsubaResponder:
             [p.moved(rotation, translation) for p in self._rig.projectors],
             spp=self._quality.sweep,
             max_depth=self._quality.sweep_depth,
-            thrift=self._quality.sweep_thrift,
             seed=self._seeds(camera, pose, 3),
             pixels=pixels,
         )

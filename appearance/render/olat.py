@@ -2,29 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
-from appearance.render.paths import (
-    Surface,
-    Wave,
-    each_sample,
-    light_from,
-    opaque_index,
-    pixel_indices,
-    walk,
-)
+from appearance.render.dome import Dome
+from appearance.render.paths import Surface, light_from, opaque_index, pixel_indices
+from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
 from appearance.scene import HairScene, light_arrays
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
-_PILOT = 1024  # pixels of the pilot pass
+_PILOT = 512  # pixels of the pilot passes at most
+_PILOT_SHARE = 64  # and one path in so many
 _PILOT_STREAM = 1 << 31
+_USUAL = 0.99  # quantile of the pilot's pixels beyond which a path is a rare bright one
+
+
+@dataclass(frozen=True)
+class OlatOptions:
+    """How `render_olat` and `olat_tiles` spend their time.
+
+    `spp` paths a pixel serve all lights. `max_depth` is the number of vertices a path may have (1
+    is direct light); None measures what is needed, see `bounce_limit`.
+
+    Every vertex weighs all lights, or a systematic sample of `first_lights` at the first vertex
+    and `deep_lights` at later ones, weighted by L/k: worse for images of single lights, better for
+    their sum. A contribution below `thrift` times the standard deviation of what a path brings
+    from that light (from a pilot pass) casts its shadow ray by roulette; 0 casts all of them. A
+    shadow ray takes as long as the BSDF of twenty lights: 3 halves the time and more for 5 to 10 %
+    more variance on hair, where 2 to 8 do as well within a tenth. `roulette`
+    of paths is that of `Reach`. The estimate is unbiased for every choice of these numbers.
+
+    `degree` projects light from the second vertex on onto spherical harmonics over the lights'
+    directions, see `Dome`: a fraction of the noise, biased. None is the unbiased renderer.
+
+    `memory` bounds, in bytes, what the tiles of pixels take at a time; the images that
+    `render_olat` returns come on top.
+    """
+
+    spp: int = 32
+    max_depth: int | None = None
+    first_lights: int | None = None
+    deep_lights: int | None = None
+    thrift: float = 3.0
+    roulette: float = 0.5
+    degree: int | None = None
+    memory: int = 1 << 30
+
+    def __post_init__(self) -> None:
+        counts = (self.first_lights, self.deep_lights, self.max_depth)
+        if min(self.spp, self.memory, *(1 if n is None else n for n in counts)) < 1:
+            raise ValueError(
+                "spp, max_depth, first_lights, deep_lights and memory must be positive, got "
+                f"{self.spp}, {self.max_depth}, {self.first_lights}, {self.deep_lights}, "
+                f"{self.memory}"
+            )
+        if not min(self.thrift, self.roulette) >= 0:
+            raise ValueError(
+                f"thrift and roulette must be 0 or more, got {self.thrift}, {self.roulette}"
+            )
+        if self.degree is not None and (not 0 <= self.degree <= 9 or self.spp < 2):
+            raise ValueError(
+                f"degree must be in [0, 9] and spp at least 2, got {self.degree}, {self.spp}"
+            )
 
 
 def render_olat(
@@ -32,61 +78,63 @@ def render_olat(
     camera: Camera,
     lights: Sequence[Light],
     *,
-    spp: int = 32,
-    max_depth: int = 16,
     seed: int = 0,
     pixels: ArrayLike | None = None,
-    first_lights: int | None = None,
-    deep_lights: int | None = None,
-    rr_depth: int = 4,
-    thrift: float = 0.25,
-    film_bytes: int = 1 << 29,
+    **options: Any,
 ) -> NDArray[np.float32]:
     """Radiance under each of `lights` alone, W/(sr m²) at full level.
 
     Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`: then
-    a cheap pass finds the pixels that see the subject and only those are traced. `spp` paths a
-    pixel serve all lights; a path has at most `max_depth` vertices (1 is direct light).
-
-    Every vertex weighs all lights, or a systematic sample of `first_lights` at the first vertex
-    and `deep_lights` at later ones, weighted by L/k. Of these, contributions below `thrift`
-    times the light's mean radiance (from a pilot pass) cast their shadow ray by roulette; 0 casts
-    all of them. On Sintel's hair 0.25 halves the time at the same variance; 1 saves another
-    sixth, but then plain surfaces, whose light would be free of noise, show the roulette. The
-    estimate is unbiased for every choice of these numbers, and for roulette of paths from vertex
-    `rr_depth` on. Pixels are tiled so that the film stays under `film_bytes`. Same arguments, same
-    bytes, with any number of threads.
+    a cheap pass finds the pixels that see the subject and only those are traced. `options` are
+    those of `OlatOptions`. Same arguments, same bytes, with any number of threads. Where all
+    images are too much to hold, use `olat_tiles`. Raises `ValueError` for options out of range.
     """
-    counts = tuple(
-        len(lights) if n is None else min(n, len(lights)) for n in (first_lights, deep_lights)
-    )
-    if spp < 1 or max_depth < 1 or (lights and min(counts) < 1) or thrift < 0:
-        raise ValueError(
-            "spp, max_depth, first_lights and deep_lights must be positive and thrift not "
-            f"negative, got {spp}, {max_depth}, {first_lights}, {deep_lights}, {thrift}"
-        )
-    shape = (len(lights), camera.height, camera.width, 3)
     if pixels is None:
-        index = covered_pixels(scene, camera)
         image = np.zeros((len(lights), camera.height * camera.width, 3), np.float32)
-    else:
-        index = pixel_indices(camera, pixels)
-        image = np.zeros((len(lights), len(index), 3), np.float32)
+        for index, radiance in olat_tiles(scene, camera, lights, seed=seed, **options):
+            image[:, index] = radiance
+        return image.reshape(len(lights), camera.height, camera.width, 3)
+    index = pixel_indices(camera, pixels)
+    some = np.zeros((len(lights), len(index), 3), np.float32)
+    tiles = _tiles(scene, camera, lights, index, OlatOptions(**options), seed)
+    for part, radiance in tiles:
+        some[:, part] = radiance
+    return some
+
+
+def olat_tiles(
+    scene: HairScene, camera: Camera, lights: Sequence[Light], *, seed: int = 0, **options: Any
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+    """`render_olat` of the pixels that see the subject, a tile at a time.
+
+    Yields flat pixel indices `(P,)` and their radiance `(L, P, 3)`. A tile is spread over the
+    whole image. No more than `memory` bytes are in use at a time, whatever the number of lights
+    and pixels, if one pixel fits.
+    """
+    chosen = OlatOptions(**options)
+    index = covered_pixels(scene, camera)
+    for part, radiance in _tiles(scene, camera, lights, index, chosen, seed):
+        yield index[part], radiance
+
+
+def _tiles(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    index: NDArray[np.int64],
+    options: OlatOptions,
+    seed: int,
+) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Slices of `index` and the radiance `(L, P, 3)` of their pixels."""
     if not len(lights) or not len(index):
-        return image.reshape(shape) if pixels is None else image
-    plan = _Plan((counts[0], counts[1]), max_depth, rr_depth)
-    if thrift > 0:
-        dim = thrift * _typical(scene, camera, lights, index, plan, seed)
-        plan = replace(plan, dim=dim)
-    tile = max(1, min(len(index), film_bytes // (12 * len(lights))))
-    for start in range(0, len(index), tile):
-        part = index[start : start + tile]
-        radiance = _render_tile(scene, camera, lights, part, spp, plan, (seed, start))
-        if pixels is None:
-            image[:, part] = radiance
-        else:
-            image[:, start : start + tile] = radiance
-    return image.reshape(shape) if pixels is None else image
+        return
+    plan = _plan(scene, camera, lights, index, options, seed)
+    # the film, its copy and the mean
+    each = 3 * 12 * len(lights) + (0 if plan.dome is None else plan.dome.pixel_bytes) + LANE_BYTES
+    tiles = -(-len(index) // max(1, options.memory // each))
+    for k in range(tiles):
+        part = slice(k, None, tiles)
+        yield part, _render_tile(scene, camera, index[part], options.spp, plan, (seed, k))
 
 
 @dataclass(frozen=True)
@@ -94,33 +142,69 @@ class _Plan:
     """How paths and shadow rays are spent.
 
     `counts`: lights asked at the first and at later vertices. `dim (L,)`: contributions below this
-    radiance cast their shadow ray with a probability in proportion, None for always.
+    radiance cast their shadow ray with a probability in proportion.
     """
 
+    lights: Sequence[Light]
     counts: tuple[int, int]
-    max_depth: int
-    rr_depth: int
-    dim: NDArray[np.float32] | None = None
+    reach: Reach
+    dim: NDArray[np.float32]
+    dome: Dome | None
 
 
-def _typical(
+def _plan(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
     index: NDArray[np.int64],
+    options: OlatOptions,
+    seed: int,
+) -> _Plan:
+    wanted = (options.first_lights, options.deep_lights)
+    first, deep = (len(lights) if n is None else min(n, len(lights)) for n in wanted)
+    depth = options.max_depth
+    if depth is None:
+        depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
+    none = np.zeros(len(lights), np.float32)
+    plan = _Plan(lights, (first, deep), Reach(depth, options.roulette), none, None)
+    if options.thrift > 0:
+        spread = _spread(scene, camera, index, options.spp, plan, seed)
+        plan = replace(plan, dim=np.float32(options.thrift) * spread)
+    if options.degree is not None:
+        plan = replace(plan, dome=Dome.over(scene, lights, options.degree))
+    return plan
+
+
+def _spread(
+    scene: HairScene,
+    camera: Camera,
+    index: NDArray[np.int64],
+    spp: int,
     plan: _Plan,
     seed: int,
 ) -> NDArray[np.float32]:
-    """Mean radiance `(L,)` of the brightest channel under each light, from a few paths."""
-    few = index[:: max(1, len(index) // _PILOT)]
-    pilot = _render_tile(scene, camera, lights, few, 1, plan, (seed, _PILOT_STREAM))
-    return pilot.mean(axis=1).max(axis=1)
+    """Standard deviation `(L,)` of what a path through a pixel brings from each light.
+
+    From a few paths, and without the brightest of them: a rare bright path, a hundred times what
+    all others bring, is no measure for these.
+    """
+    wanted = int(np.clip(len(index) * spp // _PILOT_SHARE, 64, _PILOT))
+    few = index[:: -(-len(index) // wanted)]
+
+    def pilot(pixels: NDArray[np.int64], plan: _Plan, number: int) -> NDArray[np.float32]:
+        radiance = _render_tile(scene, camera, pixels, 1, plan, (seed, _PILOT_STREAM + number))
+        brightest = radiance.max(-1)
+        return np.minimum(brightest, np.quantile(brightest, _USUAL, axis=1, keepdims=True))
+
+    # the mean of fewer still, with every shadow ray, is enough to spare most of them in the rest
+    sparing = replace(plan, dim=pilot(few[::8], plan, 0).mean(1))
+    one, other = (pilot(few, sparing, number) for number in (1, 2))
+    return np.asarray(np.sqrt(((one - other) ** 2).mean(1) / 2), np.float32)
 
 
 def _render_tile(
     scene: HairScene,
     camera: Camera,
-    lights: Sequence[Light],
     index: NDArray[np.int64],
     spp: int,
     plan: _Plan,
@@ -130,23 +214,21 @@ def _render_tile(
     import drjit as dr
     import mitsuba as mi
 
-    position, intensity = light_arrays(lights)
-    dim = plan.dim if plan.dim is not None else np.zeros(len(lights), np.float32)
-    bank = _Bank(
-        mi.Float(position.ravel()), mi.Float(intensity.ravel()), mi.Float(dim), len(lights)
-    )
-    pixel = mi.UInt32(index.astype(np.uint32))
+    lights = plan.lights
     film = dr.zeros(mi.Float, 3 * len(lights) * len(index))
     surface = Surface(scene)
-    slots = opaque_index(len(index))
-
-    def trace(paths: Wave) -> None:
-        gather = _Gather(surface, film, paths.slot, slots, bank, plan.counts)
-        walk(surface, paths.rays, paths.rng, gather, plan.max_depth, plan.rr_depth)
-
-    each_sample(camera, pixel, len(index), spp, seed, trace)
-    image = np.array(film).reshape(len(lights), len(index), 3)
-    return np.asarray(image / np.float32(spp), dtype=np.float32)
+    gather = _Gather(surface, film, opaque_index(len(index)), _Bank.of(lights, plan.dim), plan)
+    reach, escape, splat = plan.reach, None, None
+    if plan.dome is not None:
+        splat = plan.dome.splat(len(index))
+        # one ray more than vertices: the light of the last vertex is the ray that leaves it
+        reach, escape = replace(reach, max_depth=reach.max_depth + 1), splat
+    follow(surface, camera, index, spp, seed, reach, gather, escape)
+    image = np.array(film).reshape(len(lights), 3, len(index)).transpose(0, 2, 1)
+    image = image / np.float32(spp)
+    if splat is not None:
+        image += splat.light(spp)
+    return np.asarray(image, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -158,53 +240,65 @@ class _Bank:
     dim: Any
     count: int
 
+    @classmethod
+    def of(cls, lights: Sequence[Light], dim: NDArray[np.float32]) -> _Bank:
+        import mitsuba as mi
+
+        position, intensity = light_arrays(lights)
+        return cls(
+            mi.Float(position.ravel()), mi.Float(intensity.ravel()), mi.Float(dim), len(lights)
+        )
+
 
 @dataclass(frozen=True)
 class _Gather:
-    """Light from a systematic sample of the bank at a path's vertex, with a random start."""
+    """Light from the bank, or a systematic sample of it, at a path's vertex."""
 
     surface: Surface
     film: Any
-    slot: Any
     slots: Any
     bank: _Bank
-    counts: tuple[int, int]
+    plan: _Plan
 
-    def __call__(self, si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
+    def __call__(self, si: Any, paths: Paths) -> None:
         import drjit as dr
         import mitsuba as mi
 
-        count = self.counts[0] if first else self.counts[1]
-        total = self.bank.count
-        stride = total / count
-        start = rng.next_float32() * stride
+        total, first = self.bank.count, paths.depth == 0
+        active = paths.active if self.plan.dome is None else paths.active & first
+        count = dr.select(first, *(opaque_index(n) for n in self.plan.counts))
+        stride = mi.Float(total) / mi.Float(count)
+        sampled = min(self.plan.counts) < total
+        start = paths.rng.next_float32() * stride if sampled else mi.Float(0)
 
         def more(j: Any, rng: Any) -> Any:
-            return j < count
+            return active & (j < count)
 
         def body(j: Any, rng: Any) -> Any:
             light = j
-            if count < total:
+            if sampled:
                 light = dr.minimum(mi.UInt32(mi.Float(j) * stride + start), total - 1)
-            self._add(si, throughput * stride, light, rng.next_float32(), active)
+            self._add(si, paths, stride, light, rng.next_float32(), active)
             return j + 1, rng
 
-        dr.while_loop((mi.UInt32(0), rng), more, body, label="lights of a vertex")
+        dr.while_loop((mi.UInt32(0), paths.rng), more, body, label="lights of a vertex")
 
-    def _add(self, si: Any, throughput: Any, light: Any, chance: Any, active: Any) -> None:
+    def _add(
+        self, si: Any, paths: Paths, weight: Any, light: Any, chance: Any, active: Any
+    ) -> None:
         import drjit as dr
         import mitsuba as mi
 
         value, lit = light_from(
             self.surface,
             si,
-            throughput,
+            paths.throughput * weight,
             dr.gather(mi.Point3f, self.bank.positions, light, active),
             dr.gather(mi.Color3f, self.bank.intensities, light, active),
             dr.gather(mi.Float, self.bank.dim, light, active),
             chance,
             active,
         )
-        put = (light * self.slots + self.slot) * 3
         for channel in range(3):
-            dr.scatter_add(self.film, value[channel], put + channel, lit)
+            put = (light * 3 + channel) * self.slots + paths.slot
+            dr.scatter_add(self.film, value[channel], put, lit, mode=dr.ReduceMode.NoConflicts)

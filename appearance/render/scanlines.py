@@ -2,32 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import (
     Surface,
-    Wave,
-    each_sample,
     light_from,
     opaque,
     opaque_index,
     opaque_matrix,
     pixel_indices,
-    walk,
 )
+from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
 from appearance.scene import SCALE, HairScene
 from reconstruction.cameras import Camera
 from reconstruction.projectors import Projector
 
+Image = NDArray[np.float32]
+
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31
 _REACH = 4.0  # standard deviations of the line's blur beyond which a row is not asked
+
+
+@dataclass(frozen=True)
+class ScanlineOptions:
+    """How `render_scanlines` and `scanline_tiles` spend their time.
+
+    `spp` paths a pixel serve all rows. `max_depth`, `thrift`, `roulette` and `memory` are as in
+    `OlatOptions`; here a path costs more than its shadow rays, and fewer of them are spared.
+    """
+
+    spp: int = 16
+    max_depth: int | None = None
+    thrift: float = 0.2
+    roulette: float = 0.5
+    memory: int = 1 << 30
+
+    def __post_init__(self) -> None:
+        depth = 1 if self.max_depth is None else self.max_depth
+        if min(self.spp, self.memory, depth) < 1 or not min(self.thrift, self.roulette) >= 0:
+            raise ValueError(
+                "spp, max_depth and memory must be positive and thrift and roulette 0 or more, "
+                f"got {self.spp}, {self.max_depth}, {self.memory}, {self.thrift}, {self.roulette}"
+            )
 
 
 def render_scanlines(
@@ -35,43 +59,55 @@ def render_scanlines(
     camera: Camera,
     projectors: Sequence[Projector],
     *,
-    spp: int = 16,
-    max_depth: int = 4,
     seed: int = 0,
     pixels: ArrayLike | None = None,
     rows: Mapping[str, range] | None = None,
-    rr_depth: int = 3,
-    thrift: float = 0.25,
-) -> dict[str, NDArray[np.float32]]:
+    **options: Any,
+) -> dict[str, Image]:
     """Radiance of each row of each projector at full level, W/(sr m²).
 
     Returns by projector name `(rows, H, W, 3)`, or `(rows, P, 3)` for `pixels (P,)` (flat
     indices). Every vertex of a camera path that a projector sees lies on one fractional row of it:
     its light goes to the few rows within reach of the line's blur (`Projector.row_weight`), so one
     pass answers the whole sweep. The sum over all rows is that projector with all rows on.
-    Roulette of shadow rays (`thrift`) and of paths (`rr_depth`) as in `render_olat`.
-    `rows` limits a projector to a range of its rows. A moved subject is rendered with the camera
-    and the projectors `moved` instead: the scene stays as it is.
+    `rows` limits a projector to a range of its rows; `options` are those of `ScanlineOptions`. A
+    moved subject is rendered with the camera and the projectors `moved` instead: the scene stays as
+    it is. Where all rows are too much to hold, use `scanline_tiles`.
     """
-    if spp < 1 or max_depth < 1:
-        raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
-    names = [p.name for p in projectors]
-    ranges = {p.name: _rows(p, (rows or {}).get(p.name)) for p in projectors}
-    if unknown := set(rows or {}) - set(names):
-        raise ValueError(f"rows names unknown projectors {sorted(unknown)}; there are {names}")
+    ranges = _ranges(projectors, rows)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    plan = _Plan(projectors, ranges, max_depth, rr_depth, (0.0,) * len(projectors))
-    if thrift > 0 and len(index):
-        plan = replace(plan, dim=_dim(scene, camera, index, plan, seed, thrift))
-    films = _render(scene, camera, index, plan, spp, (seed, 0))
+    size = camera.height * camera.width if pixels is None else len(index)
+    out = {name: np.zeros((len(r), size, 3), np.float32) for name, r in ranges.items()}
+    chosen = ScanlineOptions(**options)
+    for part, films in _tiles(scene, camera, projectors, ranges, index, chosen, seed):
+        for name, film in films.items():
+            out[name][:, index[part] if pixels is None else part] = film
     if pixels is not None:
-        return films
-    out = {}
-    for name, film in films.items():
-        image = np.zeros((len(film), camera.height * camera.width, 3), np.float32)
-        image[:, index] = film
-        out[name] = image.reshape(len(film), camera.height, camera.width, 3)
-    return out
+        return out
+    return {n: o.reshape(len(o), camera.height, camera.width, 3) for n, o in out.items()}
+
+
+def scanline_tiles(
+    scene: HairScene,
+    camera: Camera,
+    projectors: Sequence[Projector],
+    *,
+    seed: int = 0,
+    rows: Mapping[str, range] | None = None,
+    **options: Any,
+) -> Iterator[tuple[NDArray[np.int64], dict[str, Image]]]:
+    """`render_scanlines` of the pixels that see the subject, a tile at a time, as `olat_tiles`."""
+    ranges, chosen = _ranges(projectors, rows), ScanlineOptions(**options)
+    index = covered_pixels(scene, camera)
+    for part, films in _tiles(scene, camera, projectors, ranges, index, chosen, seed):
+        yield index[part], films
+
+
+def _ranges(projectors: Sequence[Projector], rows: Mapping[str, range] | None) -> dict[str, range]:
+    if unknown := set(rows or {}) - {p.name for p in projectors}:
+        names = [p.name for p in projectors]
+        raise ValueError(f"rows names unknown projectors {sorted(unknown)}; there are {names}")
+    return {p.name: _rows(p, (rows or {}).get(p.name)) for p in projectors}
 
 
 def _rows(projector: Projector, rows: range | None) -> range:
@@ -90,23 +126,37 @@ class _Plan:
 
     projectors: Sequence[Projector]
     rows: dict[str, range]
-    max_depth: int
-    rr_depth: int
+    reach: Reach
     dim: tuple[float, ...]
 
 
-def _dim(
+def _tiles(
     scene: HairScene,
     camera: Camera,
+    projectors: Sequence[Projector],
+    rows: dict[str, range],
     index: NDArray[np.int64],
-    plan: _Plan,
+    options: ScanlineOptions,
     seed: int,
-    thrift: float,
-) -> tuple[float, ...]:
-    """`thrift` times the mean radiance under each projector, from a few paths."""
-    few = index[:: max(1, len(index) // _PILOT)]
-    films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))
-    return tuple(thrift * float(f.sum(0).mean(0).max(initial=0.0)) for f in films.values())
+) -> Iterator[tuple[slice, dict[str, Image]]]:
+    """Slices of `index` and the rows' radiance `(rows, P, 3)` at their pixels."""
+    if not len(index):
+        return
+    depth = options.max_depth
+    if depth is None:
+        depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
+    plan = _Plan(projectors, rows, Reach(depth, options.roulette), (0.0,) * len(projectors))
+    if options.thrift > 0:
+        few = index[:: -(-len(index) // _PILOT)]
+        films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))
+        brought = [f.sum(0).max(-1) for f in films.values()]
+        dim = (options.thrift * float(np.sqrt((b**2).mean())) for b in brought)
+        plan = replace(plan, dim=tuple(dim))
+    each = 3 * 12 * sum(len(r) for r in rows.values()) + LANE_BYTES
+    tiles = -(-len(index) // max(1, options.memory // each))
+    for k in range(tiles):
+        part = slice(k, None, tiles)
+        yield part, _render(scene, camera, index[part], plan, options.spp, (seed, k))
 
 
 def _render(
@@ -116,38 +166,35 @@ def _render(
     plan: _Plan,
     spp: int,
     seed: tuple[int, int],
-) -> dict[str, NDArray[np.float32]]:
+) -> dict[str, Image]:
     """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
     import drjit as dr
     import mitsuba as mi
 
-    projectors, ranges = plan.projectors, plan.rows
     n = len(index)
-    if n == 0:
-        return {p.name: np.zeros((len(ranges[p.name]), 0, 3), np.float32) for p in projectors}
-    films = [dr.zeros(mi.Float, 3 * len(ranges[p.name]) * n) for p in projectors]
-    pixel = mi.UInt32(index.astype(np.uint32))
-    surface = Surface(scene)
-    slots = opaque_index(n)
+    surface, slots = Surface(scene), opaque_index(n)
+    gathers = [
+        _Gather(
+            surface,
+            dr.zeros(mi.Float, 3 * len(plan.rows[p.name]) * n),
+            slots,
+            p,
+            plan.rows[p.name],
+            dim,
+        )
+        for p, dim in zip(plan.projectors, plan.dim, strict=True)
+    ]
 
-    def trace(paths: Wave) -> None:
-        gathers = [
-            _Gather(surface, film, paths.slot, slots, p, ranges[p.name], dim)
-            for p, film, dim in zip(projectors, films, plan.dim, strict=True)
-        ]
+    def gather(si: Any, paths: Paths) -> None:
+        for one in gathers:
+            one(si, paths)
 
-        def gather(si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
-            for one in gathers:
-                one(si, throughput, rng.next_float32(), active)
-
-        walk(surface, paths.rays, paths.rng, gather, plan.max_depth, plan.rr_depth)
-
-    each_sample(camera, pixel, n, spp, seed, trace)
-    return {
-        p.name: np.array(film, dtype=np.float32).reshape(len(ranges[p.name]), n, 3)
-        / np.float32(spp)
-        for p, film in zip(projectors, films, strict=True)
-    }
+    follow(surface, camera, index, spp, seed, plan.reach, gather)
+    out = {}
+    for one in gathers:
+        film = np.array(one.film).reshape(len(one.rows), 3, n).transpose(0, 2, 1)
+        out[one.projector.name] = np.asarray(film / np.float32(spp), np.float32)
+    return out
 
 
 @dataclass(frozen=True)
@@ -156,13 +203,12 @@ class _Gather:
 
     surface: Surface
     film: Any
-    slot: Any
     slots: Any
     projector: Projector
     rows: range
     dim: float
 
-    def __call__(self, si: Any, throughput: Any, chance: Any, active: Any) -> None:
+    def __call__(self, si: Any, paths: Paths) -> None:
         import mitsuba as mi
 
         if not self.rows:
@@ -176,13 +222,16 @@ class _Gather:
         v = k[3] * y + k[4]
         reach = _REACH * p.line_sigma + 0.5
         low, high = opaque([self.rows.start - reach, self.rows.stop - 1 + reach])
-        seen = active & (local.z > 0) & (u >= -0.5) & (u < k[5]) & (v > low) & (v < high)
+        seen = paths.active & (local.z > 0) & (u >= -0.5) & (u < k[5]) & (v > low) & (v < high)
         intensity = mi.Color3f(*opaque(p.intensity * SCALE**2))
         (dim,) = opaque(self.dim)
-        value, seen = light_from(self.surface, si, throughput, centre, intensity, dim, chance, seen)
-        self._splat(value, v, reach, seen)
+        chance = paths.rng.next_float32()
+        value, seen = light_from(
+            self.surface, si, paths.throughput, centre, intensity, dim, chance, seen
+        )
+        self._splat(value, v, reach, paths.slot, seen)
 
-    def _splat(self, value: Any, v: Any, reach: float, seen: Any) -> None:
+    def _splat(self, value: Any, v: Any, reach: float, slot: Any, seen: Any) -> None:
         """Add `value` to the rows near `v`, weighted as `Projector.row_weight` does."""
         import drjit as dr
         import mitsuba as mi
@@ -200,9 +249,11 @@ class _Gather:
             above = dr.erf((mi.Float(row) - v + 0.5) * slope)
             weight = 0.5 * (above - below)
             inside = seen & (row >= start) & (row < stop)
-            put = (mi.UInt32(row - start) * self.slots + self.slot) * 3
             for channel in range(3):
-                dr.scatter_add(self.film, value[channel] * weight, put + channel, inside)
+                put = (mi.UInt32(row - start) * 3 + channel) * self.slots + slot
+                dr.scatter_add(
+                    self.film, value[channel] * weight, put, inside, mode=dr.ReduceMode.NoConflicts
+                )
             return j + 1, above
 
         below = dr.erf((mi.Float(lowest) - v - 0.5) * slope)

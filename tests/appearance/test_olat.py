@@ -43,7 +43,7 @@ SPENDING = {
     "defaults": {},
     "all lights, all shadow rays": {"thrift": 0},
     "few lights, few shadow rays": {"first_lights": 2, "deep_lights": 1, "thrift": 8},
-    "early roulette, small film": {"rr_depth": 1, "film_bytes": 12 * 3 * 100},
+    "early roulette, small film": {"roulette": 2.0, "memory": 1 << 16},
 }
 
 

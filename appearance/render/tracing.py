@@ -1,0 +1,123 @@
+"""One loop that follows all camera paths: a lane whose path ends begins its next at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.render.paths import Surface, jittered, opaque, opaque_index
+from reconstruction.cameras import Camera
+
+LANE_BYTES = 512
+"""What a path in flight takes, about."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far paths go.
+
+    `max_depth`: vertices a path may have. `roulette`: throughput (largest channel) below which a
+    path goes on only with probability throughput/`roulette`, and then counts as that much. 0 ends
+    no path before it leaves or reaches `max_depth`. On blond and on black hair 0.5 costs least to
+    the same error; 0.3 to 1 is within a sixth of it.
+    """
+
+    max_depth: int
+    roulette: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.max_depth < 1 or not self.roulette >= 0:
+            raise ValueError(
+                "max_depth must be positive and roulette not negative, "
+                f"got {self.max_depth}, {self.roulette}"
+            )
+
+
+@dataclass(frozen=True)
+class Paths:
+    """One step of the paths in flight, all Dr.Jit variables.
+
+    `throughput` (`Color3f`) is the product of weights so far, `depth` counts the vertices so far,
+    `sample` the pixel's samples so far, `slot` is the lane's place in the list of pixels, `rng`
+    its random stream. Lanes that are not `active` are to be left alone.
+    """
+
+    throughput: Any
+    depth: Any
+    sample: Any
+    slot: Any
+    rng: Any
+    active: Any
+
+
+def follow(
+    surface: Surface,
+    camera: Camera,
+    pixels: NDArray[np.int64],
+    spp: int,
+    seeds: tuple[int, ...],
+    reach: Reach,
+    vertex: Callable[[Any, Paths], None],
+    escape: Callable[[Any, Paths], None] | None = None,
+) -> None:
+    """Follow `spp` paths through each of the flat `pixels (P,)`.
+
+    `vertex(si, paths)` is called where paths meet the subject and `escape(ray, paths)` where their
+    rays miss it; both are traced once, with symbolic variables, and add to their films as a side
+    effect. All samples of a pixel are one lane's, in order, so that sums of floats are the same on
+    every run and no two lanes write to one slot. Lanes do not wait for each other's longest path:
+    that saves a fifth to a third of the time.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    slot = dr.arange(mi.UInt32, len(pixels))
+    pixel = mi.UInt32(pixels.astype(np.uint32))
+    size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(reach.max_depth)
+    (roulette,) = opaque(reach.roulette)
+    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
+    origin = dr.opaque(mi.UInt64, int(state[0]))
+    generator: Any = mi.PCG32  # the stubs call it a plain object
+
+    def begin(sample: Any) -> tuple[Any, Any]:
+        lane = mi.UInt64(sample) * mi.UInt64(size) + mi.UInt64(slot)
+        rng = generator(1, origin + lane, lane)
+        return rng, jittered(camera, pixel, sample, spp, rng)
+
+    def more(ray: Any, throughput: Any, depth: Any, sample: Any, rng: Any, active: Any) -> Any:
+        return active
+
+    def body(ray: Any, throughput: Any, depth: Any, sample: Any, rng: Any, active: Any) -> Any:
+        si = surface.interact(ray, active)
+        hit = active & si.is_valid()
+        if escape is not None:
+            escape(ray, Paths(throughput, depth, sample, slot, rng, active & ~hit))
+        vertex(si, Paths(throughput, depth, sample, slot, rng, hit))
+
+        u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        wo, weight = surface.sample(si, u1, u2, hit)
+        throughput = throughput * weight
+        strength = dr.max(throughput)
+        survival = dr.select(strength < roulette, strength / roulette, 1)
+        alive = hit & (strength > 0) & (depth + 1 < last) & (rng.next_float32() < survival)
+
+        following = si.spawn_ray(si.to_world(wo))
+        sample = dr.select(alive, sample, sample + 1)
+        other_rng, other_ray = begin(sample)
+        return (
+            dr.select(alive, following, other_ray),
+            dr.select(alive, throughput * dr.rcp(survival), mi.Color3f(1)),
+            dr.select(alive, depth + 1, 0),
+            sample,
+            dr.select(alive, rng, other_rng),
+            sample < end,
+        )
+
+    first = dr.zeros(mi.UInt32, len(pixels))
+    rng, ray = begin(first)
+    start = (ray, mi.Color3f(1), dr.zeros(mi.UInt32, len(pixels)), first, rng, first < end)
+    dr.while_loop(start, more, body, label="paths")
