@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from appearance.hair_appearance import HairAppearance
+from reconstruction.generic_head import generic_head
 from reconstruction.mesh import Mesh, read_obj
 from reconstruction.rig import Rig
 from reconstruction.strand_files import READABLE, read_strands
 from reconstruction.strands import Strands
 from simulators.grooms import GROOMS, covering_radius, grow
-from simulators.head import hair_field, head_mesh
+from simulators.head import hair_field
 
 _APPEARANCE = {
     "wavy": HairAppearance((0.12, 0.24, 0.50), 0.28, 0.30),
@@ -70,7 +71,7 @@ def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subjec
             f"no subject called {name!r}: choose one of {', '.join(GROOMS)}, or give a strand file "
             f"({', '.join(READABLE)})"
         )
-    head = head_mesh()
+    head = generic_head()
     # The three grooms of one seed are three heads of hair, not one with three settings.
     draw = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
     hair = grow(GROOMS[name], head, hair_field(), draw, strands)

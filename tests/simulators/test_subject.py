@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from reconstruction.generic_head import generic_head, skin_distance
 from reconstruction.rig import Rig
 from reconstruction.strand_files import write_strands
 from reconstruction.strands import Strands
-from simulators.head import head_mesh, skin_distance
 from simulators.subject import SubjectError, check_fits, load_subject, make_subject
 
 NAMES = ("wavy", "straight", "curly")
@@ -21,7 +21,7 @@ def subjects():
 
 
 def test_the_head_is_closed_and_human_in_size():
-    head = head_mesh()
+    head = generic_head()
     edges = np.sort(head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     assert (counts == 2).all()
@@ -39,7 +39,7 @@ def test_the_head_is_closed_and_human_in_size():
 
 
 def test_the_scalp_is_the_top_and_the_back():
-    head = head_mesh()
+    head = generic_head()
     middle = head.vertices[head.faces].mean(axis=1)
     assert head.face_areas()[head.scalp].sum() == pytest.approx(0.055, abs=0.01)
     assert not head.scalp[(middle[:, 1] < -0.07) & (middle[:, 2] < 0.05)].any()  # the face
@@ -49,7 +49,7 @@ def test_the_scalp_is_the_top_and_the_back():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_roots_lie_on_the_scalp(subjects, name):
-    head = head_mesh()
+    head = generic_head()
     faces = head.vertices[head.faces[head.scalp]]
     i, j = np.divmod(np.arange(81), 9)
     w = np.stack([i, j, 8 - i - j], axis=1)[i + j <= 8] / 8
