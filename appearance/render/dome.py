@@ -57,7 +57,7 @@ class Dome:
                 "the subject for a smooth basis; render with degree=None"
             )
         basis = dr.sh_eval(mi.Vector3f((position / distance[:, None]).T), degree)
-        intensity = np.array([light.intensity for light in lights]) * SCALE**2
+        intensity = np.array([light.intensity_towards(np.zeros(3)) for light in lights]) * SCALE**2
         return cls(
             degree,
             radius,

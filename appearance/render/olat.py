@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.dome import Dome
+from appearance.render.lamps import LampBank
 from appearance.render.paths import Surface, light_from, opaque_index, pixel_indices
 from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
-from appearance.scene import HairScene, light_arrays
+from appearance.scene import HairScene
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
@@ -233,21 +234,16 @@ def _render_tile(
 
 @dataclass(frozen=True)
 class _Bank:
-    """The lights on the device, in scene units: `(3 L,)`, `(3 L,)` and `(L,)`."""
+    """The lights on the device, and the contributions `(L,)` below which roulette is played."""
 
-    positions: Any
-    intensities: Any
+    lamps: LampBank
     dim: Any
-    count: int
 
     @classmethod
     def of(cls, lights: Sequence[Light], dim: NDArray[np.float32]) -> _Bank:
         import mitsuba as mi
 
-        position, intensity = light_arrays(lights)
-        return cls(
-            mi.Float(position.ravel()), mi.Float(intensity.ravel()), mi.Float(dim), len(lights)
-        )
+        return cls(LampBank.of(lights), mi.Float(dim))
 
 
 @dataclass(frozen=True)
@@ -264,7 +260,7 @@ class _Gather:
         import drjit as dr
         import mitsuba as mi
 
-        total, first = self.bank.count, paths.depth == 0
+        total, first = self.bank.lamps.count, paths.depth == 0
         active = paths.active if self.plan.dome is None else paths.active & first
         count = dr.select(first, *(opaque_index(n) for n in self.plan.counts))
         stride = mi.Float(total) / mi.Float(count)
@@ -278,25 +274,24 @@ class _Gather:
             light = j
             if sampled:
                 light = dr.minimum(mi.UInt32(mi.Float(j) * stride + start), total - 1)
-            self._add(si, paths, stride, light, rng.next_float32(), active)
+            self._add(si, paths, stride, light, rng, active)
             return j + 1, rng
 
         dr.while_loop((mi.UInt32(0), paths.rng), more, body, label="lights of a vertex")
 
-    def _add(
-        self, si: Any, paths: Paths, weight: Any, light: Any, chance: Any, active: Any
-    ) -> None:
+    def _add(self, si: Any, paths: Paths, weight: Any, light: Any, rng: Any, active: Any) -> None:
         import drjit as dr
         import mitsuba as mi
 
+        target, intensity = self.bank.lamps.sample(light, si.p, rng, active)
         value, lit = light_from(
             self.surface,
             si,
             paths.throughput * weight,
-            dr.gather(mi.Point3f, self.bank.positions, light, active),
-            dr.gather(mi.Color3f, self.bank.intensities, light, active),
+            target,
+            intensity,
             dr.gather(mi.Float, self.bank.dim, light, active),
-            chance,
+            rng.next_float32(),
             active,
         )
         for channel in range(3):

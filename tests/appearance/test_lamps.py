@@ -1,5 +1,7 @@
 """Lamps: irradiance in closed form, soft shadows, profiles on the device, mixtures."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -212,3 +214,18 @@ def test_mixtures_of_pixels_and_seeds(tufted):
     for wrong in ({"weights": np.nan}, {"spp": 0}):
         with pytest.raises(ValueError, match="must be"):
             render_mixed(scene, camera, lights, **wrong)
+
+
+def test_lamps_of_every_shape_shine_in_olat_images(tufted):
+    """Each lamp alone, against the mixture of that one lamp."""
+    scene, camera, lights = tufted
+    shapes = (
+        {"radius": 0.1},
+        {"orientation": facing((-0.2, -1.0, -0.2)), "profile": BEAM},
+        {"orientation": facing((0.2, -0.1, -1.0)), "size": (0.3, 0.2)},
+    )
+    lights = [replace(light, **shape) for light, shape in zip(lights, shapes, strict=True)]
+    olat = render_olat(scene, camera, lights, spp=256, max_depth=4, seed=1)
+    for image, light in zip(olat, lights, strict=True):
+        one = render_mixed(scene, camera, [light], spp=256, max_depth=4, seed=2)
+        np.testing.assert_allclose(image.mean((0, 1)), one.mean((0, 1)), rtol=0.04)
