@@ -42,7 +42,12 @@ class PathReference:
         spp: int,
         seed: int = 0,
     ) -> NDArray[np.float32]:
-        """Radiance `(L, P, 3)` of the flat `pixels (P,)` under each light alone, W/(sr m²)."""
+        """Radiance `(L, P, 3)` of the flat `pixels (P,)` under each light alone, W/(sr m²).
+
+        Raises `ValueError` for lamps that are not isotropic points.
+        """
+        if shaped := [x.name for x in lights if x.radius or x.size or x.profile]:
+            raise ValueError(f"the reference knows point lamps only, and {shaped} are none")
         out = np.empty((len(lights), len(pixels), 3), np.float32)
         positions, intensities = light_arrays(lights)
         for i in range(len(lights)):
