@@ -12,7 +12,7 @@ class HairAppearance:
     """Parameters of a hair fibre that has one colour along its length.
 
     `sigma_a` is the absorption per fibre radius and linear RGB channel (dimensionless);
-    `beta_m`, `beta_n` are Chiang's longitudinal and azimuthal roughness in (0, 1]; `eta` is the
+    `beta_m`, `beta_n` are Chiang's longitudinal and azimuthal roughness in [0.001, 1]; `eta` is the
     fibre's index of refraction relative to the air; `tilt_deg` is the cuticle's tilt in degrees,
     for strands that run from root to tip, where a positive tilt moves the R highlight towards the
     root. Raises `ValueError` naming the field that is out of range.
@@ -27,13 +27,13 @@ class HairAppearance:
     def __post_init__(self) -> None:
         object.__setattr__(self, "sigma_a", _rgb("sigma_a", self.sigma_a, 0.0, float("inf")))
         for name, low, high in (
-            ("beta_m", 0.0, 1.0),
-            ("beta_n", 0.0, 1.0),
-            ("eta", 1.0, 5.0),
+            ("beta_m", 0.001, 1.0),
+            ("beta_n", 0.001, 1.0),
+            ("eta", 1.0001, 5.0),
         ):
             value = float(getattr(self, name))
-            if not low < value <= high:
-                raise ValueError(f"hair: {name} must be in ({low:g}, {high:g}], got {value}")
+            if not low <= value <= high:
+                raise ValueError(f"hair: {name} must be in [{low:g}, {high:g}], got {value}")
             object.__setattr__(self, name, value)
         if not abs(self.tilt_deg) <= 20:
             raise ValueError(f"hair: tilt_deg must be in [-20, 20], got {self.tilt_deg}")

@@ -43,15 +43,20 @@ class HairScene:
     skin: tuple[float, float, float]
     hair_bsdf: Any | None
 
-    def with_hair(self, hair: HairAppearance | DiffuseHair) -> HairScene:
-        """The same geometry with another hair material; nothing is rebuilt."""
-        return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair))
+    def with_hair(
+        self, hair: HairAppearance | DiffuseHair, *, bsdf: str = "extended_hair"
+    ) -> HairScene:
+        """The same geometry with another hair material; nothing is rebuilt.
+
+        `bsdf` is the plugin of a `HairAppearance`: ours, or Mitsuba's `"hair"` for comparisons.
+        """
+        return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair, bsdf))
 
     def material_shapes(self) -> dict[str, Any]:
         """The shapes with their materials attached, as Mitsuba's own integrators expect them.
 
         For comparisons with Mitsuba: the shapes are shared with this scene and keep the materials
-        of the latest call. Fibres are attached stock BSDFs, the head a two-sided `diffuse`.
+        of the latest call. The head gets a two-sided `diffuse`.
         """
         import mitsuba as mi
 
@@ -100,14 +105,14 @@ def build_scene(
     return HairScene(mi.load_dict(parts), hair_shape, head_shape, hair, albedo, _hair_bsdf(hair))
 
 
-def mitsuba_hair(hair: HairAppearance) -> dict[str, Any]:
-    """Mitsuba's `hair` plugin for `hair`: the one place that knows its conventions.
+def mitsuba_hair(hair: HairAppearance, bsdf: str = "extended_hair") -> dict[str, Any]:
+    """The plugin `extended_hair` or Mitsuba's `hair`: the one place that knows their conventions.
 
     Mitsuba's curves run along +y of the shading frame, from root to tip, and a positive
     `scale_tilt` moves R towards the tip: the opposite of ours and of Blender's.
     """
     return {
-        "type": "hair",
+        "type": bsdf,
         "longitudinal_roughness": hair.beta_m,
         "azimuthal_roughness": hair.beta_n,
         "scale_tilt": -hair.tilt_deg,
@@ -117,20 +122,12 @@ def mitsuba_hair(hair: HairAppearance) -> dict[str, Any]:
     }
 
 
-def _hair_bsdf(hair: HairAppearance | DiffuseHair) -> Any | None:
+def _hair_bsdf(hair: HairAppearance | DiffuseHair, bsdf: str = "extended_hair") -> Any | None:
     if isinstance(hair, DiffuseHair):
         return None
-    import drjit as dr
     import mitsuba as mi
 
-    bsdf = mi.load_dict(mitsuba_hair(hair))
-    parameters: Any = mi.traverse(bsdf)
-    # A touched parameter becomes a variable of the kernels: fits change it without recompiling.
-    for name in ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta"):
-        parameters[name] = dr.opaque(mi.Float, parameters[name][0])
-    parameters["sigma_a.value"] = mi.Color3f(*(dr.opaque(mi.Float, s) for s in hair.sigma_a))
-    parameters.update()
-    return bsdf
+    return mi.load_dict(mitsuba_hair(hair, bsdf))
 
 
 def _diffuse(albedo: tuple[float, float, float]) -> dict[str, Any]:

@@ -246,9 +246,10 @@ def _checked(name: str, value: Any, low: float, high: float) -> Any:
             f"extended_hair: {name} must be finite and in [{low:g}, {high:g}], "
             f"got {numbers.min():g} to {numbers.max():g}"
         )
-    values = mi.Float(numbers)
-    dr.make_opaque(values)
-    return values
+    if len(numbers) == 1:
+        # not NumPy's memory: kernels are compiled anew for each alignment
+        return dr.opaque(mi.Float, float(numbers[0]))
+    return mi.Float(numbers)
 
 
 def _tensor(name: str, value: Any, channels: int, low: float, high: float) -> Any:

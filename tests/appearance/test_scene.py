@@ -102,13 +102,31 @@ def test_other_materials_share_the_geometry(small):
     assert colour[2] == pytest.approx(2 * colour[1], rel=5e-3)
 
 
-def test_a_positive_tilt_moves_the_first_reflection_towards_the_root():
+def test_another_hair_material_runs_in_the_same_kernel(small):
+    import drjit as dr
+    import mitsuba as mi
+
+    scene = build_scene(small.no_hair, None, hair=HAIR)
+    scenes = [
+        scene.with_hair(HairAppearance((s, 1.0, 2.0), 0.1 + s, 0.2)) for s in np.arange(8) / 9
+    ]
+    si = dr.zeros(mi.SurfaceInteraction3f, 16)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        for s in scenes:
+            dr.eval(s.hair_bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)))
+        kernels = {k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])}
+    assert len(kernels) == 1
+
+
+@pytest.mark.parametrize("bsdf", ["extended_hair", "hair"])
+def test_a_positive_tilt_moves_the_first_reflection_towards_the_root(bsdf):
     """A vertical fibre, root below, lit level: R goes down by twice the tilt."""
     fibre = Strands(np.array([[0, 0, -0.2], [0, 0, 0.2]], np.float32), np.array([0, 2]), 0.01)
     light = Light("level", np.array([0.0, -20.0, 0.0]), np.array([400.0, 400.0, 400.0]))
     # so dark that only R leaves the fibre
     hair = HairAppearance((50.0, 50.0, 50.0), 0.15, 0.3, tilt_deg=3.0)
-    scene = build_scene(fibre, None, hair=hair)
+    scene = build_scene(fibre, None, hair=hair).with_hair(hair, bsdf=bsdf)
     elevations = np.arange(-20.0, 20.5, 2.0)
     answer = []
     for e in np.radians(elevations):
