@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from reconstruction.cameras import Camera
 from stage_service.cli.output import (
     FAILED,
     CommandError,
@@ -21,6 +26,8 @@ from stage_service.cli.output import (
     progress_bar,
 )
 
+_DATA, _CAPTURE = "HAIRSTAGE_DATA", "captures/cycles_wavy"
+
 
 def add(commands: Commands) -> None:
     """Add the command."""
@@ -29,7 +36,9 @@ def add(commands: Commands) -> None:
         "bench",
         run_bench,
         "measure error against run time",
-        "olat: our renderer of many lights against Mitsuba's own path integrator, light by light. "
+        "light: our renderers against Mitsuba's own path integrator, light by light and line by "
+        "line, and how their cost grows. "
+        "agreement: a capture that Blender Cycles rendered, from its true strands. "
         "acquisition: steps and bytes a second beside what wires and disk allow. "
         "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
     )
@@ -38,6 +47,7 @@ def add(commands: Commands) -> None:
     bench.add_argument("--subject", default="wavy", help="wavy, straight, curly or a strand file")
     bench.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
     bench.add_argument("--rig", type=Path, default=Path("deploy/rigs/demo.toml"))
+    bench.add_argument("--capture", type=Path, help=f"for agreement; default: ${_DATA}/{_CAPTURE}")
     bench.add_argument("--seed", type=int, default=0)
 
 
@@ -49,31 +59,61 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def _olat(args: argparse.Namespace) -> dict[str, Any]:
-    from appearance.bench_olat import run
+def _light(args: argparse.Namespace) -> dict[str, Any]:
+    from appearance.bench_light import Subject, run
     from appearance.hair_appearance import HairAppearance
     from reconstruction.mesh import read_obj
     from reconstruction.rig import Rig
     from reconstruction.strand_files import read_strands
 
-    rig = Rig.load(args.rig)
-    with tempfile.TemporaryDirectory() as folder, progress_bar("bench olat") as progress:
-        truth = Path(folder)
-        progress("making the subject", 0.0)
-        _write_truth(args, truth)
-        appearance = json.loads((truth / "appearance.json").read_text())
-        head = truth / "head.obj"
-        progress("rendering", 0.1)
-        return run(
-            args.out,
-            strands=read_strands(truth / "strands.npz"),
-            head=read_obj(head) if head.is_file() else None,
-            hair=HairAppearance.from_dict(appearance["hair"]),
-            skin=tuple(appearance["skin"]),
-            camera=rig.cameras[0],
-            lights=rig.lights,
-            seed=args.seed,
+    def subject(name: str, head: Path | None, sigma_a: tuple[float, float, float] | None) -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            truth = Path(folder)
+            chosen = argparse.Namespace(rig=args.rig, subject=name, head=head, seed=args.seed)
+            _write_truth(chosen, truth)
+            appearance = json.loads((truth / "appearance.json").read_text())
+            hair = HairAppearance.from_dict(appearance["hair"])
+            return Subject(
+                read_strands(truth / "strands.npz"),
+                read_obj(truth / "head.obj") if (truth / "head.obj").is_file() else None,
+                hair if sigma_a is None else replace(hair, sigma_a=sigma_a),
+                tuple(appearance["skin"]),
+            )
+
+    camera = Rig.load(args.rig).cameras[0]
+    small = Camera.look_at(
+        camera.name, 128, 128, camera.center, camera.center + camera.R[2], _fov_deg(camera)
+    )
+    with progress_bar("bench light") as progress:
+        progress("making the subjects", 0.0)
+        subjects = {
+            Path(args.subject).stem: subject(args.subject, args.head, None),
+            # eumelanin of pbrt's table: 0.3 and 8
+            "straight blond": subject("straight", None, (0.126, 0.209, 0.411)),
+            "black curls": subject("curly", None, (3.35, 5.58, 10.96)),
+        }
+        return run(args.out, subjects, small, seed=args.seed, progress=progress)
+
+
+def _fov_deg(camera: Camera) -> float:
+    return float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0])))
+
+
+def _agreement(args: argparse.Namespace) -> dict[str, Any]:
+    from appearance.bench_agreement import agreement
+
+    data = os.environ.get(_DATA)
+    folder = args.capture
+    if folder is None and data is not None:
+        folder = Path(data) / _CAPTURE
+    if folder is None or not folder.is_dir():
+        raise CommandError(
+            f"bench agreement: no capture at {folder}: name its folder with --capture, "
+            f"or the folder that holds {_CAPTURE} in ${_DATA}",
+            FAILED,
         )
+    with progress_bar("bench agreement") as progress:
+        return agreement(args.out, folder, seed=args.seed, progress=progress)
 
 
 def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
@@ -100,7 +140,8 @@ def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
 
 
 BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
-    "olat": _olat,
+    "light": _light,
+    "agreement": _agreement,
     "acquisition": _acquisition,
 }
 

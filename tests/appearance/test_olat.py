@@ -7,7 +7,7 @@ import pytest
 
 from appearance.hair_appearance import DiffuseHair, HairAppearance
 from appearance.render.coverage import covered_pixels
-from appearance.render.olat import render_olat
+from appearance.render.olat import olat_tiles, render_olat
 from appearance.render.reference import PathReference
 from appearance.scene import build_scene
 from reconstruction.cameras import Camera
@@ -86,6 +86,40 @@ def test_diffuse_fibres_agree_with_mitsubas_path(tufted):
     ours = render_olat(scene, camera, lights, spp=256, max_depth=6, pixels=pixels).mean(1)
     path = PathReference(scene, max_depth=6).render(camera, lights, pixels, spp=128).mean(1)
     np.testing.assert_allclose(ours, path, rtol=0.015)
+
+
+def test_memory_is_bounded_by_tiles_that_make_up_the_image(tufted):
+    scene, camera, lights = tufted
+    covered, memory = covered_pixels(scene, camera), 1 << 16
+    tiles = list(olat_tiles(scene, camera, lights, spp=4, seed=2, max_depth=4, memory=memory))
+    assert len(tiles) > 3
+    assert all(3 * radiance.nbytes < memory for _, radiance in tiles)
+    np.testing.assert_array_equal(np.sort(np.concatenate([index for index, _ in tiles])), covered)
+    image = render_olat(scene, camera, lights, spp=4, seed=2, max_depth=4, memory=memory)
+    for index, radiance in tiles:
+        np.testing.assert_array_equal(image.reshape(3, -1, 3)[:, index], radiance)
+
+
+def test_black_and_white_hair_stay_finite(tufted):
+    scene, camera, lights = tufted
+    black, white = (
+        render_olat(
+            scene.with_hair(HairAppearance((s, s, s), 0.3, 0.3)), camera, lights, spp=8, seed=1
+        )
+        for s in (1e4, 0.0)
+    )
+    assert np.isfinite(white).all()
+    assert np.isfinite(black).all()
+    assert 0 < black.mean() < white.mean()
+
+
+def test_a_camera_that_sees_nothing_gets_black_images(tufted):
+    scene, _, lights = tufted
+    away = Camera.look_at("away", 8, 6, (0, 0, 1.0), (0, 0, 2.0), 20)
+    image = render_olat(scene, away, lights)
+    assert image.shape == (3, 6, 8, 3)
+    assert not image.any()
+    assert not list(olat_tiles(scene, away, lights))
 
 
 def test_lights_superpose(tufted):

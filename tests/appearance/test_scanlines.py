@@ -5,7 +5,7 @@ import pytest
 
 from appearance.hair_appearance import HairAppearance
 from appearance.render.olat import render_olat
-from appearance.render.scanlines import render_scanlines
+from appearance.render.scanlines import render_scanlines, scanline_tiles
 from appearance.scene import build_scene
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
@@ -120,6 +120,16 @@ def test_a_moved_subject_is_a_moved_stage(small, above):
     )["proj"]
     assert a.max() > 1
     np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-3 * a.max())
+
+
+def test_memory_is_bounded_by_tiles_that_make_up_the_sweep(floor, above):
+    how = {"spp": 2, "max_depth": 1, "seed": 4, "memory": 1 << 18}
+    whole = render_scanlines(floor, above, [projector()], **how)["proj"].reshape(16, -1, 3)
+    tiles = list(scanline_tiles(floor, above, [projector()], **how))
+    assert len(tiles) > 3
+    assert all(3 * films["proj"].nbytes < how["memory"] for _, films in tiles)
+    for index, films in tiles:
+        np.testing.assert_array_equal(whole[:, index], films["proj"])
 
 
 def test_same_seed_same_bytes(small):
