@@ -1,0 +1,335 @@
+"""Cameras from sightings of one board in many poses: each lens alone, then all together.
+
+Zhang's method (2000) starts every camera, shared poses tie them to one another, and a bundle
+adjustment over all lenses, cameras and board poses has the last word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.calibration.boards import Board, Sighting
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.least_squares import Solution, minimise
+from reconstruction.calibration.rigid import Rigid, align_devices
+from reconstruction.cameras import Camera
+
+Array = NDArray[np.float64]
+Sightings = Mapping[str, Mapping[str, Sighting]]
+
+LEAST = 8  # corners in a sighting
+CORNER = 0.05  # pixels: no corner is better than this
+LOOSE = 0.02  # of the focal length: a larger deviation is no calibration
+LENSES = ((), (0,), (0, 1), (0, 1, 2, 3))
+"""Sets of distortion numbers (k1, k2, p1, p2) that a lens may need; k3 needs wider ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSolution:
+    """Calibrated `cameras`, and the board's poses `board_to_world` by capture.
+
+    By camera: `rms` of reprojection in pixels, `seen` (captures, corners), `focal_deviation`
+    relative, `position_deviation` in metres, against the camera that is named first in `rms`.
+    `residuals` holds (N, 2) pixels by camera.
+    """
+
+    cameras: tuple[Camera, ...]
+    board_to_world: dict[str, Rigid]
+    rms: dict[str, float]
+    seen: dict[str, tuple[int, int]]
+    focal_deviation: dict[str, float]
+    position_deviation: dict[str, float]
+    residuals: dict[str, Array]
+
+
+def calibrate_cameras(
+    nominal: Sequence[Camera], board: Board, sightings: Sightings, *, keep_lens: bool = False
+) -> CameraSolution:
+    """Calibrate the cameras called as in `nominal` from `sightings[camera][capture]`.
+
+    `nominal` gives sizes and, by the rigid motion that fits it best, the world's frame; with
+    `keep_lens` it also gives K and distortion, and one pose of the board is enough. Lengths are
+    the board's.
+
+    Raises `CalibrationError` where a camera has not seen the board, where the poses of the board do
+    not determine its lens, and where no pose ties cameras together.
+    """
+    usable = {c.name: _usable(c, board, sightings.get(c.name, {}), keep_lens) for c in nominal}
+    alone = [_Lens.kept(c) if keep_lens else _one_lens(c, board, usable[c.name]) for c in nominal]
+    bundle = _Bundle(board, [c.name for c in nominal], usable, alone)
+    solution = minimise(bundle, bundle.start(_chain(board, usable, alone)), huber=3.0)
+    return _result(bundle, solution, nominal)
+
+
+def _usable(
+    camera: Camera, board: Board, seen: Mapping[str, Sighting], keep_lens: bool
+) -> dict[str, Sighting]:
+    out = {
+        pose: s
+        for pose, s in seen.items()
+        if len(s) >= LEAST
+        and not board._opencv.checkCharucoCornersCollinear(s.ids.astype(np.int32)[:, None])
+    }
+    need = 1 if keep_lens else 3
+    if len(out) < need:
+        raise CalibrationError(
+            f"{camera.name}: sees {LEAST} or more corners of the board in {len(out)} of the "
+            f"captures, its lens and pose need {need}"
+            + (" at different tilts" if need > 1 else "")
+            + ": shoot the board nearer to it, larger in its picture, or check the board's numbers"
+        )
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Lens:
+    """fx, fy, cx, cy, k1, k2, p1, p2, k3 `(9,)`, and which of them are estimated."""
+
+    values: Array
+    free: NDArray[np.int64]
+
+    @classmethod
+    def kept(cls, camera: Camera) -> _Lens:
+        K = camera.K
+        values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera.distortion])
+        return cls(values, np.zeros(0, np.int64))
+
+    def matrix(self) -> Array:
+        fx, fy, cx, cy = self.values[:4]
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Lens:
+    """The lens with as many numbers as the sightings bear out (Bayesian information criterion)."""
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_LU
+    corners = [board.corners[s.ids].astype(np.float32) for s in seen.values()]
+    pixels = [s.pixels.astype(np.float32) for s in seen.values()]
+    count = 2 * sum(len(p) for p in pixels)
+    best: tuple[float, _Lens] | None = None
+    spread = np.inf
+    for lens in LENSES:
+        fixed = flags
+        fixed |= 0 if 0 in lens else cv2.CALIB_FIX_K1
+        fixed |= 0 if 1 in lens else cv2.CALIB_FIX_K2
+        fixed |= 0 if 2 in lens else cv2.CALIB_ZERO_TANGENT_DIST
+        try:
+            rms, K, bent, _, _, deviation, _, _ = cv2.calibrateCameraExtended(
+                corners, pixels, (camera.width, camera.height), None, None, flags=fixed
+            )
+        except cv2.error:
+            continue  # as below: a lens that these poses leave open
+        if not (np.isfinite(K).all() and np.isfinite(deviation).all() and K[0, 0] > 0):
+            continue
+        worse = max(1.0, CORNER / max(rms, 1e-9))  # a lucky fit is no proof
+        relative = float(np.max(deviation.ravel()[:2] / (K[0, 0], K[1, 1]))) * worse
+        score = count * np.log(max(rms, 0.2 * CORNER) ** 2) + len(lens) * np.log(count)
+        if relative < LOOSE and (best is None or score < best[0]):
+            values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], bent.ravel()[:5]])
+            best = score, _Lens(values, np.array([0, 1, 2, 3, *(4 + k for k in lens)]))
+        spread = min(spread, relative)
+    if best is None:
+        tilts = _tilts(board, seen)
+        raise CalibrationError(
+            f"{camera.name}: {len(seen)} poses of the board leave the lens open: its focal length "
+            f"is known to {spread:.1%} at best (limit {LOOSE:.0%}), the board's planes differ by "
+            f"{tilts:.0f}° at most: tilt the board by 30° or more in several directions, or keep "
+            "the nominal lens"
+        )
+    return best[1]
+
+
+def _tilts(board: Board, seen: Mapping[str, Sighting]) -> float:
+    """Degrees between the two most different directions of foreshortening, roughly."""
+    normals = []
+    for s in seen.values():
+        H, _ = cv2.findHomography(board.corners[s.ids][:, :2], s.pixels)
+        if H is None:
+            continue
+        A = H[:2, :2] - np.outer(s.pixels.mean(axis=0), H[2, :2])
+        values = np.linalg.svd(A, compute_uv=False)
+        normals.append(np.degrees(np.arccos(np.clip(values[1] / values[0], 0, 1))))
+    return float(np.ptp(normals)) if normals else 0.0
+
+
+def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid:
+    """Board to camera."""
+    _, turn, shift = cv2.solvePnP(
+        board.corners[sighting.ids],
+        sighting.pixels,
+        lens.matrix(),
+        lens.values[4:],
+        flags=cv2.SOLVEPNP_IPPE,
+    )
+    _, turn, shift = cv2.solvePnP(
+        board.corners[sighting.ids],
+        sighting.pixels,
+        lens.matrix(),
+        lens.values[4:],
+        turn,
+        shift,
+        useExtrinsicGuess=True,
+    )
+    return Rigid(cv2.Rodrigues(turn)[0], shift.ravel())
+
+
+def _chain(
+    board: Board, usable: Mapping[str, Mapping[str, Sighting]], lenses: Sequence[_Lens]
+) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
+    """World-to-camera and board-to-world poses: the first camera is the world.
+
+    A tree over the sightings, those with most corners first (Prim).
+    """
+    edges = {
+        (name, pose): _pose(lens, board, s)
+        for (name, seen), lens in zip(usable.items(), lenses, strict=True)
+        for pose, s in seen.items()
+    }
+    first = next(iter(usable))
+    cameras, boards = {first: Rigid.identity()}, dict[str, Rigid]()
+    while True:
+        ready = [e for e in edges if (e[0] in cameras) != (e[1] in boards)]
+        if not ready:
+            break
+        name, pose = max(ready, key=lambda e: len(usable[e[0]][e[1]]))
+        if name in cameras:
+            boards[pose] = cameras[name].inverse() @ edges[name, pose]
+        else:
+            cameras[name] = edges[name, pose] @ boards[pose].inverse()
+    if apart := sorted(set(usable) - set(cameras)):
+        raise CalibrationError(
+            f"no capture of the board ties {apart} to {sorted(cameras)}: shoot poses that a camera "
+            "of each group sees"
+        )
+    return cameras, boards
+
+
+class _Bundle:
+    """Residuals of all corners with their derivatives: lenses, cameras but the first, boards."""
+
+    def __init__(
+        self,
+        board: Board,
+        names: Sequence[str],
+        usable: Mapping[str, Mapping[str, Sighting]],
+        lenses: Sequence[_Lens],
+    ) -> None:
+        self.board, self.names, self.usable, self.lenses = board, list(names), usable, lenses
+        self.poses = sorted({p for seen in usable.values() for p in seen})
+        ends = np.cumsum([0] + [len(lens.free) for lens in lenses])
+        self.lens_at = [np.arange(a, b) for a, b in pairwise(ends)]
+        self.cameras_from = int(ends[-1]) - 6  # the first camera is the world
+        self.boards_from = self.cameras_from + 6 * len(self.names)
+        self.size = self.boards_from + 6 * len(self.poses)
+        self.count = 2 * sum(len(s) for seen in usable.values() for s in seen.values())
+
+    def start(self, poses: tuple[dict[str, Rigid], dict[str, Rigid]]) -> Array:
+        """Parameters from lenses and poses."""
+        cameras, boards = poses
+        x = np.zeros(self.size)
+        for lens, at in zip(self.lenses, self.lens_at, strict=True):
+            x[at] = lens.values[lens.free]
+        for k, name in enumerate(self.names[1:], 1):
+            x[self.camera_at(k)] = cameras[name].vector()
+        for k, pose in enumerate(self.poses):
+            x[self.board_at(k)] = boards[pose].vector()
+        return x
+
+    def camera_at(self, k: int) -> NDArray[np.int64]:
+        """Where camera number `k` > 0 has its pose."""
+        return np.arange(6) + self.cameras_from + 6 * k
+
+    def board_at(self, k: int) -> NDArray[np.int64]:
+        """Where board number `k` has its pose."""
+        return np.arange(6) + self.boards_from + 6 * k
+
+    def lens(self, x: Array, k: int) -> _Lens:
+        """Camera number `k`'s lens at the parameters `x`."""
+        values = self.lenses[k].values.copy()
+        values[self.lenses[k].free] = x[self.lens_at[k]]
+        return replace(self.lenses[k], values=values)
+
+    def camera_pose(self, x: Array, k: int) -> Rigid:
+        """World to camera number `k`."""
+        return Rigid.identity() if k == 0 else Rigid.from_vector(x[self.camera_at(k)])
+
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        r, J = np.empty(self.count), np.zeros((self.count, self.size))
+        row = 0
+        for k, name in enumerate(self.names):
+            lens, camera = self.lens(x, k), self.camera_pose(x, k).vector()
+            for pose, s in self.usable[name].items():
+                b = self.board_at(self.poses.index(pose))
+                part = slice(row, row + 2 * len(s))
+                row = part.stop
+                turn, shift, *d = cv2.composeRT(x[b][:3], x[b][3:], camera[:3], camera[3:])
+                pixels, D = cv2.projectPoints(
+                    self.board.corners[s.ids], turn, shift, lens.matrix(), lens.values[4:]
+                )
+                r[part] = (pixels.reshape(-1, 2) - s.pixels).ravel() / CORNER
+                # columns: rotation 3, translation 3, fx, fy, cx, cy, k1, k2, p1, p2, k3; and
+                # composeRT's: d r3 / d r1, t1, r2, t2, then d t3 / d the same
+                wrt = D[:, :6] @ np.block([d[:4], d[4:]])
+                J[part, b] = wrt[:, :6] / CORNER
+                if k > 0:
+                    J[part, self.camera_at(k)] = wrt[:, 6:] / CORNER
+                J[part, self.lens_at[k]] = D[:, 6:15][:, lens.free] / CORNER
+        return r, J
+
+
+def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> CameraSolution:
+    x = solution.x
+    found = []
+    for k, c in enumerate(nominal):
+        lens, pose = bundle.lens(x, k), bundle.camera_pose(x, k)
+        more: dict[str, Any] = {"distortion": lens.values[4:], "filter_sigma": c.filter_sigma}
+        try:
+            camera = Camera(
+                c.name, c.width, c.height, lens.matrix(), pose.rotation, pose.translation, **more
+            )
+        except ValueError as error:
+            raise CalibrationError(
+                f"{error}: shoot the board into the corners of its picture"
+            ) from error
+        found.append(camera)
+    frame = align_devices(found, nominal)
+    residuals, row = {}, 0
+    for name in bundle.names:
+        count = 2 * sum(len(s) for s in bundle.usable[name].values())
+        residuals[name] = CORNER * solution.residual[row : row + count].reshape(-1, 2)
+        row += count
+    return CameraSolution(
+        cameras=tuple(frame.inverse().seen_by(c) for c in found),
+        board_to_world={
+            p: frame @ Rigid.from_vector(x[bundle.board_at(k)]) for k, p in enumerate(bundle.poses)
+        },
+        rms={n: float(np.sqrt((r**2).sum(axis=1).mean())) for n, r in residuals.items()},
+        seen={n: (len(s), sum(map(len, s.values()))) for n, s in bundle.usable.items()},
+        focal_deviation={
+            n: float(max(solution.deviation[at[:2]] / x[at[:2]], default=0.0))
+            for n, at in zip(bundle.names, bundle.lens_at, strict=True)
+        },
+        position_deviation={
+            n: 0.0 if k == 0 else _position_deviation(solution, bundle.camera_at(k))
+            for k, n in enumerate(bundle.names)
+        },
+        residuals=residuals,
+    )
+
+
+def _position_deviation(solution: Solution, at: NDArray[np.int64]) -> float:
+    """Metres, from the covariance of rotation vector and translation."""
+    x, C = solution.x[at], solution.covariance[np.ix_(at, at)]
+    step = 1e-6 * np.eye(6)
+
+    def centre(v: Array) -> Array:
+        return Rigid.from_vector(v).inverse().translation
+
+    J = np.stack([(centre(x + d) - centre(x - d)) / 2e-6 for d in step], axis=1)
+    return float(np.sqrt(np.trace(J @ C @ J.T)))

@@ -1,0 +1,88 @@
+"""A calibrated rig beside the true one, once their worlds are brought together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.calibration.rigid import align_devices
+from reconstruction.cameras import Pinhole
+from reconstruction.projectors import Projector
+from reconstruction.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
+    """Errors of `found` against `truth` in the frame in which the cameras agree best.
+
+    By camera: `reprojection_px`, mean and largest over a head-sized ball of points; `centre_mm`;
+    `turn_deg`. By projector: the rows' error over the same points, `plane_mm` what that is where
+    they are, `axis_mm` and `along_axis_mm` of its centre across and along its x axis, `turn_deg`.
+    By lamp: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
+    """
+    frame = align_devices(found.cameras, truth.cameras)
+    ball = _ball()
+    cameras = {}
+    for c in found.cameras:
+        ours, true = frame.inverse().seen_by(c), truth.camera(c.name)
+        off = np.linalg.norm(ours.project(ball)[0] - true.project(ball)[0], axis=1)
+        cameras[c.name] = {
+            "reprojection_px": [float(off.mean()), float(off.max())],
+            **_pose(ours, true),
+        }
+    projectors = {}
+    for p in found.projectors:
+        mine, its = frame.inverse().seen_by(p), truth.projector(p.name)
+        projectors[p.name] = _rows(mine, its, ball)
+    lamps = {}
+    for light in found.lights:
+        place, lamp = frame(light.position), truth.light(light.name)
+        distance = float(np.linalg.norm(lamp.position))
+        cosine = place @ lamp.position / (np.linalg.norm(place) * distance)
+        strength = light.intensity.mean() / max(float(lamp.intensity.mean()), 1e-300)
+        lamps[light.name] = {
+            "position": float(np.linalg.norm(place - lamp.position) / distance),
+            "direction_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            "intensity": float(abs(strength - 1)),
+        }
+    return {"cameras": cameras, "projectors": projectors, "lamps": lamps}
+
+
+def _ball(radius: float = 0.1, count: int = 500) -> Array:
+    rng = np.random.default_rng(0)
+    way = rng.standard_normal((count, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    return np.asarray(radius * rng.uniform(size=(count, 1)) ** (1 / 3) * way)
+
+
+def _pose(ours: Pinhole, true: Pinhole) -> dict[str, float]:
+    return {
+        "centre_mm": 1e3 * float(np.linalg.norm(ours.center - true.center)),
+        "turn_deg": _turn_deg(ours, true),
+    }
+
+
+def _turn_deg(ours: Pinhole, true: Pinhole) -> float:
+    skew = ours.R @ true.R.T
+    sine = np.linalg.norm(
+        [skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]
+    )
+    return float(np.degrees(np.arctan2(sine, np.trace(skew) - 1)))
+
+
+def _rows(ours: Projector, true: Projector, ball: Array) -> dict[str, float]:
+    row = true.project(ball)[0][:, 1]
+    off = ours.project(ball)[0][:, 1] - row
+    plane = ours.plane(row)
+    away = np.abs((plane[:, :3] * ball).sum(axis=1) + plane[:, 3])
+    shift = true.R @ (ours.center - true.center)
+    return {
+        "rows": float(np.sqrt((off**2).mean())),
+        "plane_mm": 1e3 * float(away.max()),
+        "axis_mm": 1e3 * float(np.hypot(shift[1], shift[2])),
+        "along_axis_mm": 1e3 * float(abs(shift[0])),
+        "turn_deg": _turn_deg(ours, true),
+    }

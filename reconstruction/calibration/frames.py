@@ -1,0 +1,39 @@
+"""Pictures less their dark frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture import Capture, Step
+
+
+def dark_rgb(capture: Capture, camera: str, exposure: float) -> NDArray[np.float32]:
+    """Mean of the dark frames `(H, W, 3)` at the nearest exposure; zeros where none was shot."""
+    steps = [s for s in capture.of_kind("dark") if capture.has(s, camera)]
+    if not steps:
+        c = capture.rig.camera(camera)
+        return np.zeros((c.height, c.width, 3), np.float32)
+    nearest = min((s.exposure for s in steps), key=lambda e: abs(e - exposure))
+    return np.mean(
+        [capture.frame(s, camera) for s in steps if s.exposure == nearest], axis=0, dtype=np.float32
+    )
+
+
+def dark_response(
+    capture: Capture, step: Step, camera: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The frame less the dark one, at full level `(H, W, 3)`, and where it is saturated."""
+    image, saturated = capture.response_and_saturated(step, camera)
+    level = step.level if step.level > 0 else 1.0
+    return image - dark_rgb(capture, camera, step.exposure) / np.float32(level), saturated
+
+
+def lamp_response(
+    capture: Capture, light: str, camera: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """`Capture.light` less the dark frame, at full level `(H, W, 3)`, and where it is saturated."""
+    image, saturated = capture.light(light, camera)
+    step = next(s for s in capture.of_kind("olat") if s.light == light)
+    level = step.level if step.level > 0 else 1.0
+    return image - dark_rgb(capture, camera, step.exposure) / np.float32(level), saturated

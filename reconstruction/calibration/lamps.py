@@ -1,0 +1,318 @@
+"""Lamps from what they do to spheres: highlights on mirrors, shading of diffuse ones.
+
+A mirror's highlight is a direction from the sphere, sharp but with the base line of the spheres
+alone for a distance. A diffuse sphere's shading says how far the light is by how it falls off over
+the sphere, and how strong it is. Each serves alone; together they make up for one another: the
+diffuse sphere's answer, with its covariance, is what the mirrors' bundle adjustment knows before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.least_squares import Solution, minimise
+from reconstruction.calibration.spheres import Highlight, crossing, mirrored
+from reconstruction.cameras import Camera
+from reconstruction.lights import Light
+
+Array = NDArray[np.float64]
+
+MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better
+LOOSE = 0.05  # of the distance: a larger deviation is no position
+SAME_PLACE = np.radians(0.5)  # between rays that are to cross
+
+
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """Samples of diffuse spheres under one lamp alone.
+
+    `points` and `normals (N, 3)`, `share (N,)`: albedo / π, `radiance (N, 3)` at full level, and
+    its `deviation (N,)` from noise. `centre (3,)` and `radius` are those of the (first) sphere,
+    `centre_deviation` in metres.
+    """
+
+    points: Array
+    normals: Array
+    share: Array
+    radiance: Array
+    deviation: Array
+    centre: Array
+    radius: float
+    centre_deviation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Glint:
+    """`highlight` of the lamp `light` that `camera` sees on mirror sphere number `sphere`."""
+
+    light: str
+    camera: Camera
+    sphere: int
+    highlight: Highlight
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A calibrated `light` with the `covariance (3, 3)` of its position, m².
+
+    `intensity_deviation` is relative, None where only mirrors showed the lamp: its intensity is nominal.
+    """
+
+    light: Light
+    covariance: Array
+    intensity_deviation: float | None
+
+    @property
+    def deviation(self) -> float:
+        """Of the position along its worst direction, metres."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+
+def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
+    """Position and intensity of a lamp from diffuse spheres: near Lambertian shading.
+
+    Radiance = albedo / π · I · n·v / |v|³, v from the point to the lamp. `nominal` gives the
+    lamp's profile and aim, which stay, and where to begin.
+
+    Raises `CalibrationError` where the spheres are not lit or the distance stays open.
+    """
+    grey = shading.radiance.mean(axis=1)
+    lit = grey > 6 * np.maximum(shading.deviation, 1e-12)
+    if lit.sum() < 100:
+        raise CalibrationError(
+            f"lamp {nominal.name}: {int(lit.sum())} pixels of the diffuse sphere answer it, 100 "
+            "are needed: it is behind the sphere for every camera, dark, or too dim for the "
+            "exposure: move the sphere or expose longer"
+        )
+    start = _far(shading, grey, lit)
+    towards = start / np.linalg.norm(start)
+    distance = float(np.linalg.norm(nominal.position - shading.centre))
+    position = shading.centre + distance * towards
+    unit = replace(nominal, position=position, intensity=np.ones(3))
+    form = shading.share * unit.intensity_towards(shading.points)[:, 0]
+    cosine = shading.normals @ towards
+    use = lit & (cosine > 0.15) & (form > 0)
+    if use.sum() < 100:
+        raise CalibrationError(
+            f"lamp {nominal.name}: its light falls on the diffuse sphere from where no camera sees "
+            "it well: move the sphere, or aim a camera at its lit side"
+        )
+    x, n, s = shading.points[use], shading.normals[use], form[use]
+    value = grey[use]
+    error = np.hypot(shading.deviation[use], MODEL * value)
+
+    def function(p: Array) -> tuple[Array, Array]:
+        v = p[:3] - x
+        squared = (v * v).sum(axis=1)
+        nv = (n * v).sum(axis=1)
+        strength = s * np.exp(p[3]) / squared**1.5
+        model = strength * nv
+        slope = strength[:, None] * (n - (3 * nv / squared)[:, None] * v)
+        J = np.column_stack([slope, model]) / error[:, None]
+        return (model - value) / error, J
+
+    v = position - x
+    guess = s * (n * v).sum(axis=1) / (v * v).sum(axis=1) ** 1.5
+    begin = np.log(max(float(guess @ value / (guess @ guess)), 1e-12))
+    solution = minimise(function, np.append(position, begin))
+    found = solution.x[:3]
+    distance = float(np.linalg.norm(found - shading.centre))
+    # a sphere that is taken to be off its place turns every normal on it
+    lever = (distance / shading.radius * shading.centre_deviation) ** 2
+    covariance = solution.covariance[:3, :3] + lever * np.eye(3)
+    lamp = Lamp(
+        replace(nominal, position=found, intensity=np.full(3, np.exp(solution.x[3]))),
+        covariance,
+        float(solution.deviation[3]),
+    )
+    if not lamp.deviation < LOOSE * distance:
+        raise CalibrationError(
+            f"lamp {nominal.name}: shading leaves its position open by {lamp.deviation:.3g} m at "
+            f"{distance:.3g} m (limit {LOOSE:.0%}): use a larger sphere, or several places"
+        )
+    return with_intensity(lamp, shading)
+
+
+def with_intensity(lamp: Lamp, shading: Shading) -> Lamp:
+    """`lamp` with the intensity per channel that its place and the `shading` say."""
+    towards = lamp.light.position - shading.points
+    squared = (towards**2).sum(axis=1)
+    unit = replace(lamp.light, intensity=np.ones(3))
+    form = shading.share * unit.intensity_towards(shading.points)[:, 0]
+    form = form * (shading.normals * towards).sum(axis=1) / squared**1.5
+    use = form > 0.15 * form.max()
+    weight = 1 / (shading.deviation[use] ** 2 + (MODEL * shading.radiance[use].mean(axis=1)) ** 2)
+    A = form[use] * weight
+    intensity = A @ shading.radiance[use] / (A @ form[use])
+    return replace(lamp, light=replace(lamp.light, intensity=np.maximum(intensity, 0)))
+
+
+def mirrored_lamps(
+    nominal: Mapping[str, Light],
+    glints: Sequence[Glint],
+    radius: float,
+    known: Mapping[str, Lamp],
+) -> tuple[dict[str, Lamp], Array, float]:
+    """Lamps from highlights on mirror spheres of `radius`; `known` is what shading said of them.
+
+    Solves for all lamps and the spheres' centres at once, by reprojection of the highlights.
+    Returns lamps whose position is found to `LOOSE`, the centres `(S, 3)`, and the highlights' rms
+    in pixels.
+
+    Raises `CalibrationError` where a sphere cannot be placed: fewer than two viewpoints.
+    """
+    names = sorted({g.light for g in glints})
+    spheres = 1 + max(g.sphere for g in glints)
+    centres = np.array([_place(glints, s, radius) for s in range(spheres)])
+    lamp = np.array([names.index(g.light) for g in glints])
+    sphere = np.array([g.sphere for g in glints])
+    pixel = np.array([g.highlight.pixel for g in glints])
+    error = np.array([g.highlight.deviation for g in glints])
+    cameras = {g.camera.name: g.camera for g in glints}
+    of = {n: np.array([k for k, g in enumerate(glints) if g.camera.name == n]) for n in cameras}
+    eyes = np.array([g.camera.center for g in glints])
+    start = _begin(nominal, known, names, glints, centres, radius)
+    count = 3 * len(names)
+
+    def residual(x: Array) -> Array:
+        lamps, centre = x[:count].reshape(-1, 3)[lamp], x[count:].reshape(-1, 3)[sphere]
+        at = mirrored(eyes, lamps, centre, radius)
+        out = np.empty((len(glints), 2))
+        for name, k in of.items():
+            out[k] = (cameras[name].project(at[k])[0] - pixel[k]) / error[k, None]
+        return out.ravel()
+
+    # what shading knew: rows that weigh a lamp's change by the root of its information
+    priors = [
+        (k, known[n].light.position, np.linalg.cholesky(np.linalg.inv(known[n].covariance)).T)
+        for k, n in enumerate(names)
+        if n in known
+    ]
+
+    def function(x: Array) -> tuple[Array, sparse.csr_array]:
+        r, h = residual(x), 1e-6
+        row = np.arange(2 * len(glints))
+        entries = []
+        # no highlight shares its lamp or sphere with another's parameters: step them all at once
+        for owner, offset, size in ((lamp, 0, count), (sphere, count, len(x) - count)):
+            for axis in range(3):
+                step = np.zeros_like(x)
+                step[offset + axis : offset + size : 3] = h
+                slope = (residual(x + step) - residual(x - step)) / (2 * h)
+                entries.append((slope, row, np.repeat(offset + 3 * owner + axis, 2)))
+        rest = [W @ (x[3 * k : 3 * k + 3] - p) for k, p, W in priors]
+        for i, (k, _, W) in enumerate(priors):
+            rows, columns = np.indices((3, 3)).reshape(2, -1)
+            entries.append((W.ravel(), 2 * len(glints) + 3 * i + rows, 3 * k + columns))
+        value, rows, columns = (np.concatenate(e) for e in zip(*entries, strict=True))
+        shape = (2 * len(glints) + 3 * len(priors), len(x))
+        return np.concatenate([r, *rest]), sparse.csr_array((value, (rows, columns)), shape=shape)
+
+    solution = minimise(function, np.concatenate([start.ravel(), centres.ravel()]))
+    return _lamps(nominal, known, names, solution, glints)
+
+
+def _lamps(
+    nominal: Mapping[str, Light],
+    known: Mapping[str, Lamp],
+    names: Sequence[str],
+    solution: Solution,
+    glints: Sequence[Glint],
+) -> tuple[dict[str, Lamp], Array, float]:
+    out = {}
+    centres = solution.x[3 * len(names) :].reshape(-1, 3)
+    for k, name in enumerate(names):
+        at = np.arange(3 * k, 3 * k + 3)
+        before = known.get(name)
+        light = before.light if before else nominal[name]
+        lamp = Lamp(
+            replace(light, position=solution.x[at]),
+            solution.covariance[np.ix_(at, at)],
+            before.intensity_deviation if before else None,
+        )
+        distance = np.linalg.norm(lamp.light.position - centres.mean(axis=0))
+        if lamp.deviation < LOOSE * distance:
+            out[name] = lamp
+    pixels = solution.residual[: 2 * len(glints)].reshape(-1, 2)
+    pixels = pixels * np.array([g.highlight.deviation for g in glints])[:, None]
+    return out, centres, float(np.sqrt((pixels**2).sum(axis=1).mean()))
+
+
+def _far(shading: Shading, grey: Array, lit: NDArray[np.bool_]) -> Array:
+    """Direction and strength `(3,)` of a far light: radiance = max(n·g, 0)."""
+    use, g = lit, np.zeros(3)
+    for _ in range(4):
+        A = shading.normals[use] * shading.share[use, None]
+        g = np.linalg.lstsq(A, grey[use], rcond=None)[0]
+        use = lit & (shading.normals @ g > 0.2 * np.linalg.norm(g))
+        if use.sum() < 20:
+            break
+    return g
+
+
+def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:
+    """About where a mirror sphere is: a far lamp's image stands half a radius before its centre.
+
+    So the crossings of the rays to each lamp's highlight lie on a sphere of half the radius.
+    """
+    images = []
+    widest = 0.0
+    mine = [g for g in glints if g.sphere == sphere]
+    for light in sorted({g.light for g in mine}):
+        of = [g for g in mine if g.light == light]
+        eyes = np.array([g.camera.center for g in of])
+        rays = np.array([g.camera.rays(g.highlight.pixel) for g in of])
+        at, angle = crossing(eyes, rays)
+        widest = max(widest, angle)
+        if angle > 4 * SAME_PLACE:
+            images.append(at)
+    if not images:
+        who = sorted({g.camera.name for g in mine})
+        raise CalibrationError(
+            f"mirror sphere {sphere + 1}: no lamp's highlight is seen from two places ({who}, "
+            f"{np.degrees(widest):.2g}° apart at most): a second camera must see it"
+        )
+    v = np.array(images)
+    if len(v) < 6:
+        return np.asarray(v.mean(axis=0))
+    middle = v.mean(axis=0)
+    A = np.column_stack([2 * (v - middle), np.ones(len(v))])
+    fit = np.linalg.lstsq(A, ((v - middle) ** 2).sum(axis=1), rcond=1e-3)[0][:3]
+    fit *= min(1.0, radius / max(float(np.linalg.norm(fit)), 1e-12))
+    return np.asarray(middle + fit)
+
+
+def _begin(
+    nominal: Mapping[str, Light],
+    known: Mapping[str, Lamp],
+    names: Sequence[str],
+    glints: Sequence[Glint],
+    centres: Array,
+    radius: float,
+) -> Array:
+    """Where to begin `(L, 3)`: along the mean mirrored ray, as far as nominal."""
+    out: Array = np.empty((len(names), 3))
+    for k, name in enumerate(names):
+        if name in known:
+            out[k] = known[name].light.position
+            continue
+        rays: list[Array] = []
+        for g in (g for g in glints if g.light == name):
+            centre, w = centres[g.sphere], g.camera.rays(g.highlight.pixel)
+            along = (centre - g.camera.center) @ w
+            off = centre - g.camera.center - along * w
+            deep = np.sqrt(max(radius**2 - off @ off, 0.0))
+            n = (g.camera.center + (along - deep) * w - centre) / radius
+            n = n / np.linalg.norm(n)
+            rays.append(w - 2 * (w @ n) * n)
+        ray: Array = np.mean(rays, axis=0)
+        middle: Array = centres.mean(axis=0)
+        away = np.linalg.norm(nominal[name].position - middle)
+        out[k] = middle + ray * (away / max(float(np.linalg.norm(ray)), 1e-9))
+    return out

@@ -1,0 +1,266 @@
+"""Projectors as inverse cameras: the rows that a sweep decodes on a board in known poses.
+
+A sweep of rows says one coordinate of two. The planes of light of a pinhole projector all hold one
+line, its x axis through its centre, and the seven numbers that rows determine are that line (4),
+and row against angle about it (3: focal length and principal point along y, and the turn). Where
+along the line the centre is, and the focal length and principal point along x, no row tells: they
+stay as nominal, relative to the device, and change no plane of light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from reconstruction.calibration.boards import Board
+from reconstruction.calibration.cameras import CameraSolution
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.frames import dark_response
+from reconstruction.calibration.least_squares import Linearised, minimise, numeric
+from reconstruction.calibration.rigid import Rigid
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture
+from reconstruction.light_planes.peaks import find_peaks
+from reconstruction.projectors import Projector
+
+Array = NDArray[np.float64]
+
+MOST = 20_000  # points: more do not make it better
+LOOSE = 0.02  # radians between planes, and metres: a larger deviation is no calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Points `points (N, 3)` of the world, their rows `row (N,)` and deviations `(N,)`, in rows."""
+
+    points: Array
+    row: Array
+    deviation: Array
+
+    @classmethod
+    def join(cls, parts: Sequence[Rows]) -> Rows:
+        """All of them; at most `MOST`, evenly taken."""
+        if not parts:
+            return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+        joined = [
+            np.concatenate([getattr(p, f) for p in parts]) for f in ("points", "row", "deviation")
+        ]
+        every = max(1, -(-len(joined[0]) // MOST))
+        return cls(*(a[::every] for a in joined))
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectorSolution:
+    """The calibrated `projector`; `points` used; `rms` of the rows' residuals, rows.
+
+    `axis_deviation` (metres) is of the line through the centre that all planes hold,
+    `turn_deviation` (radians) of the rotation; `conditioning` is `Solution.conditioning`.
+    """
+
+    projector: Projector
+    points: int
+    rms: float
+    axis_deviation: float
+    turn_deviation: float
+    conditioning: float
+
+
+UNDETERMINED = (
+    "the centre's place along the projector's x axis, K[0, 0], K[0, 1], K[0, 2]: rows say nothing "
+    "of them, and no plane of light depends on them; kept as nominal"
+)
+
+
+def rows_on_board(
+    capture: Capture, camera: Camera, projector: str, board: Board, board_to_world: Rigid
+) -> Rows:
+    """What `camera`, calibrated, decodes of `projector`'s sweep on the board, one point a pixel.
+
+    Pixels that see an edge of the print are left out: the line's centre of light is not its centre
+    there. So are saturated ones.
+    """
+    peaks = find_peaks(capture, camera.name, projector)
+    first = np.unique(peaks.pixel @ (1, camera.width), return_index=True)[1]
+    first = first[~peaks.saturated[first]]
+    rays = camera.rays(peaks.pixel[first].astype(float)) @ board_to_world.rotation
+    origin = board_to_world.inverse()(camera.center)
+    if not len(rays) or origin[2] >= 0:
+        return Rows.join([])
+    distance = -origin[2] / np.where(rays[:, 2] > 1e-6, rays[:, 2], np.inf)
+    flat = origin + distance[:, None] * rays
+    footprint = np.abs(origin[2]) / camera.K[0, 0]
+    slant = np.median(np.where(rays[:, 2] > 1e-6, 1 / np.maximum(rays[:, 2], 0.1), 10.0))
+    good = (distance > 0) & board.plain(flat[:, :2], float(1.2 * footprint * slant))
+    flat, first = flat[good], first[good]
+    return Rows(board_to_world(flat), peaks.row[first], peaks.deviation[first])
+
+
+def calibrate_projector(nominal: Projector, rows: Rows) -> ProjectorSolution:
+    """The projector whose planes of light meet `rows`, in the world of the points.
+
+    `nominal` gives the size, the line's width, intensity and what rows leave open.
+
+    Raises `CalibrationError` where too few points are there or all of them lie in one plane: that
+    leaves two of the seven numbers open.
+    """
+    where = f"projector {nominal.name}"
+    if len(rows.row) < 50:
+        raise CalibrationError(
+            f"{where}: {len(rows.row)} points of the board decode, 50 are needed: is the sweep in "
+            "the board captures, and does its light reach the board's printed side?"
+        )
+    start = _linear(nominal, rows)
+    solution = minimise(_linearised(nominal, rows), start)
+    deviation = solution.deviation
+    axis, turn = float(deviation[3:5].max()), float(deviation[:3].max())
+    if not max(axis, turn) < LOOSE:
+        raise CalibrationError(
+            f"{where}: {len(rows.row)} decoded points leave its planes of light open by "
+            f"{axis * 1e3:.3g} mm and {np.degrees(turn):.3g}° (limit {LOOSE * 1e3:g} mm, "
+            f"{np.degrees(LOOSE):.2g}°): {_shape(rows.points)}; shoot the sweep on boards at "
+            "several distances and tilts"
+        )
+    weighted = solution.residual * rows.deviation
+    return ProjectorSolution(
+        _projector(nominal, solution.x),
+        len(rows.row),
+        float(np.sqrt(np.mean(weighted**2))),
+        axis,
+        turn,
+        solution.conditioning,
+    )
+
+
+def projector_intensities(
+    projectors: Sequence[Projector],
+    captures: Mapping[str, Capture],
+    cameras: CameraSolution,
+    board: Board,
+    white: float,
+) -> dict[str, Array]:
+    """Radiant intensities `(3,)` from the tracking frames (all projectors on), W/sr per channel.
+
+    The print is Lambertian; its paper has the albedo `white`. Each pixel's light is the sum over
+    projectors of albedo / π · I · cosine / distance², which non-negative least squares solves.
+    """
+    rows: list[Array] = []
+    values: list[Array] = []
+    for pose, capture in captures.items():
+        steps = capture.of_kind("tracking")[:1]
+        if not steps or pose not in cameras.board_to_world:
+            continue
+        to_world = cameras.board_to_world[pose]
+        for camera in cameras.cameras:
+            if not capture.has(steps[0], camera.name):
+                continue
+            image, saturated = dark_response(capture, steps[0], camera.name)
+            points, pixels = _paper(camera, board, to_world)
+            x, y = pixels.T
+            ok = ~saturated[y, x]
+            rows.append(_arriving(projectors, points[ok], -to_world.rotation[:, 2]))
+            values.append(image[y[ok], x[ok]])
+    if not rows:
+        return {}
+    A, b = np.concatenate(rows) * (white / np.pi), np.concatenate(values)
+    reached = (A > 0).any(axis=1)
+    if not reached.any():
+        return {}
+    channels = np.stack([nnls(A[reached], b[reached, c])[0] for c in range(3)], axis=1)
+    return {
+        p.name: channels[k]
+        for k, p in enumerate(projectors)
+        if (A[:, k] > 0).sum() >= 50 and channels[k].any()
+    }
+
+
+def _paper(camera: Camera, board: Board, to_world: Rigid) -> tuple[Array, NDArray[np.int64]]:
+    """World points `(N, 3)` of unprinted paper, well inside it, and the pixels that see them."""
+    step = board.square / 24
+    x, y = np.meshgrid(*(np.arange(step, s, step) for s in board.size))
+    flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    facing = to_world.inverse()(camera.center)[2] < 0
+    pixels, depth = camera.project(to_world(flat))
+    seen = camera.inside(pixels) & (depth > 0) & facing
+    margin = 1.5 * float(np.median(depth)) / camera.K[0, 0] * 1.5
+    seen &= board.plain(flat[:, :2], margin) & ~board.ink(flat[:, :2])
+    nearest = np.clip(np.rint(pixels[seen]), 0, (camera.width - 1, camera.height - 1)).astype(int)
+    # the point that the pixel's centre sees, not the one that fell into the pixel
+    origin = to_world.inverse()(camera.center)
+    rays = camera.rays(nearest.astype(float)) @ to_world.rotation
+    points = origin - (origin[2] / rays[:, 2:]) * rays
+    return to_world(points), nearest
+
+
+def _arriving(projectors: Sequence[Projector], points: Array, normal: Array) -> Array:
+    """Cosine over squared distance `(N, P)`, 0 outside a beam."""
+    out = []
+    for p in projectors:
+        towards = p.center - points
+        squared = (towards**2).sum(axis=1)
+        at, depth = p.project(points)
+        lit = p.inside(at) & (depth > 0)
+        out.append(np.where(lit, np.maximum(towards @ normal, 0) / squared**1.5, 0.0))
+    return np.stack(out, axis=1)
+
+
+def _projector(nominal: Projector, x: Array) -> Projector:
+    """From rotation (3), the centre's y and z (2) in the device's frame, log focal length, cy."""
+    turn = Rigid.from_vector(np.append(x[:3], np.zeros(3))).rotation
+    R = turn @ nominal.R
+    # nominal centre, shifted across the axis
+    center = nominal.center + R.T @ (0.0, x[3], x[4])
+    K = nominal.K.copy()
+    K[1, 1], K[1, 2] = K[1, 1] * np.exp(x[5]), x[6]
+    return replace(nominal, K=K, R=R, t=-R @ center)
+
+
+def _linearised(nominal: Projector, rows: Rows) -> Linearised:
+    def residual(x: Array) -> Array:
+        p = _projector(nominal, x)
+        local = rows.points @ p.R.T + p.t
+        return (p.K[1, 1] * local[:, 1] / local[:, 2] + p.K[1, 2] - rows.row) / rows.deviation
+
+    return numeric(residual)
+
+
+def _linear(nominal: Projector, rows: Rows) -> Array:
+    """The parameters that `rows` give by the direct linear transform; nominal where it is weak."""
+    start = np.array([0.0, 0, 0, 0, 0, 0, nominal.K[1, 2]])
+    middle = rows.points.mean(axis=0)
+    size = np.abs(rows.points - middle).max()
+    X = np.column_stack([(rows.points - middle) / size, np.ones(len(rows.row))])
+    v0, dv = rows.row.mean(), max(float(np.ptp(rows.row)), 1.0)
+    v = (rows.row - v0) / dv
+    A = np.column_stack([X, -v[:, None] * X]) / rows.deviation[:, None]
+    _, values, vt = np.linalg.svd(A, full_matrices=False)
+    if values[-2] < 3 * max(values[-1], 1e-9 * values[0]):
+        return start  # the points lie in one plane, or nearly: the deviations will tell
+    a, c = vt[-1][:4], vt[-1][4:]
+    a = dv * a + v0 * c
+    # to metres about the world's origin
+    a, c = (np.append(q[:3] / size, q[3] - q[:3] @ middle / size) for q in (a, c))
+    length = np.linalg.norm(c[:3])
+    a, c = a / length, c / length
+    if c[:3] @ middle + c[3] < 0:
+        a, c = -a, -c
+    forward = c[:3]
+    cy = float(a[:3] @ forward)
+    down = a[:3] - cy * forward
+    fy = float(np.linalg.norm(down))
+    down = down / fy
+    R = np.stack([np.cross(down, forward), down, forward])
+    if not 0.2 < fy / nominal.K[1, 1] < 5:
+        return start
+    # y and z of the centre: the planes a - cy c = 0 and c = 0 hold it
+    yz = np.array([-(a[3] - cy * c[3]) / fy, -c[3]])
+    turn = Rigid(R @ nominal.R.T, np.zeros(3)).vector()[:3]
+    return np.array([*turn, *(yz - (R @ nominal.center)[1:]), np.log(fy / nominal.K[1, 1]), cy])
+
+
+def _shape(points: Array) -> str:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
+    return f"the points spread over {', '.join(f'{s * 1e3:.3g}' for s in spread)} mm (deviation)"

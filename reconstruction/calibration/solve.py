@@ -1,0 +1,226 @@
+"""From captures of boards and spheres to a rig, with a report of what is known how well."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reconstruction.calibration.boards import Board, Sighting
+from reconstruction.calibration.cameras import CameraSolution, calibrate_cameras
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.lamps import Lamp, mirrored_lamps, shaded_lamp
+from reconstruction.calibration.lamps import with_intensity as lamp_with_intensity
+from reconstruction.calibration.projectors import (
+    UNDETERMINED,
+    Rows,
+    calibrate_projector,
+    projector_intensities,
+    rows_on_board,
+)
+from reconstruction.calibration.sphere_captures import gather_shading, glints_of
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture
+from reconstruction.lights import Light
+from reconstruction.projectors import Projector
+from reconstruction.report import Progress, Report, Stage, silent
+from reconstruction.rig import Rig
+from reconstruction.silhouettes import NoSilhouette, lit_image
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What stood on the stage: the board, its paper's albedo, the spheres' radii and albedo.
+
+    Metres. The diffuse sphere's albedo scales all lamps' intensities, the paper's all projectors';
+    None leaves the projectors' intensities nominal.
+    """
+
+    board: Board = Board()  # noqa: RUF009  frozen
+    paper: float | None = None
+    mirror_radius: float = 0.05
+    diffuse_radius: float = 0.05
+    diffuse_albedo: float = 0.8
+
+
+def calibrate(
+    nominal: Rig,
+    boards: Sequence[Capture],
+    targets: Targets = Targets(),
+    *,
+    mirrors: Sequence[Capture] = (),
+    diffuse: Sequence[Capture] = (),
+    keep_lens: bool = False,
+    progress: Progress = silent,
+) -> tuple[Rig, Report]:
+    """Calibrate the rig whose devices are called as in `nominal`, and are about there.
+
+    `boards` are captures of the board, one a pose, with `all_on` frames; where they hold sweeps,
+    projectors are calibrated too. `mirrors` and `diffuse` are captures of a sphere with single
+    lamps, one a place. Pictures are taken less their dark frames. What no capture determines stays
+    nominal and stands in the report's stages under `undetermined`.
+
+    The world is `nominal`'s: the rigid motion that fits its cameras best. Raises
+    `CalibrationError` where cameras stay open.
+    """
+    report = Report()
+    poses = {f"{k:02d} {c.path.name}": c for k, c in enumerate(boards)}
+    with report.stage("cameras") as stage:
+        found = _cameras(nominal, poses, targets.board, keep_lens, stage, progress)
+    projectors: tuple[Projector, ...] = nominal.projectors
+    if projectors:
+        with report.stage("projectors") as stage:
+            projectors = _projectors(nominal, poses, found, targets, stage, progress)
+    lights: tuple[Light, ...] = nominal.lights
+    if lights:
+        with report.stage("lamps") as stage:
+            lights = _lamps(nominal, found.cameras, targets, mirrors, diffuse, stage, progress)
+    return Rig(nominal.name, found.cameras, lights, projectors), report
+
+
+def sightings(captures: Mapping[str, Capture], camera: str, board: Board) -> dict[str, Sighting]:
+    """Where `camera` sees the corners, by capture; captures without a lit frame are left out."""
+    out = {}
+    for name, capture in captures.items():
+        try:
+            out[name] = board.find(lit_image(capture, camera))
+        except NoSilhouette:
+            continue
+    return out
+
+
+def _cameras(
+    nominal: Rig,
+    captures: Mapping[str, Capture],
+    board: Board,
+    keep_lens: bool,
+    stage: Stage,
+    progress: Progress,
+) -> CameraSolution:
+    seen = {}
+    for k, camera in enumerate(nominal.cameras):
+        progress(f"board in {camera.name}", 0.4 * k / len(nominal.cameras))
+        seen[camera.name] = sightings(captures, camera.name, board)
+    found = calibrate_cameras(nominal.cameras, board, seen, keep_lens=keep_lens)
+    stage.figures.update(
+        rms_px=found.rms,
+        captures_and_corners={k: list(v) for k, v in found.seen.items()},
+        focal_deviation=found.focal_deviation,
+        position_deviation_mm={k: 1e3 * v for k, v in found.position_deviation.items()},
+        distortion={c.name: c.distortion.tolist() for c in found.cameras},
+        lens="nominal" if keep_lens else "estimated",
+    )
+    for name, rms in found.rms.items():
+        if rms > 0.3:
+            stage.warn(f"{name}: corners are off by {rms:.2g} px (rms): is the board flat?")
+    return found
+
+
+def _projectors(
+    nominal: Rig,
+    captures: Mapping[str, Capture],
+    cameras: CameraSolution,
+    targets: Targets,
+    stage: Stage,
+    progress: Progress,
+) -> tuple[Projector, ...]:
+    out: list[Projector] = []
+    undetermined: dict[str, str] = {}
+    figures = {}
+    for k, p in enumerate(nominal.projectors):
+        progress(f"sweep of {p.name}", 0.4 + 0.3 * k / len(nominal.projectors))
+        parts = [
+            rows_on_board(capture, camera, p.name, targets.board, cameras.board_to_world[pose])
+            for pose, capture in captures.items()
+            if pose in cameras.board_to_world
+            and any(s.projector == p.name for s in capture.of_kind("scanline"))
+            for camera in cameras.cameras
+        ]
+        try:
+            one = calibrate_projector(p, Rows.join(parts))
+        except CalibrationError as error:
+            undetermined[p.name] = str(error)
+            out.append(p)
+            continue
+        undetermined[p.name] = UNDETERMINED
+        out.append(one.projector)
+        figures[p.name] = {
+            "points": one.points,
+            "rms_rows": one.rms,
+            "axis_deviation_mm": 1e3 * one.axis_deviation,
+            "turn_deviation_deg": float(np.degrees(one.turn_deviation)),
+        }
+    if targets.paper is None:
+        why = "without the paper's albedo"
+    else:
+        values = projector_intensities(out, captures, cameras, targets.board, targets.paper)
+        out = [replace(p, intensity=values[p.name]) if p.name in values else p for p in out]
+        missing = [p.name for p in out if p.name not in values]
+        why = f"of {missing}: no tracking frame shows the board in their light" if missing else ""
+        stage.figures["intensity"] = {k: v.tolist() for k, v in values.items()}
+    if why:
+        undetermined["intensity"] = f"{why}; kept as nominal"
+    stage.figures.update(projectors=figures, undetermined=undetermined)
+    return tuple(out)
+
+
+def _lamps(
+    nominal: Rig,
+    cameras: Sequence[Camera],
+    targets: Targets,
+    mirrors: Sequence[Capture],
+    diffuse: Sequence[Capture],
+    stage: Stage,
+    progress: Progress,
+) -> tuple[Light, ...]:
+    undetermined: dict[str, str] = {}
+    names = [x.name for x in nominal.lights]
+    shadings = {}
+    if diffuse:
+        progress("diffuse sphere", 0.7)
+        shadings = gather_shading(
+            diffuse, cameras, targets.diffuse_radius, targets.diffuse_albedo, names
+        )
+    lamps: dict[str, Lamp] = {}
+    for name, shading in shadings.items():
+        try:
+            lamps[name] = shaded_lamp(nominal.light(name), shading)
+        except CalibrationError as error:
+            undetermined[name] = str(error)
+    if mirrors:
+        progress("mirror sphere", 0.85)
+        glints = glints_of(mirrors, cameras, names)
+        if not glints:
+            raise CalibrationError(
+                "mirror sphere: no camera sees a highlight of any single lamp: are there OLAT "
+                "frames, and is the sphere in view?"
+            )
+        by_mirror, centres, rms = mirrored_lamps(
+            {x.name: x for x in nominal.lights}, glints, targets.mirror_radius, lamps
+        )
+        for name, lamp in by_mirror.items():
+            lamps[name] = lamp_with_intensity(lamp, shadings[name]) if name in lamps else lamp
+        stage.figures.update(
+            highlights=len(glints),
+            highlights_rms_px=rms,
+            saturated_highlights=sum(g.highlight.saturated for g in glints),
+            mirror_centres=centres.tolist(),
+        )
+        for name in {g.light for g in glints} - set(lamps):
+            undetermined[name] = (
+                "its highlights tell its direction but not its distance: shoot the mirror sphere "
+                "in more places, or a diffuse one"
+            )
+    for name in names:
+        if name not in lamps:
+            undetermined.setdefault(name, "no sphere was shot under it alone")
+        elif lamps[name].intensity_deviation is None:
+            undetermined[name] = "intensity: only mirrors showed it; kept as nominal"
+    stage.figures.update(
+        calibrated=len(lamps),
+        position_deviation_mm={k: 1e3 * v.deviation for k, v in lamps.items()},
+        intensity_deviation={k: v.intensity_deviation for k, v in lamps.items()},
+        undetermined=undetermined,
+    )
+    return tuple(lamps[x.name].light if x.name in lamps else x for x in nominal.lights)

@@ -1,0 +1,119 @@
+"""What captures of spheres say of each lamp: shading samples and highlights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.frames import lamp_response
+from reconstruction.calibration.lamps import Glint, Shading
+from reconstruction.calibration.spheres import find_highlight, find_outline, sphere_centre
+from reconstruction.cameras import Camera
+from reconstruction.capture import Capture
+from reconstruction.silhouettes import NoSilhouette, background_noise, lit_image
+
+Array = NDArray[np.float64]
+Samples = tuple[Array, Array, Array, Array]
+
+MOST = 600  # pixels of a camera: more do not make a lamp better
+RIM = 0.35  # cosine to the viewer below which a pixel's mean is not its middle
+
+
+def gather_shading(
+    captures: Sequence[Capture],
+    cameras: Sequence[Camera],
+    radius: float,
+    albedo: float,
+    lights: Sequence[str],
+) -> dict[str, Shading]:
+    """Samples of a diffuse sphere in the places of `captures`, by lamp; `radius` in metres.
+
+    The sphere's place is found from its outline in the lit frames. Raises `CalibrationError` where
+    a capture shows none.
+    """
+    found: dict[str, list[Samples]] = {name: [] for name in lights}
+    centres, worst = [], 0.0
+    for capture in captures:
+        outlines = {}
+        for c in cameras:
+            try:
+                outlines[c.name] = find_outline(lit_image(capture, c.name))
+            except NoSilhouette:
+                continue
+        centre, covariance = sphere_centre(
+            cameras, outlines, radius, f"diffuse sphere in {capture.path}"
+        )
+        centres.append(centre)
+        worst = max(worst, float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))
+        for c in cameras:
+            pixels, points, normals = _disc(c, centre, radius)
+            for name in lights if len(pixels) else ():
+                if not capture.has_light(name, c.name):
+                    continue
+                image, saturated = lamp_response(capture, name, c.name)
+                x, y = pixels.T
+                ok = ~saturated[y, x]
+                values = image[y, x][ok].astype(np.float64)
+                # the mean of three channels, and the photons' share that grows with the light
+                noise = background_noise(image.mean(axis=-1))
+                error = np.full(len(values), noise)
+                found[name].append((points[ok], normals[ok], values, error))
+    out = {}
+    for name, parts in found.items():
+        if not parts:
+            continue
+        points, normals, values, error = (np.concatenate(p) for p in zip(*parts, strict=True))
+        share = np.full(len(points), albedo / np.pi)
+        middle = np.mean(centres, axis=0)
+        out[name] = Shading(points, normals, share, values, error, middle, radius, worst)
+    if not out:
+        raise CalibrationError(
+            f"diffuse sphere: none of {[str(c.path) for c in captures]} holds frames of single "
+            "lamps (OLAT)"
+        )
+    return out
+
+
+def glints_of(
+    captures: Sequence[Capture], cameras: Sequence[Camera], lights: Sequence[str]
+) -> list[Glint]:
+    """Highlights on a mirror sphere in the places of `captures`, of every camera and lamp."""
+    out = []
+    for number, capture in enumerate(captures):
+        for c in cameras:
+            for name in lights:
+                if not capture.has_light(name, c.name):
+                    continue
+                image, saturated = lamp_response(capture, name, c.name)
+                highlight = find_highlight(image.mean(axis=-1), saturated)
+                if highlight is not None:
+                    out.append(Glint(name, c, number, highlight))
+    return out
+
+
+def _disc(camera: Camera, centre: Array, radius: float) -> tuple[NDArray[np.int64], Array, Array]:
+    """Pixels `(N, 2)` well inside the sphere's picture, with points and normals `(N, 3)` there."""
+    box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+    at, depth = camera.project(centre + radius * box)
+    if not (depth > 0).all():
+        return np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+    limit = (camera.width - 1, camera.height - 1)
+    low, high = (
+        np.clip(np.rint(e), 0, limit).astype(int) for e in (at.min(axis=0), at.max(axis=0))
+    )
+    pixels = np.stack(
+        np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), axis=-1
+    ).reshape(-1, 2)
+    rays = camera.rays(pixels.astype(float))
+    towards = centre - camera.center
+    along = rays @ towards
+    inside = along**2 - (towards @ towards - radius**2)
+    points = camera.center + (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays
+    normals = (points - centre) / radius
+    good = (inside > 0) & (-(normals * rays).sum(axis=1) > RIM)
+    pixels, points, normals = pixels[good], points[good], normals[good]
+    every = max(1, -(-len(pixels) // MOST))
+    return pixels[::every], points[::every], normals[::every]

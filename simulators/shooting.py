@@ -1,0 +1,62 @@
+"""Captures of a prop without the wires: for calibrations, whose devices are tested elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.capture import Capture, Step
+from reconstruction.capture_writer import CaptureWriter
+from reconstruction.rig import Rig
+from simulators.frames import FrameMaker, Snapshot
+from simulators.projector_controller import FULL, Show
+from simulators.responses import Responder
+from simulators.sensor import Sensor
+
+
+def shoot(
+    path: Path,
+    rig: Rig,
+    responder: Responder,
+    steps: Sequence[Step],
+    *,
+    written: Rig | None = None,
+    sensor: Sensor = Sensor(),  # noqa: B008  frozen
+    seed: int = 0,
+) -> Capture:
+    """Expose `steps` on the true `rig` and write the capture `path`, a new folder.
+
+    `written` is what the capture's rig.json says of the stage: nominal places, where nobody knows
+    the true ones. Raises `CaptureError`.
+    """
+    frames = FrameMaker(rig, responder, sensor, seed)
+    writer = CaptureWriter.create(path, written or rig, {"steps": list(steps)})
+    names = [x.name for x in rig.lights]
+    records = []
+    for step in steps:
+        power = np.zeros(len(names))
+        if step.kind == "all_on":
+            power[:] = step.level
+        elif step.light is not None:
+            power[names.index(step.light)] = step.level
+        show = Show()
+        if step.kind in ("scanline", "tracking"):
+            show = Show(round(step.level * FULL), step.projector, step.row or 0)
+        unit = 1 / (sensor.gain * step.exposure)
+        for camera in rig.cameras:
+            shot = Snapshot(step.index + 1, power, show, 0)
+            counts = frames.counts(camera.name, shot, step.exposure).astype(np.float64)
+            records.append(
+                writer.store_frame(
+                    step,
+                    camera.name,
+                    (counts - sensor.black) * unit,
+                    full_scale=(sensor.full_scale - sensor.black) * unit,
+                    count_scale=unit,
+                )
+            )
+    writer.commit(records)
+    writer.finish("completed")
+    return Capture(path)
