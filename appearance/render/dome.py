@@ -40,10 +40,18 @@ class Dome:
 
     @classmethod
     def over(cls, scene: HairScene, lights: Sequence[Light], degree: int) -> Self:
-        """The dome that holds `lights`. Raises `ValueError` if the subject reaches out of it."""
+        """The dome that holds `lights`, spherical lamps as points.
+
+        Raises `ValueError` if the subject reaches out of it, or a lamp is directed.
+        """
         import drjit as dr
         import mitsuba as mi
 
+        if directed := [x.name for x in lights if x.profile is not None or x.size is not None]:
+            raise ValueError(
+                f"{', '.join(directed[:3])}: the smooth basis knows lamps that shine alike in all "
+                "directions; render with degree=None"
+            )
         position = np.array([light.position for light in lights]) * SCALE
         distance = np.linalg.norm(position, axis=1)
         box = scene.mi_scene.bbox()

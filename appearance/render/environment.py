@@ -15,15 +15,8 @@ from numpy.typing import NDArray
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
-from appearance.render.paths import (
-    Surface,
-    Wave,
-    camera_rays,
-    each_sample,
-    opaque,
-    opaque_index,
-    walk,
-)
+from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
+from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene import HairScene
 from reconstruction.cameras import Camera
 
@@ -38,7 +31,6 @@ def render_environment(
     seed: int = 0,
     rotation_deg: float = 0.0,
     background: bool = False,
-    rr_depth: int = 4,
 ) -> NDArray[np.float32]:
     """Radiance `(H, W, 3)`, W/(sr m²), of the subject lit by `envmap (h, w, 3)` alone.
 
@@ -59,17 +51,15 @@ def render_environment(
         image[:] = np.array(sky.radiance(rays.d)).T
     index = covered_pixels(scene, camera)
     if len(index):
-        pixel = mi.UInt32(index.astype(np.uint32))
         film = dr.zeros(mi.Float, 3 * len(index))
+        gather = _Gather(Surface(scene), film, sky)
 
-        def trace(paths: Wave) -> None:
-            if background:
-                missed = ~scene.mi_scene.ray_test(paths.rays)
-                _add(film, paths.slot, sky.radiance(paths.rays.d), missed)
-            gather = _Gather(Surface(scene), film, paths.slot, sky)
-            walk(gather.surface, paths.rays, paths.rng, gather, max_depth, rr_depth)
+        def missed(ray: Any, paths: Paths) -> None:
+            _add(film, paths.slot, sky.radiance(ray.d), paths.active & (paths.depth == 0))
 
-        each_sample(camera, pixel, len(index), spp, (seed,), trace)
+        reach = Reach(max_depth)
+        escape = missed if background else None
+        follow(gather.surface, camera, index, spp, (seed,), reach, gather, escape)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
     return image.reshape(camera.height, camera.width, 3)
 
@@ -78,7 +68,8 @@ def _add(film: Any, slot: Any, value: Any, active: Any) -> None:
     import drjit as dr
 
     for channel in range(3):
-        dr.scatter_add(film, value[channel], slot * 3 + channel, active)
+        put = slot * 3 + channel
+        dr.scatter_add(film, value[channel], put, active, mode=dr.ReduceMode.NoConflicts)
 
 
 @dataclass(frozen=True)
@@ -147,14 +138,14 @@ class _Gather:
 
     surface: Surface
     film: Any
-    slot: Any
     sky: Sky
 
-    def __call__(self, si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
+    def __call__(self, si: Any, paths: Paths) -> None:
         import drjit as dr
 
-        towards, light = self.sky.sample(rng, active)
-        value = throughput * light * self.surface.eval(si, si.to_local(towards), active)
-        lit = active & (dr.max(value) > 0)
+        towards, light = self.sky.sample(paths.rng, paths.active)
+        answer = self.surface.eval(si, si.to_local(towards), paths.active)
+        value = paths.throughput * light * answer
+        lit = paths.active & (dr.max(value) > 0)
         lit &= ~self.surface.scene.mi_scene.ray_test(si.spawn_ray(towards), lit)
-        _add(self.film, self.slot, value, lit)
+        _add(self.film, paths.slot, value, lit)

@@ -14,7 +14,8 @@ from appearance.render.environment import Sky
 from appearance.render.environment_maps import check_environment
 from appearance.render.lamps import LampBank
 from appearance.render.olat import render_olat
-from appearance.render.paths import Surface, Wave, each_sample, opaque, pixel_indices, walk
+from appearance.render.paths import Surface, opaque, pixel_indices
+from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene import HairScene
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
@@ -44,7 +45,6 @@ def render_mixed(
     max_depth: int = 24,
     seed: int = 0,
     pixels: ArrayLike | None = None,
-    rr_depth: int = 4,
 ) -> NDArray[np.float32]:
     """Radiance, W/(sr m²), of the subject under everything at once: `(H, W, 3)`, or `(P, 3)`.
 
@@ -73,7 +73,7 @@ def render_mixed(
                 for m, e in zip(maps, environments, strict=True)
             ],
             index,
-            (spp, max_depth, rr_depth, seed),
+            (spp, max_depth, seed),
         )
     if pixels is not None:
         return radiance
@@ -118,22 +118,18 @@ def _render(
     choice: NDArray[np.float64],
     skies: Sequence[tuple[Sky, NDArray[np.float64]]],
     index: NDArray[np.int64],
-    how: tuple[int, int, int, int],
+    how: tuple[int, int, int],
 ) -> NDArray[np.float32]:
     import drjit as dr
     import mitsuba as mi
 
-    spp, max_depth, rr_depth, seed = how
+    spp, max_depth, seed = how
     film = dr.zeros(mi.Float, 3 * len(index))
     surface = Surface(scene)
     draw = mi.DiscreteDistribution(mi.Float(choice)) if bank is not None else None
 
-    def trace(paths: Wave) -> None:
-        gather = _Gather(surface, film, paths.slot, bank, draw, skies)
-        walk(surface, paths.rays, paths.rng, gather, max_depth, rr_depth)
-
-    pixel = mi.UInt32(index.astype(np.uint32))
-    each_sample(camera, pixel, len(index), spp, (seed,), trace)
+    gather = _Gather(surface, film, bank, draw, skies)
+    follow(surface, camera, index, spp, (seed,), Reach(max_depth), gather)
     image = np.array(film).reshape(len(index), 3)
     return np.asarray(image / np.float32(spp), dtype=np.float32)
 
@@ -144,15 +140,15 @@ class _Gather:
 
     surface: Surface
     film: Any
-    slot: Any
     bank: LampBank | None
     choice: Any
     skies: Sequence[tuple[Sky, NDArray[np.float64]]]
 
-    def __call__(self, si: Any, throughput: Any, rng: Any, first: bool, active: Any) -> None:
+    def __call__(self, si: Any, paths: Paths) -> None:
         import drjit as dr
         import mitsuba as mi
 
+        throughput, rng, active = paths.throughput, paths.rng, paths.active
         if self.bank is not None:
             light = self.choice.sample(rng.next_float32(), active)
             # the bank's intensities are divided by the probability of the choice
@@ -161,17 +157,18 @@ class _Gather:
             squared = dr.squared_norm(towards)
             wo = si.to_local(towards * dr.rsqrt(squared))
             value = throughput * self.surface.eval(si, wo, active) * (intensity / squared)
-            self._add(value, si.spawn_ray_to(target), active)
+            self._add(value, si.spawn_ray_to(target), paths)
         for sky, weight in self.skies:
             direction, radiance = sky.sample(rng, active)
             value = throughput * self.surface.eval(si, si.to_local(direction), active)
             value = value * radiance * mi.Color3f(*opaque(weight))
-            self._add(value, si.spawn_ray(direction), active)
+            self._add(value, si.spawn_ray(direction), paths)
 
-    def _add(self, value: Any, ray: Any, active: Any) -> None:
+    def _add(self, value: Any, ray: Any, paths: Paths) -> None:
         import drjit as dr
 
-        lit = active & (dr.max(dr.abs(value)) > 0)
+        lit = paths.active & (dr.max(dr.abs(value)) > 0)
         lit &= ~self.surface.scene.mi_scene.ray_test(ray, lit)
         for channel in range(3):
-            dr.scatter_add(self.film, value[channel], self.slot * 3 + channel, lit)
+            put = paths.slot * 3 + channel
+            dr.scatter_add(self.film, value[channel], put, lit, mode=dr.ReduceMode.NoConflicts)

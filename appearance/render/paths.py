@@ -123,46 +123,6 @@ class Surface:
         return dr.select(seen, dr.abs(wo.z), 0)
 
 
-def walk(
-    surface: Surface,
-    ray: Any,
-    rng: Any,
-    gather: Callable[[Any, Any, Any, bool, Any], None],
-    max_depth: int,
-    rr_depth: int,
-) -> None:
-    """Follow one path from each camera `ray` and call `gather` at its vertices.
-
-    `gather(si, throughput, rng, first, active)` is traced once for the camera's own hits (`first`)
-    and once for all later vertices; it adds to its film as a side effect. A path has at most
-    `max_depth` vertices.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    si = surface.interact(ray, mi.Bool(True))
-    active = si.is_valid()
-    throughput = mi.Color3f(1)
-    gather(si, throughput, rng, True, active)
-    if max_depth < 2:
-        return
-
-    def more(si: Any, throughput: Any, depth: Any, rng: Any, active: Any) -> Any:
-        return active
-
-    def body(si: Any, throughput: Any, depth: Any, rng: Any, active: Any) -> Any:
-        ray, throughput, active = continue_path(
-            surface, si, throughput, depth, rng, rr_depth, active
-        )
-        si = surface.interact(ray, active)
-        active = active & si.is_valid()
-        depth = depth + 1
-        gather(si, throughput, rng, False, active)
-        return si, throughput, depth, rng, active & (depth + 1 < max_depth)
-
-    dr.while_loop((si, throughput, mi.UInt32(0), rng, active), more, body, label="path")
-
-
 def light_from(
     surface: Surface,
     si: Any,
