@@ -102,16 +102,15 @@ def _fov_deg(camera: Camera) -> float:
 def _agreement(args: argparse.Namespace) -> dict[str, Any]:
     from appearance.bench_agreement import agreement
 
-    data = os.environ.get(_DATA)
-    folder = args.capture
-    if folder is None and data is not None:
-        folder = Path(data) / _CAPTURE
-    if folder is None or not folder.is_dir():
-        raise CommandError(
+    folder = args.capture or Path(os.environ.get(_DATA, ".")) / _CAPTURE
+    if not folder.is_dir():
+        absent = (
             f"bench agreement: no capture at {folder}: name its folder with --capture, "
-            f"or the folder that holds {_CAPTURE} in ${_DATA}",
-            FAILED,
+            f"or the folder that holds {_CAPTURE} in ${_DATA}"
         )
+        if args.name == "all":  # whoever has no capture still gets the others
+            return {"left_out": absent}
+        raise CommandError(absent, FAILED)
     with progress_bar("bench agreement") as progress:
         return agreement(args.out, folder, seed=args.seed, progress=progress)
 
