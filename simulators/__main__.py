@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +19,9 @@ from simulators.drift import Drift
 from simulators.faults import Faults
 from simulators.frames import FrameMaker, cache_key
 from simulators.lamps import Lamps
+from simulators.props import Prop, PropResponder, named_prop
 from simulators.render_process import RenderPool
-from simulators.responses import Quality, reproducible
+from simulators.responses import Quality, Responder, reproducible
 from simulators.sensor import Sensor
 from simulators.stage import SimulatedStage
 from simulators.subject import Subject, check_fits, load_subject
@@ -47,8 +49,9 @@ def main(arguments: list[str] | None = None) -> int:
         rig_file = load_rig_file(args.rig)
         cameras = [c.name for c in rig_file.rig.cameras]
         faults = Faults.load(args.faults, cameras) if args.faults else Faults()
-        subject = load_subject(args.subject, args.head, seed=args.seed)
-        check_fits(subject, rig_file.rig)
+        subject = named_prop(args.subject) or load_subject(args.subject, args.head, seed=args.seed)
+        if isinstance(subject, Subject):
+            check_fits(subject, rig_file.rig)
         drift = Drift(_poses(rig_file), args.drift_mm * 1e-3, args.seed)
         if args.truth_only is not None:
             write_truth(args.truth_only, subject, drift)
@@ -67,14 +70,22 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(
-    args: argparse.Namespace, rig_file: RigFile, subject: Subject, drift: Drift, faults: Faults
+    args: argparse.Namespace,
+    rig_file: RigFile,
+    subject: Subject | Prop,
+    drift: Drift,
+    faults: Faults,
 ) -> None:
     rig, sensor, quality = rig_file.rig, Sensor(), Quality.scaled(args.spp)
     leave = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: leave.set())
     with ExitStack() as stack:
-        make = functools.partial(reproducible, rig, subject, drift, quality, args.seed)
+        make: Callable[[], Responder]
+        if isinstance(subject, Subject):
+            make = functools.partial(reproducible, rig, subject, drift, quality, args.seed)
+        else:
+            make = functools.partial(PropResponder, rig, subject)
         names = [c.name for c in rig.cameras]
         responder = RenderPool(make, names, args.processes)
         key = cache_key(subject.digest(), rig.to_dict(), asdict(quality), args.seed)
@@ -107,7 +118,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--rig", type=Path, required=True, help="rig file (TOML or JSON)")
     parser.add_argument(
-        "--subject", default="wavy", help="wavy, straight, curly, or a strand file (default: wavy)"
+        "--subject",
+        default="wavy",
+        help="wavy, straight, curly, or a strand file; to calibrate: board:N, mirror:N or "
+        "diffuse:N in pose or place N (default: wavy)",
     )
     parser.add_argument("--head", type=Path, help="OBJ of the head under the strand file's hair")
     parser.add_argument("--state", type=Path, help="folder for devices.toml and the serial ports")

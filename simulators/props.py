@@ -6,6 +6,7 @@ cameras' own model, lenses included, is exact where a path tracer would be noisy
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -65,6 +66,10 @@ class BoardProp:
         normal = np.broadcast_to(-self.rotation[:, 2], points.shape)
         return Seen(pixels, points, normal, albedo)
 
+    def digest(self) -> str:
+        """A text of everything that frames depend on."""
+        return json.dumps([str(self.board), self.white, self.black, self.to_dict()])
+
     def to_dict(self) -> dict[str, Any]:
         """The true pose, ready for JSON."""
         return {"rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
@@ -97,9 +102,17 @@ class SphereProp:
         normals = (points - self.centre) / self.radius
         return Seen(pixels, points, normals, np.where(inside > 0, self.albedo, 0.0))
 
+    def digest(self) -> str:
+        """A text of everything that frames depend on."""
+        return json.dumps(self.to_dict())
+
     def to_dict(self) -> dict[str, Any]:
         """The true place, ready for JSON."""
-        return {"centre": self.centre.tolist(), "radius": self.radius, "albedo": self.albedo}
+        place = {"centre": self.centre.tolist(), "radius": self.radius}
+        return {**place, "albedo": self.albedo, "mirror": self.mirror}
+
+
+Prop = BoardProp | SphereProp
 
 
 def board_pose(number: int, board: Board) -> BoardProp:
@@ -119,7 +132,7 @@ def board_pose(number: int, board: Board) -> BoardProp:
 class PropResponder:
     """Answers as `responses.Responder` does; the prop stands still at every pose."""
 
-    def __init__(self, rig: Rig, prop: BoardProp | SphereProp, samples: int = 4) -> None:
+    def __init__(self, rig: Rig, prop: Prop, samples: int = 4) -> None:
         self._rig = rig
         self._prop = prop
         self._samples = samples
@@ -256,3 +269,18 @@ def _rays(camera: Camera, offsets: Array, around: Array) -> tuple[NDArray[np.int
     y, x = np.mgrid[y0:y1, x0:x1]
     centres = np.stack([x.ravel(), y.ravel()], axis=-1)
     return centres[:, 1] * camera.width + centres[:, 0], camera.rays(centres[:, None] + offsets)
+
+
+SPHERES = np.array([[0.0, 0, 0.02], [-0.06, 0.08, -0.05], [0.05, -0.09, -0.02], [0.02, 0.06, 0.08]])
+"""Centres of a sphere in its places, metres."""
+
+
+def named_prop(name: str) -> Prop | None:
+    """The prop called `board:N`, `mirror:N` or `diffuse:N`, N its pose or place; None: no prop."""
+    kind, _, number = name.partition(":")
+    if kind not in ("board", "mirror", "diffuse") or not number.isdigit():
+        return None
+    if kind == "board":
+        return board_pose(int(number), Board())
+    centre = SPHERES[int(number) % len(SPHERES)]
+    return SphereProp(centre, 0.05, 0.9 if kind == "mirror" else 0.8, kind == "mirror")

@@ -25,11 +25,12 @@ def shoot(
     written: Rig | None = None,
     sensor: Sensor = Sensor(),  # noqa: B008  frozen
     seed: int = 0,
+    ambient: float = 0.0,
 ) -> Capture:
     """Expose `steps` on the true `rig` and write the capture `path`, a new folder.
 
     `written` is what the capture's rig.json says of the stage: nominal places, where nobody knows
-    the true ones. Raises `CaptureError`.
+    the true ones. `ambient` W/(sr m²) reach every pixel of every frame. Raises `CaptureError`.
     """
     frames = FrameMaker(rig, responder, sensor, seed)
     writer = CaptureWriter.create(path, written or rig, {"steps": list(steps)})
@@ -47,12 +48,13 @@ def shoot(
         unit = 1 / (sensor.gain * step.exposure)
         for camera in rig.cameras:
             shot = Snapshot(step.index + 1, power, show, 0)
-            counts = frames.counts(camera.name, shot, step.exposure).astype(np.float64)
+            radiance = frames.radiance(camera.name, shot) + ambient
+            counts = sensor.expose(radiance, step.exposure, (seed, len(records)))
             records.append(
                 writer.store_frame(
                     step,
                     camera.name,
-                    (counts - sensor.black) * unit,
+                    (counts.astype(np.float64) - sensor.black) * unit,
                     full_scale=(sensor.full_scale - sensor.black) * unit,
                     count_scale=unit,
                 )

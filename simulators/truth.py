@@ -8,22 +8,26 @@ from pathlib import Path
 from reconstruction.mesh import write_obj
 from reconstruction.strand_files import write_strands
 from simulators.drift import Drift
+from simulators.props import Prop
 from simulators.subject import Subject
 
 EXPOSURES = "exposures.jsonl"
 
 
-def write_truth(folder: Path, subject: Subject, drift: Drift) -> None:
+def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
     """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`.
 
-    All at pose 0. `exposures.jsonl` beside them, begun empty here and continued by `World`, says
-    the pose of each pulse.
+    All at pose 0. Of a prop, which stands still, `prop.json` instead. `exposures.jsonl` beside
+    them, begun empty here and continued by `World`, says the pose of each pulse.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / EXPOSURES).write_text("")
+    if not isinstance(subject, Subject):
+        (folder / "prop.json").write_text(json.dumps(subject.to_dict(), indent=1) + "\n")
+        return
     write_strands(folder / "strands.npz", subject.strands)
     if subject.head is not None:
         write_obj(folder / "head.obj", subject.head)
     appearance = {"hair": subject.hair.to_dict(), "skin": list(subject.skin)}
     (folder / "appearance.json").write_text(json.dumps(appearance, indent=1) + "\n")
     (folder / "poses.json").write_text(json.dumps(drift.to_dicts(), indent=1) + "\n")
-    (folder / EXPOSURES).write_text("")

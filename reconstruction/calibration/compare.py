@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.calibration.rigid import align_devices
+from reconstruction.calibration.least_squares import minimise, numeric
+from reconstruction.calibration.rigid import Rigid, align_devices
 from reconstruction.cameras import Pinhole
 from reconstruction.projectors import Projector
 from reconstruction.rig import Rig
@@ -23,8 +24,8 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     they are, `axis_mm` and `along_axis_mm` of its centre across and along its x axis, `turn_deg`.
     By lamp: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
     """
-    frame = align_devices(found.cameras, truth.cameras)
     ball = _ball()
+    frame = _align(found, truth, ball)
     cameras = {}
     for c in found.cameras:
         ours, true = frame.inverse().seen_by(c), truth.camera(c.name)
@@ -49,6 +50,19 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
             "intensity": float(abs(strength - 1)),
         }
     return {"cameras": cameras, "projectors": projectors, "lamps": lamps}
+
+
+def _align(found: Rig, truth: Rig, ball: Array) -> Rigid:
+    """The motion after which `ball` is seen alike: poses alone trade turns for principal points."""
+    start = align_devices(found.cameras, truth.cameras)
+    true = [truth.camera(c.name).project(ball)[0] for c in found.cameras]
+
+    def residual(x: Array) -> Array:
+        back = (Rigid.from_vector(x) @ start).inverse()
+        off = [c.project(back(ball))[0] - p for c, p in zip(found.cameras, true, strict=True)]
+        return np.concatenate(off).ravel()
+
+    return Rigid.from_vector(minimise(numeric(residual), np.zeros(6)).x) @ start
 
 
 def _ball(radius: float = 0.1, count: int = 500) -> Array:

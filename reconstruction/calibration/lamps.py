@@ -61,7 +61,8 @@ class Glint:
 class Lamp:
     """A calibrated `light` with the `covariance (3, 3)` of its position, m².
 
-    `intensity_deviation` is relative, None where only mirrors showed the lamp: its intensity is nominal.
+    `intensity_deviation` is relative; None where only mirrors showed the lamp and the intensity
+    is nominal.
     """
 
     light: Light
@@ -246,10 +247,10 @@ def _lamps(
 
 def _far(shading: Shading, grey: Array, lit: NDArray[np.bool_]) -> Array:
     """Direction and strength `(3,)` of a far light: radiance = max(n·g, 0)."""
-    use, g = lit, np.zeros(3)
+    use, g = lit, np.asarray((0.0, 0.0, 0.0))
     for _ in range(4):
         A = shading.normals[use] * shading.share[use, None]
-        g = np.linalg.lstsq(A, grey[use], rcond=None)[0]
+        g = np.asarray(np.linalg.lstsq(A, grey[use], rcond=None)[0], np.float64)
         use = lit & (shading.normals @ g > 0.2 * np.linalg.norm(g))
         if use.sum() < 20:
             break

@@ -144,8 +144,9 @@ def projector_intensities(
 ) -> dict[str, Array]:
     """Radiant intensities `(3,)` from the tracking frames (all projectors on), W/sr per channel.
 
-    The print is Lambertian; its paper has the albedo `white`. Each pixel's light is the sum over
-    projectors of albedo / π · I · cosine / distance², which non-negative least squares solves.
+    The print is Lambertian; its paper has the albedo `white`, its ink any. A pixel's light is the
+    sum over projectors of albedo / π · I · cosine / distance², of paper and of ink by their shares
+    of the pixel, which non-negative least squares tells apart.
     """
     rows: list[Array] = []
     values: list[Array] = []
@@ -158,41 +159,52 @@ def projector_intensities(
             if not capture.has(steps[0], camera.name):
                 continue
             image, saturated = dark_response(capture, steps[0], camera.name)
-            points, pixels = _paper(camera, board, to_world)
+            pixels, points, share = _printed(camera, board, to_world)
             x, y = pixels.T
-            ok = ~saturated[y, x]
-            rows.append(_arriving(projectors, points[ok], -to_world.rotation[:, 2]))
+            ok = ~saturated[y, x] & _sure(projectors, points)
+            light = _arriving(projectors, points[ok], -to_world.rotation[:, 2])
+            rows.append(np.hstack([light * share[ok, None], light * (1 - share[ok, None])]))
             values.append(image[y[ok], x[ok]])
     if not rows:
         return {}
     A, b = np.concatenate(rows) * (white / np.pi), np.concatenate(values)
-    reached = (A > 0).any(axis=1)
-    if not reached.any():
+    lit = (A > 0).sum(axis=0)[: len(projectors)]
+    if not lit.any():
         return {}
-    channels = np.stack([nnls(A[reached], b[reached, c])[0] for c in range(3)], axis=1)
-    return {
-        p.name: channels[k]
-        for k, p in enumerate(projectors)
-        if (A[:, k] > 0).sum() >= 50 and channels[k].any()
-    }
+    channels = np.stack([nnls(A, b[:, c])[0] for c in range(3)], axis=1)
+    return {p.name: channels[k] for k, p in enumerate(projectors) if lit[k] >= 50}
 
 
-def _paper(camera: Camera, board: Board, to_world: Rigid) -> tuple[Array, NDArray[np.int64]]:
-    """World points `(N, 3)` of unprinted paper, well inside it, and the pixels that see them."""
-    step = board.square / 24
-    x, y = np.meshgrid(*(np.arange(step, s, step) for s in board.size))
-    flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    facing = to_world.inverse()(camera.center)[2] < 0
-    pixels, depth = camera.project(to_world(flat))
-    seen = camera.inside(pixels) & (depth > 0) & facing
-    margin = 1.5 * float(np.median(depth)) / camera.K[0, 0] * 1.5
-    seen &= board.plain(flat[:, :2], margin) & ~board.ink(flat[:, :2])
-    nearest = np.clip(np.rint(pixels[seen]), 0, (camera.width - 1, camera.height - 1)).astype(int)
-    # the point that the pixel's centre sees, not the one that fell into the pixel
-    origin = to_world.inverse()(camera.center)
-    rays = camera.rays(nearest.astype(float)) @ to_world.rotation
-    points = origin - (origin[2] / rays[:, 2:]) * rays
-    return to_world(points), nearest
+def _printed(
+    camera: Camera, board: Board, to_world: Rigid
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Pixels `(N, 2)` that see the print, points `(N, 3)` there, and each one's share of paper."""
+    to_board = to_world.inverse()
+    origin = to_board(camera.center)
+    y, x = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2]
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    if origin[2] >= 0:
+        return pixels[:0], np.zeros((0, 3)), np.zeros(0)
+    sub = (np.arange(4) + 0.5) / 4 - 0.5
+    offsets = np.stack(np.meshgrid(sub, sub), axis=-1).reshape(-1, 2)
+    rays = camera.rays(pixels[:, None] + offsets) @ to_world.rotation
+    ahead = (rays[..., 2] > 0.2).all(axis=1)  # flatter, a card shines
+    pixels, rays = pixels[ahead], rays[ahead]
+    at = origin - (origin[2] / rays[..., 2:]) * rays
+    inside = ((at[..., :2] > 0) & (at[..., :2] < board.size)).all(axis=(1, 2))
+    paper = 1 - board.ink(at[inside, :, :2]).mean(axis=1)
+    return pixels[inside], to_world(at[inside].mean(axis=1)), paper
+
+
+def _sure(projectors: Sequence[Projector], points: Array) -> NDArray[np.bool_]:
+    """Points well inside of each beam or well outside: rows do not say where its sides are."""
+    sure = np.ones(len(points), bool)
+    for p in projectors:
+        at, depth = p.project(points)
+        half = 0.5 * np.array([p.width, p.height])
+        edge = np.abs(at - half + 0.5) / half
+        sure &= (depth <= 0) | (edge < 0.85).all(axis=1) | (edge > 1.15).any(axis=1)
+    return sure
 
 
 def _arriving(projectors: Sequence[Projector], points: Array, normal: Array) -> Array:

@@ -18,7 +18,7 @@ from reconstruction.silhouettes import NoSilhouette, background_noise, lit_image
 Array = NDArray[np.float64]
 Samples = tuple[Array, Array, Array, Array]
 
-MOST = 600  # pixels of a camera: more do not make a lamp better
+MOST = 4000  # pixels of a camera
 RIM = 0.35  # cosine to the viewer below which a pixel's mean is not its middle
 
 

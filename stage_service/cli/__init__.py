@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from stage_service.cli import (
     bench,
+    calibrate,
     captures,
     demo_command,
     evaluate,
@@ -31,7 +32,17 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for group in (demo_command, processes, remote, captures, models, evaluate, bench, rigs):
+    for group in (
+        demo_command,
+        processes,
+        remote,
+        captures,
+        models,
+        evaluate,
+        bench,
+        rigs,
+        calibrate,
+    ):
         group.add(commands)
     return parser
 

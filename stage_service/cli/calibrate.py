@@ -1,0 +1,141 @@
+"""`calibrate`: a rig file from captures of a board and of spheres, and the board to print."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from stage_service.cli.output import (
+    BAD_INPUT,
+    CommandError,
+    Commands,
+    Output,
+    add_command,
+    add_group,
+    progress_bar,
+)
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    group = add_group(commands, "calibrate", "calibrate a stage")
+    rig = add_command(
+        group,
+        "rig",
+        run_rig,
+        "a rig file from captures of a board and of spheres",
+        "Calibrate cameras (and, where the captures hold sweeps, projectors) from captures of a "
+        "ChArUco board, one a pose, and lamps from captures of a mirror or diffuse sphere, one a "
+        "place. Writes a rig file with the nominal one's device tables, and beside it "
+        "NAME.report.json: what is known how well, and what no capture determined.",
+    )
+    rig.add_argument("boards", type=Path, nargs="+", metavar="CAPTURE", help="board, one a pose")
+    rig.add_argument("--rig", type=Path, help="the nominal rig file (default: the first capture's)")
+    rig.add_argument("--out", type=Path, required=True, help="rig file to write (.json)")
+    rig.add_argument("--mirror", type=Path, nargs="+", default=[], metavar="CAPTURE")
+    rig.add_argument("--diffuse", type=Path, nargs="+", default=[], metavar="CAPTURE")
+    rig.add_argument("--mirror-radius-mm", type=float, default=50.0)
+    rig.add_argument("--diffuse-radius-mm", type=float, default=50.0)
+    rig.add_argument("--diffuse-albedo", type=float, default=0.8, help="scales all lamps")
+    rig.add_argument(
+        "--paper-albedo", type=float, help="of the board; without it projectors stay as strong"
+    )
+    rig.add_argument("--keep-lens", action="store_true", help="K and distortion stay nominal")
+    rig.add_argument("--truth", type=Path, help="a rig file to compare with")
+    _board_options(rig)
+
+    board = add_command(group, "board", run_board, "the board as a picture to print")
+    board.add_argument("out", type=Path, help=".png")
+    board.add_argument("--dpi", type=float, default=300.0)
+    _board_options(board)
+
+
+def _board_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--columns", type=int, default=9, help="squares across")
+    parser.add_argument("--rows", type=int, default=7, help="squares down")
+    parser.add_argument("--square-mm", type=float, default=27.0)
+    parser.add_argument("--marker-mm", type=float, default=21.0)
+    parser.add_argument("--dictionary", default="DICT_4X4_50", help="OpenCV's name")
+
+
+def _board(args: argparse.Namespace) -> Any:
+    from reconstruction.calibration.boards import Board
+
+    square, marker = args.square_mm * 1e-3, args.marker_mm * 1e-3
+    return Board(args.columns, args.rows, square, marker, args.dictionary)
+
+
+def run_rig(args: argparse.Namespace, output: Output) -> int:
+    """Calibrate a stage."""
+    from reconstruction.calibration.compare import compare_rigs
+    from reconstruction.calibration.solve import Targets, calibrate
+    from reconstruction.capture import Capture
+    from reconstruction.rig import Rig
+    from stage_service.config import load_rig_file
+
+    if args.out.suffix != ".json":
+        raise CommandError(f"--out must end in .json, got {args.out}", BAD_INPUT, "BadInput")
+    boards = [Capture(p) for p in args.boards]
+    tables: dict[str, Any] = {}
+    if args.rig is None:
+        nominal = boards[0].rig
+    else:
+        file = load_rig_file(args.rig)
+        nominal = file.rig
+        tables = {
+            key: table.model_dump(mode="json")
+            for key in ("devices", "capture", "safety")
+            if (table := getattr(file, key)) is not None
+        }
+    targets = Targets(
+        _board(args),
+        args.paper_albedo,
+        args.mirror_radius_mm * 1e-3,
+        args.diffuse_radius_mm * 1e-3,
+        args.diffuse_albedo,
+    )
+    with progress_bar("calibrate") as progress:
+        rig, report = calibrate(
+            nominal,
+            boards,
+            targets,
+            mirrors=[Capture(p) for p in args.mirror],
+            diffuse=[Capture(p) for p in args.diffuse],
+            keep_lens=args.keep_lens,
+            progress=progress,
+        )
+    args.out.write_text(json.dumps({**rig.to_dict(), **tables}, indent=1) + "\n")
+    load_rig_file(args.out)
+    report.save(args.out.with_suffix(".report.json"))
+    data: dict[str, Any] = {
+        "rig": str(args.out),
+        "stages": {s.name: s.figures for s in report.stages},
+        "warnings": [w for s in report.stages for w in s.warnings],
+    }
+    if args.truth is not None:
+        data["errors"] = compare_rigs(rig, Rig.load(args.truth))
+    output.result(data)
+    return 0
+
+
+def run_board(args: argparse.Namespace, output: Output) -> int:
+    """Draw the board."""
+    import cv2
+
+    board = _board(args)
+    per_square = round(board.square / 0.0254 * args.dpi)
+    if per_square < 8 or not cv2.imwrite(str(args.out), board.picture(per_square)):
+        raise CommandError(
+            f"{args.out}: cannot be written, or squares of {per_square} pixels are too small",
+            BAD_INPUT,
+            "BadInput",
+        )
+    width, height = (1e3 * board.size).tolist()
+    output.result(
+        {"picture": str(args.out), "width_mm": width, "height_mm": height},
+        f"{args.out}: print it {width:g} mm wide and {height:g} mm high, measure a square, and "
+        "mount it flat with white around it",
+    )
+    return 0
