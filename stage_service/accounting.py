@@ -184,7 +184,9 @@ class FrameAccount:
 def _by_time(
     start: int, after: Sequence[int], timestamps: Sequence[float], schedule: Sequence[float]
 ) -> list[int] | None:
-    """Places that fit block ids and, to half a step, timestamps; None unless exactly one does."""
+    """Places that fit block ids and, to half a step, the time from one frame to the next; None
+    unless exactly one does. From one to the next: a box that is a little slower than its schedule
+    is late by whole steps at the end of a long run."""
     rising = all(a < b for a, b in pairwise(timestamps))
     if len(after) < 2 or not rising:
         return None
@@ -192,12 +194,13 @@ def _by_time(
     fits = []
     for first in range(start, len(schedule) - after[-1]):
         found = [first]
-        for stamp, at_least in zip(timestamps[1:], after[1:], strict=True):
-            due = schedule[first] + stamp - timestamps[0]
+        for (stamp, later), (number, next_number) in zip(
+            pairwise(timestamps), pairwise(after), strict=True
+        ):
+            due = schedule[found[-1]] + later - stamp
             nearest = min(range(len(schedule)), key=lambda i: abs(schedule[i] - due))
-            if abs(schedule[nearest] - due) > slack or nearest < max(
-                first + at_least, found[-1] + 1
-            ):
+            at_least = found[-1] + next_number - number
+            if abs(schedule[nearest] - due) > slack or nearest < at_least:
                 break
             found.append(nearest)
         else:

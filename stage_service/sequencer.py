@@ -245,11 +245,11 @@ class Sequencer:
     def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
         """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
         steps = list(todo)
-        with self._spent.on("arm"):
-            self._arm(steps[0].exposure, cameras)
         run = HardwareRun(self.stage, steps, self._lamp, rate_hz=self._rate_hz)
         self._clocked = len(steps)
         try:
+            with self._spent.on("arm"):
+                self._arm(steps[0].exposure, cameras)
             with self._spent.on("hardware run"):
                 shots = run.shoot(cameras, self._cancel, lambda: self._abort_asked)
                 self._exposing.dark()
