@@ -82,18 +82,32 @@ class _LightBank(Strict):
     settle_s: float = Field(default=0.0, ge=0.0, le=1.0)
     accept_unverified_blackout: bool = False
 
+    @property
+    def sequences(self) -> bool:
+        """Whether it has a sequence table, which the trigger box's gate steps."""
+        return False
 
-class ModbusTcpConfig(_LightBank):
+
+class _ModbusConfig(_LightBank):
+    registers: LightRegisters = LightRegisters()
+
+    @property
+    def sequences(self) -> bool:
+        """Whether it has a sequence table, which the trigger box's gate steps."""
+        r = self.registers
+        return None not in (r.sequence, r.table, r.position)
+
+
+class ModbusTcpConfig(_ModbusConfig):
     """`[devices.lights]`: a light bank on Modbus TCP."""
 
     kind: Literal["modbus_tcp"] = "modbus_tcp"
     host: str = "127.0.0.1"
     port: Port = 502
     unit: int = Field(default=1, ge=0, le=255)
-    registers: LightRegisters = LightRegisters()
 
 
-class ModbusRtuConfig(_LightBank):
+class ModbusRtuConfig(_ModbusConfig):
     """`[devices.lights]`: a light bank on Modbus RTU, 8 data bits."""
 
     kind: Literal["modbus_rtu"]
@@ -102,7 +116,6 @@ class ModbusRtuConfig(_LightBank):
     parity: Literal["N", "E", "O"] = "E"
     stop_bits: Literal[1, 2] = 1
     unit: int = Field(default=1, ge=1, le=247)
-    registers: LightRegisters = LightRegisters()
 
 
 class DmxConfig(_LightBank):

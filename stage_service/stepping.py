@@ -33,7 +33,8 @@ def runs(
     """Divide the steps of a plan into runs, and say why they are clocked as they are.
 
     A hardware-stepped run is never longer than what the cameras hold unread: the box cannot wait
-    for a slow link or disk, so the sequence waits between runs and no frame is dropped.
+    for a slow link or disk, so the sequence waits between runs and no frame is dropped. Lamps of a
+    bank without a sequence table are lit by the service.
     """
     devices = rig_file.devices
     why = ""
@@ -47,19 +48,25 @@ def runs(
         return [Run(steps, "software")], why
     assert devices is not None
     out: list[Run] = []
-    for _, group in groupby(steps, key=lambda s: s.exposure):
-        alike = tuple(group)
+    gated = devices.lights.sequences
+
+    def alike(step: Step) -> tuple[float, bool]:
+        return step.exposure, gated or step.kind not in ("olat", "all_on")
+
+    for (_, by_box), group in groupby(steps, key=alike):
+        own = tuple(group)
         size = devices.cameras.buffers
-        for i in range(0, len(alike), size):
-            part = alike[i : i + size]
-            stepping: Stepping = "hardware" if len(part) >= SHORTEST_RUN else "software"
+        for i in range(0, len(own), size):
+            part = own[i : i + size]
+            stepping: Stepping = "hardware" if by_box and len(part) >= SHORTEST_RUN else "software"
             if out and out[-1].stepping == stepping == "software":
                 part = out.pop().steps + part
             out.append(Run(part, stepping))
     clocked = sum(len(r.steps) for r in out if r.stepping == "hardware")
+    lamps = "" if gated else "; the light bank has no sequence table, so the service lights lamps"
     if clocked == 0:
-        return out, f"no {SHORTEST_RUN} steps in a row share an exposure time"
-    return out, f"the trigger box clocks {clocked} of {len(steps)} steps"
+        return out, f"no {SHORTEST_RUN} steps in a row share an exposure time{lamps}"
+    return out, f"the trigger box clocks {clocked} of {len(steps)} steps{lamps}"
 
 
 def period_s(step: Step, devices: DevicesConfig, rate_hz: float | None) -> float:

@@ -168,3 +168,59 @@ def test_brackets_are_clocked_one_exposure_at_a_time(simulated, tmp_path):
     response, saturated = Capture(tmp_path / "c").light("light_011", "cam_a")
     assert response.mean() == pytest.approx(1.2, abs=0.03)
     assert not saturated.any()
+
+
+@pytest.mark.parametrize("end", ["abort", "estop"])
+def test_a_run_that_is_cut_short_keeps_no_frame_of_a_lamp_that_lagged_behind(
+    simulated, tmp_path, end
+):
+    """The fourth flash's edges do not reach the bank: from then on it lights the lamp before."""
+    fault = (Fault("trigger", "estop", 9),) if end == "estop" else ()
+    rig_file, world = simulated(*fault)
+    run = sequencer(rig_file, tmp_path / "c", [], projectors=(), rate_hz=25.0)
+    gate, opened = world.lamps.gate, [0]
+
+    def lossy(is_open: bool) -> None:
+        opened[0] += is_open
+        if opened[0] != 4:
+            gate(is_open)
+        if end == "abort" and opened[0] == 9 and not is_open:
+            run.abort()
+
+    world.lamps.gate = lossy
+    assert run.run() == "failed"
+    told = "estop" if end == "estop" else "counting the steps of a hardware-stepped run"
+    assert told in str(run.error)
+    assert is_dark(world)
+    assert not [r for r in check_frames(tmp_path / "c").records.values() if r.file]
+
+
+LAMPS_BY_THE_SERVICE = {
+    "DMX": 'kind = "dmx_enttec"\nport = "lights"\naccept_unverified_blackout = true',
+    "no table": 'registers = { table = "none" }',
+}
+
+
+@pytest.mark.parametrize("bank", LAMPS_BY_THE_SERVICE)
+def test_lamps_without_a_sequence_table_are_lit_by_the_service(
+    bank, simulated, small_rig, tmp_path
+):
+    table = f"[devices.lights]\n{LAMPS_BY_THE_SERVICE[bank]}"
+    rig_file, _world = simulated(rig=small_rig.replace("[devices.lights]", table))
+    lights = tuple(f"light_{i:03d}" for i in range(9))
+    plan = CapturePlan(lights=lights, level={"all_on": 1.0})
+    cost = plan.cost(rig_file)
+    assert cost.stepping == {"software": 12, "hardware": 20}
+    assert "the light bank has no sequence table" in cost.stepping_why
+    run = sequencer(rig_file, tmp_path / "c", [], lights=lights, level={"all_on": 1.0})
+    assert run.run() == "completed", run.error
+    check_frames(tmp_path / "c")
+
+
+def test_a_table_without_read_back_is_stepped_by_its_position(simulated, small_rig, tmp_path):
+    table = 'accept_unverified_blackout = true\nregisters = { lit = "none" }'
+    rig = small_rig.replace("[devices.lights]", f"[devices.lights]\n{table}")
+    rig_file, _world = simulated(rig=rig)
+    run = sequencer(rig_file, tmp_path / "c", [], projectors=())
+    assert run.run() == "completed", run.error
+    check_frames(tmp_path / "c")

@@ -43,7 +43,7 @@ class ModbusLightBank:
         self.capabilities = LightCapabilities(
             reads_back=r.lit is not None,
             dead_man=None not in (r.heartbeat, r.watchdog),
-            table=TABLE_ENTRIES if None not in (r.sequence, r.table, r.position) else 0,
+            table=TABLE_ENTRIES if config.sequences else 0,
         )
         self._lamps = lamps
         self._level: int | None = None
@@ -171,7 +171,8 @@ class ModbusLightBank:
             self._armed = None
             self._write([len(entries)], sequence, f"{doing}: arming it")
             self._armed = len(entries)
-            self._confirm(0, f"{doing}: arming it")
+            if self.capabilities.reads_back:
+                self._confirm(0, f"{doing}: arming it")
 
     def position(self) -> int:
         """How many steps of the armed sequence are over."""
