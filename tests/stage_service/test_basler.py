@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +20,7 @@ from stage_service.accounting import FrameAccount
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.block_counter import BlockCounter
-from stage_service.devices.errors import Cancelled, DeviceError, DeviceUnreachable
+from stage_service.devices.errors import Cancelled, DeviceError, DeviceUnreachable, IndexShift
 
 WIDTH, HEIGHT = 32, 24
 SENSOR = Sensor()
@@ -224,6 +225,21 @@ def test_an_overtrigger_leaves_no_gap(camera):
     assert ids == [1, 2]
     for block_id in ids:
         account.arrived(block_id)
+
+
+def test_a_frame_that_nobody_asked_for_is_told_without_a_clock(camera):
+    account = FrameAccount(camera.name, camera.capabilities.block_wrap)
+    camera.arm(EXPOSURE)
+    for _ in range(3):
+        pulse(camera)
+    deadline = time.monotonic() + 2.0
+    while camera._camera.NumReadyBuffers.Value < 3:
+        assert time.monotonic() < deadline, "three frames were asked for"
+    first = camera.read(NEVER)
+    assert first.left == 2
+    with pytest.raises(IndexShift, match="2 behind block id 1"):
+        account.arrived(first.block_id, first.left)
+    assert [camera.read(NEVER).left for _ in range(2)] == [1, 0]
 
 
 def test_a_damaged_frame_is_a_lost_frame(camera):

@@ -180,7 +180,9 @@ class BaslerCamera:
                 result = self._retrieve(camera, min(max(left, 0.0), SLICE_S))
                 if result.IsValid():
                     with result:
-                        return self._frame(result, self._exposure, doing)
+                        frame = self._frame(result, self._exposure, doing)
+                    left = int(camera.NumReadyBuffers.Value)
+                    return None if frame is None else replace(frame, left=left)
                 if camera.IsCameraDeviceRemoved():
                     raise self._gone(doing)
                 if left <= 0:
