@@ -1,0 +1,239 @@
+"""Where a head is and how large: a similarity between a mesh and points, by robust ICP.
+
+Point to plane, closest points by KD-tree, Tukey's weights on the distances. (Chen and Medioni 1992;
+Zinßer, Schmidt, Niemann 2005 for the scale.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+MOTIONS = ("turn x", "turn y", "turn z", "scale", "shift x", "shift y", "shift z")
+"""The seven ways in which a similarity can change, in the order of every `(7,)` here."""
+
+_YAWS = 12
+_COARSE = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Samples of a mesh to match with: `points (M, 3)`, unit `normals (M, 3)`, outward."""
+
+    points: Array
+    normals: Array
+
+    _tree: cKDTree = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_tree", cKDTree(self.points))
+
+    def nearest(self, points: Array, limit: float) -> tuple[Array, NDArray[np.int64]]:
+        """Distances `(N,)`, never over `limit`, and samples `(N,)`: any beyond that, it is slow."""
+        distance, index = self._tree.query(points, distance_upper_bound=limit)
+        return np.minimum(distance, limit), np.where(np.isfinite(distance), index, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """`x -> scale * rotation @ x + translation` from the mesh's frame to the points'.
+
+    `deviation (7,)` are standard deviations of `MOTIONS`: radians, share, metres; they count every
+    point as independent. `stiffness (7,)` are sorted, smallest first: how far distances change, at
+    root mean square, per metre that the samples move along each principal motion; `weakest` says
+    which motion the first is. `margin` is the share by which the cost of the next best start that
+    ended elsewhere exceeds this one's (infinite where all starts ended here).
+    """
+
+    scale: float
+    rotation: Array
+    translation: Array
+    deviation: Array
+    stiffness: Array
+    weakest: str
+    margin: float = np.inf
+
+    def __call__(self, points: Array) -> Array:
+        """Points `(N, 3)` of the mesh's frame in the points' frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def inverse(self, points: Array) -> Array:
+        """Points `(N, 3)` of the points' frame in the mesh's frame."""
+        return (points - self.translation) @ self.rotation / self.scale
+
+
+def tukey(distance: Array, least: float) -> Array:
+    """Weights `(N,)`, 0 to 1, that fall to 0 at three robust deviations (or `least`)."""
+    cut = max(3 * 1.4826 * float(np.median(distance)), least)
+    return np.maximum(1 - (distance / cut) ** 2, 0) ** 2
+
+
+def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation and translation that take `source (N, 3)` onto `target (N, 3)` best.
+
+    Least squares (Umeyama 1991). Raises `ValueError` for under three points or points on a line.
+    """
+    if source.shape != target.shape or len(source) < 3:
+        raise ValueError(
+            f"expected at least 3 pairs of landmarks, got {source.shape} and {target.shape}"
+        )
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    if s[1] < 1e-6 * s[0]:
+        raise ValueError("the landmarks lie on a line: their rotation is undetermined")
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    scale = float((s * sign).sum() / (a**2).sum())
+    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+
+
+def find_pose(
+    surface: Surface,
+    points: Array,
+    normals: Array | None = None,
+    *,
+    start: tuple[float, Array, Array] | None = None,
+    scales: tuple[float, ...] = (1.0,),
+    scale_deviation: float | None = 0.1,
+    size: float = 0.1,
+    seed: int = 0,
+) -> Pose:
+    """The pose in which `surface` lies on `points (N, 3)`, both with z about upwards.
+
+    Without a `start`, twelve turns about z at each of `scales` are tried on a few hundred points,
+    the tops of both at one height. `scale_deviation` is what is known of the scale beforehand, a
+    standard deviation of its logarithm about the middle of `scales`, or None. `size` is the head's
+    radius in the points' unit, which distances are judged by.
+    """
+    middle = float(np.exp(np.mean(np.log(scales))))
+    known = None if scale_deviation is None else (middle, scale_deviation)
+    if start is not None:
+        return _refine(surface, points, normals, *start, known, size, 60)
+    order = np.random.default_rng(seed).permutation(len(points))
+
+    def some(count: int) -> tuple[Array, Array | None]:
+        few = order[:count]
+        return points[few], None if normals is None else normals[few]
+
+    coarse, facing = some(_COARSE)
+    tries = []
+    for scale in scales:
+        for yaw in np.arange(_YAWS) * 2 * np.pi / _YAWS:
+            rotation = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
+            moved = scale * surface.points @ rotation.T
+            shift = np.median(coarse, axis=0) - np.median(moved, axis=0)
+            shift[2] = np.percentile(coarse[:, 2], 85) - np.percentile(moved[:, 2], 85)
+            pose = _refine(surface, coarse, facing, scale, rotation, shift, known, size, 20)
+            tries.append((_cost(surface, pose, coarse, facing, size), pose))
+    tries.sort(key=lambda t: t[0])
+    distinct: list[Pose] = []
+    for _, pose in tries:
+        if all(_apart(pose, other) > np.radians(5) for other in distinct):
+            distinct.append(pose)
+    ends = []
+    for t in distinct[:3]:
+        p = _refine(surface, *some(1000), t.scale, t.rotation, t.translation, known, size, 60)
+        ends.append((_cost(surface, p, *some(1000), size), p))
+    p = min(ends, key=lambda end: end[0])[1]
+    best = _refine(surface, points, normals, p.scale, p.rotation, p.translation, known, size, 60)
+    others = [*(pose for _, pose in ends), *distinct[3:]]
+    others = [pose for pose in others if _apart(pose, best) > np.radians(10)]
+    return replace(best, margin=_margin(surface, best, others, points, normals, size))
+
+
+def _margin(
+    surface: Surface,
+    best: Pose,
+    others: list[Pose],
+    points: Array,
+    normals: Array | None,
+    size: float,
+) -> float:
+    """By what share the points that lie on the best pose cost more in the next best one."""
+    if not others:
+        return np.inf
+    distance = best.scale * surface.nearest(best.inverse(points), 0.5 * size / best.scale)[0]
+    on = tukey(distance, 0.01 * size) > 0
+    if normals is not None:
+        normals = normals[on]
+    own, *rest = (_cost(surface, p, points[on], normals, size) for p in (best, *others))
+    return float(min(rest) / max(own, 1e-6) - 1)
+
+
+def _apart(a: Pose, b: Pose) -> float:
+    return float(Rotation.from_matrix(a.rotation @ b.rotation.T).magnitude())
+
+
+def _cost(surface: Surface, pose: Pose, points: Array, normals: Array | None, size: float) -> float:
+    """Mean squared distance, cut off at an eighth of the head's radius, in units of that."""
+    cut = 0.125 * size / pose.scale
+    distance, index = surface.nearest(pose.inverse(points), cut)
+    far = distance / cut
+    if normals is not None:
+        far[((surface.normals[index] @ pose.rotation.T) * normals).sum(axis=1) < 0] = 1
+    return float((far**2).mean())
+
+
+def _refine(
+    surface: Surface,
+    points: Array,
+    normals: Array | None,
+    scale: float,
+    rotation: Array,
+    translation: Array,
+    known: tuple[float, float] | None,
+    size: float,
+    limit: int,
+) -> Pose:
+    """ICP from one start."""
+    rotation, translation = rotation.copy(), translation.copy()
+    for _ in range(limit):
+        there = (points - translation) @ rotation / scale
+        distance, index = surface.nearest(there, size / scale)
+        n = surface.normals[index] @ rotation.T
+        x = scale * surface.points[index] @ rotation.T + translation
+        weight = tukey(scale * distance, 0.01 * size)
+        if normals is not None:
+            weight = weight * ((n * normals).sum(axis=1) > 0.5)
+        total = max(float(weight.sum()), 1e-9)
+        center = weight @ x / total
+        q = x - center
+        # every motion in units of length, so that they can be compared: radius times angle or share
+        radius = max(float(np.sqrt(weight @ (q**2).sum(axis=1) / total)), 1e-9)
+        J = np.hstack([np.cross(q, n) / radius, (q * n).sum(axis=1)[:, None] / radius, n])
+        r = (n * (points - x)).sum(axis=1)
+        normal, right = (J.T * weight) @ J / total, (J.T * weight) @ r / total
+        variance = float(weight @ r**2) / total
+        stiffness, motions = np.linalg.eigh(normal)
+        if known is not None:
+            strength = max(variance, (1e-3 * size) ** 2) / (total * (known[1] * radius) ** 2)
+            normal[3, 3] += strength
+            right[3] += strength * radius * np.log(known[0] / scale)
+        values, vectors = np.linalg.eigh(normal)
+        free = values > 1e-4 * values[-1]  # what nothing determines is left where it is
+        step = vectors[:, free] @ (vectors[:, free].T @ right / values[free])
+        step[:4] = np.clip(step[:4] / radius, -0.2, 0.2)
+        turn, grow = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[3]))
+        translation = grow * turn @ (translation - center) + center + step[4:]
+        rotation, scale = turn @ rotation, scale * grow
+        if radius * np.abs(step[:4]).max() + np.linalg.norm(step[4:]) < 1e-5 * size:
+            break
+    spread = np.full(7, np.inf)
+    if free.all():
+        spread = np.sqrt(variance * np.diag(vectors / values @ vectors.T) / total)
+        spread[:4] /= radius
+    first = int(np.abs(motions[:, 0]).argmax())
+    return Pose(
+        float(scale),
+        rotation,
+        translation,
+        spread,
+        np.sqrt(np.maximum(stiffness, 0)),
+        MOTIONS[first],
+    )
