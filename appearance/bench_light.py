@@ -54,7 +54,8 @@ class Effort:
     reference_spp: int = 128
     strands: Sequence[int] = (1_000, 10_000, 100_000)
     bounces: Sequence[int] = (1, 2, 4, 8, 16, 32)
-    growth_pixels: Sequence[int] = (500, 2000, 8000)
+    growth_pixels: Sequence[int] = (200, 800, 3200)
+    growth_spp: int = 32
     rows: int = 768
 
 
@@ -72,7 +73,8 @@ def run(
     The error is the mean squared error over the mean square of the reference, averaged over the
     same 12 random lights of the dome for every method. The reference is Mitsuba's `path` light by
     light; its two halves are independent, so that its own variance can be taken off. Methods take
-    turns in one process, and kernels are compiled before a clock starts. Times are of all lights;
+    turns in one process, and kernels are compiled before a clock starts; what tracing them again
+    takes (some 0.1 s each, three for `render_olat`) counts. Times are of all lights;
     `path` renders the judged ones and its time is scaled to all, as it does them one by one.
     """
     effort = Effort() if effort is None else effort
@@ -158,7 +160,7 @@ def _errors(scene: HairScene, camera: Camera, effort: Effort, seed: int) -> dict
             "mitsuba path": theirs,
         }
         for method in methods.values():
-            method(2, seed)
+            method(min(effort.spp), seed)
         series = []
         for turn in range(max(len(effort.spp), len(effort.path_spp))):
             for name, method in methods.items():
@@ -260,8 +262,8 @@ def _growth(
     lights = dome(36, seed)
 
     def cost(scene: HairScene, index: NDArray[np.int64], depth: int | None) -> dict[str, float]:
-        spp = 8
-        render_olat(scene, camera, lights, spp=2, pixels=index, max_depth=depth)
+        spp = effort.growth_spp
+        render_olat(scene, camera, lights, spp=spp, pixels=index, max_depth=depth)
         start = time.process_time()
         render_olat(scene, camera, lights, spp=spp, pixels=index, max_depth=depth, seed=seed)
         seconds = time.process_time() - start

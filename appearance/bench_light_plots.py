@@ -31,6 +31,7 @@ def plot_errors(path: Path, result: dict[str, Any]) -> None:
             axes.set_title(f"{name}, {count} lights", fontsize=9)
             axes.set_xlabel("CPU seconds", fontsize=8)
             axes.set_ylabel("relative MSE", fontsize=8)
+            axes.tick_params(which="both", labelsize=6)
             axes.grid(True, which="major", alpha=0.3)
     grid[0][0].legend(fontsize=7)
     figure.savefig(path, dpi=90)
@@ -48,6 +49,8 @@ def plot_growth(path: Path, result: dict[str, Any]) -> None:
     for axes, what in zip(grid, ("strands", "bounces", "pixels"), strict=False):
         x = [int(n) for n in growth[what]]
         axes.semilogx(x, [p["us_per_path"] for p in growth[what].values()], "C0o-")
+        axes.set_xticks(x, [f"{n:,}" for n in x], fontsize=7)
+        axes.minorticks_off()
         axes.set_xlabel(what)
         axes.set_ylabel(f"µs a path, {growth['lights']} lights")
         axes.set_ylim(bottom=0)

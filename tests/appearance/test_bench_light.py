@@ -29,7 +29,7 @@ def test_a_small_run_writes_figures_and_plots(tmp_path, small):
     subject = Subject(
         small.tuft(100), small.plane(), HairAppearance((0.5, 0.6, 0.8), 0.3, 0.3), (0.3, 0.3, 0.3)
     )
-    effort = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 16)
+    effort = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2, 16)
     result = run(tmp_path, {"tuft": subject}, small.camera(), effort=effort)
     assert json.loads((tmp_path / "light.json").read_text()) == result
     assert all((tmp_path / f).stat().st_size > 5000 for f in ("light.png", "light_growth.png"))
