@@ -179,7 +179,8 @@ def known(fibre: Fibre, wi: Any) -> Known:
     gamma_t, length = refraction(cosine, -x, z, fibre.eta)
     f, through = fresnel(dr.abs(wi.z), fibre.eta)
     attenuation = attenuations(f, through, fibre.sigma_a * length)
-    mean = [dr.mean(a, axis=0) if dr.depth_v(a) > dr.depth_v(gamma) else a for a in attenuation]
+    # dr.mean would put the number of lanes into the kernel: one to compile for each number
+    mean = [dr.sum(a, axis=0) / 3 if dr.depth_v(a) > dr.depth_v(gamma) else a for a in attenuation]
     total = dr.rcp(mean[0] + mean[1] + mean[2] + mean[3])
     return Known(
         gamma,
