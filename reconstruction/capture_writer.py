@@ -245,6 +245,15 @@ class CaptureWriter:
         self.commit([record])
         return record
 
+    def withdraw(self, step: Step, camera: str, *, reason: str) -> None:
+        """Take a frame back that was written: it counts as missing, and may be written again."""
+        record = self.records.get((step.index, camera))
+        if record is None or record.file is None:
+            return
+        gone = replace(record, file=None, sha256=None, recorded=utc_now(), reason=reason)
+        self.commit([gone])
+        (self.path / record.file).unlink()
+
     def finish(self, outcome: str, extra: dict[str, Any] | None = None) -> dict[str, Any]:
         """Write `manifest.json`, close the journal and return the manifest.
 

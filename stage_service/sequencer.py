@@ -13,7 +13,7 @@ from reconstruction.capture_writer import CaptureWriter
 from stage_service.accounting import FrameAccount, PulseAccount
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera, Frame
-from stage_service.devices.errors import Cancelled
+from stage_service.devices.errors import Cancelled, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.devices.stage import Stage
 from stage_service.exposing import Exposing, Pulse
@@ -28,6 +28,7 @@ from stage_service.writer import FrameWriter, Shot
 Notify = Callable[[str, dict[str, Any]], None]
 QUEUED_STEPS = 2
 """Steps' worth of frames that may wait for the disk before the sequence waits, too."""
+MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
 
 
 class CannotPause(WrongState):
@@ -83,6 +84,9 @@ class Sequencer:
         self._lamp = {light.name: i for i, light in enumerate(writer.rig.lights)}
         self._armed: float | None = None
         self._doubtful = False
+        # By camera: frames since its queue was last found empty, and those that it put in doubt.
+        self._unchecked: dict[str, list[Step]] = {c.name: [] for c in stage.cameras}
+        self._withdrawn: dict[str, list[Step]] = {}
         self._clocked = 0  # steps of the hardware-stepped run that is under way
         self._unclear: dict[str, str] = {}
         self._spent = Spent()
@@ -180,6 +184,9 @@ class Sequencer:
         if self.blackout is not None:
             extra["blackout"] = self.blackout.to_dict()
         try:
+            for camera, steps in self._withdrawn.items():
+                for step in steps:
+                    self._writer.withdraw(step, camera, reason=MAY_BE_ANOTHER)
             self._writer.finish(str(self.outcome), extra)
         except Exception as error:  # a full disk: the journal keeps the frames, state the reason
             self._fail(error)
@@ -314,6 +321,7 @@ class Sequencer:
     def _put(self, frames: FrameWriter, shot: Shot) -> None:
         with self._spent.on("storage"):
             frames.put(shot)
+        self._unchecked[shot.camera].append(shot.step)
 
     def _tell_missing(self, step: Step, cameras: set[str], attempt: int) -> None:
         if cameras:
@@ -344,9 +352,15 @@ class Sequencer:
         self._armed, self._doubtful = exposure, False
 
     def _drain(self, camera: Camera) -> None:
-        """Drop frames that came late for pulses counted as missed; others raise `IndexShift`."""
-        while (frame := camera.read(self._cancel)) is not None:
-            self._accounts[camera.name].late(frame.block_id)
+        """Drop frames that came late for pulses counted as missed; others raise `IndexShift`, and
+        the frames since the last time are taken back: resumed, the capture shoots them again."""
+        try:
+            while (frame := camera.read(self._cancel)) is not None:
+                self._accounts[camera.name].late(frame.block_id)
+        except IndexShift:
+            self._withdrawn[camera.name] = self._unchecked[camera.name]
+            raise
+        self._unchecked[camera.name] = []
 
     def _boundary(self, beats: Sequence[Heartbeat]) -> None:
         """Where pause and abort take effect, and failed heartbeats come to light."""

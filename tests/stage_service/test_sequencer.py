@@ -100,6 +100,26 @@ def test_a_doubled_trigger_is_named_as_an_index_shift(rig_file, world, tmp_path)
     assert is_dark(world)
 
 
+def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world, tmp_path):
+    """Cameras without a clock, which do not say what they hold: it shows at the next arming."""
+    world.double = {4}
+    assert sequencer(rig_file, tmp_path / "c").run() == "failed"
+    records = Capture(tmp_path / "c").records
+    taken_back = {step for (step, _), r in records.items() if r.file is None}
+    assert taken_back == {2, 3, 4}  # armed alike, the pulse that fired twice among them
+    assert "another step's" in str(records[2, "cam_0"].reason)
+    assert {step for step, _ in records} == {0, 1, 2, 3, 4}
+
+    world.double = set()
+    writer = CaptureWriter.reopen(tmp_path / "c")
+    assert Sequencer(Stage.of(rig_file), writer).run() == "completed"
+    assert verify(tmp_path / "c") == []
+    capture = Capture(tmp_path / "c")
+    for step, light in zip((2, 3, 4), LIGHTS, strict=True):
+        counts = capture.frame(capture.steps[step], "cam_1") * GAIN * 0.01
+        np.testing.assert_allclose(counts, int(light[-3:]) + 1, atol=2.5)
+
+
 def test_a_busy_camera_is_waited_for(rig_file, world, tmp_path):
     world.busy = {"cam_1": 5}
     assert sequencer(rig_file, tmp_path / "c").run() == "completed"
