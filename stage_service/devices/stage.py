@@ -104,8 +104,8 @@ class Stage:
     def status(self, *, connect: bool) -> dict[str, Any]:
         """Ask each device how it is: {kind: {"state": "ok" | "unreachable", ...}}.
 
-        With `connect` each device is connected first. Without it, as during a capture, only
-        devices that are connected are asked, and the cameras are left alone.
+        With `connect` each device is connected first. Without it, as during a capture, the cameras
+        are left alone; a driver whose link is closed opens it to ask.
         """
         lights, trigger, beams = self.lights, self.trigger, self.projectors
         out = {
