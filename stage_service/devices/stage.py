@@ -152,12 +152,9 @@ def _powers(rig_file: RigFile, config: DevicesConfig) -> tuple[PjLinkProjector, 
         where = f"{rig_file.path}: devices.pjlink.{name}"
         if name not in known:
             raise RigError(f"{where}: the rig has no projector {name!r}")
-        password = ""
-        if link.password_file is not None:
-            try:
-                password = (rig_file.path.parent / link.password_file).read_text().strip()
-            except OSError as error:
-                raise RigError(f"{where}: password_file: {error}") from error
+        file = link.password_file
+        # Read when it is needed: a file that is gone must not keep anybody from a blackout.
+        password = "" if file is None else rig_file.path.parent / file
         out.append(PjLinkProjector(name, link.host, link.port, password, link.timeout_s))
     return tuple(out)
 

@@ -17,6 +17,7 @@ from simulators.faults import Fault
 from simulators.pjlink_projector import PjLinkServer, SimulatedProjector
 from stage_service.devices.stage import Stage
 from stage_service.plan import CapturePlan
+from stage_service.safety import blackout
 from stage_service.sequencer import CannotPause, Sequencer
 
 
@@ -136,6 +137,16 @@ def test_a_sweep_needs_projectors_that_are_on(simulated, small_rig, tmp_path):
     link = f'[devices.pjlink.left]\nhost = "127.0.0.1"\nport = {server.port}\n'
     rig_file, world = simulated(rig=small_rig + link + 'password_file = "password"\n')
     try:
+        (tmp_path / "password").rename(tmp_path / "elsewhere")
+        world.lamps.select(3)
+        stage = Stage.of(rig_file)
+        assert blackout(stage).safe  # whatever becomes of a password
+        assert is_dark(world)
+        power = stage.status(connect=True)["projector_power"]["left"]
+        stage.close()
+        assert "No such file" in power["error"]
+        assert "correct password_file" in power["error"]
+        (tmp_path / "elsewhere").rename(tmp_path / "password")
         run = sequencer(rig_file, tmp_path / "c", [])
         assert run.run() == "failed"
         assert "left (PJLink" in str(run.error)

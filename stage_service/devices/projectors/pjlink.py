@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
+from pathlib import Path
 from typing import NoReturn
 
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
@@ -51,7 +52,8 @@ class ProjectorBusy(DeviceError):
 
 @dataclass(frozen=True)
 class PjLinkProjector:
-    """One projector; `password` empty where it asks for none. Safe to call from several threads.
+    """One projector; `password` is a text or the file that holds it, read when the projector asks,
+    empty where it never does. Safe to call from several threads.
 
     Every exchange, with connecting, is over within `timeout_s` and has a connection of its own:
     projectors drop idle ones, and no late answer can pass for the next. Raises `DeviceError`:
@@ -62,7 +64,7 @@ class PjLinkProjector:
     projector: str
     host: str
     port: int = PORT
-    password: str = field(default="", repr=False)
+    password: str | Path = field(default="", repr=False)
     timeout_s: float = 5.0
 
     @property
@@ -189,11 +191,26 @@ class PjLinkProjector:
             )
         if match[1] is None:
             return ""
-        if not self.password:
+        password = self._password(doing)
+        if not password:
             self._not_authenticated("a greeting that asks for one", doing)
         # The protocol has MD5; it keeps the password off the wire, no more.
-        text = (match[1] + self.password).encode()
+        text = (match[1] + password).encode()
         return hashlib.md5(text, usedforsecurity=False).hexdigest()
+
+    def _password(self, doing: str) -> str:
+        if isinstance(self.password, str):
+            return self.password
+        try:
+            return self.password.read_text().strip()
+        except (OSError, ValueError) as error:
+            raise DeviceError(
+                self.name,
+                doing,
+                expected="the file with its password",
+                received=str(error),
+                todo="Put the password there, or correct password_file in the rig file.",
+            ) from error
 
     def _not_authenticated(self, received: str, doing: str) -> NoReturn:
         raise DeviceError(
