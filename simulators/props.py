@@ -61,6 +61,8 @@ class BoardProp:
         at = origin[:2] + distance[..., None] * local[..., :2]
         rim = 0.25 * self.board.square
         on = front & ((at > -rim) & (at < self.board.size + rim)).all(axis=-1)
+        kept = on.any(axis=1)
+        pixels, rays, at, on, distance = (a[kept] for a in (pixels, rays, at, on, distance))
         albedo = np.where(self.board.ink(at), self.black, self.white) * on
         points = camera.center + distance[..., None] * rays
         normal = np.broadcast_to(-self.rotation[:, 2], points.shape)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.capture import Capture, Step
+from reconstruction.capture import Capture, FrameRecord, Step
 from reconstruction.capture_writer import CaptureWriter
 from reconstruction.rig import Rig
 from simulators.frames import FrameMaker, Snapshot
@@ -35,7 +35,7 @@ def shoot(
     frames = FrameMaker(rig, responder, sensor, seed)
     writer = CaptureWriter.create(path, written or rig, {"steps": list(steps)})
     names = [x.name for x in rig.lights]
-    records = []
+    records: list[FrameRecord] = []
     for step in steps:
         power = np.zeros(len(names))
         if step.kind == "all_on":

@@ -113,49 +113,34 @@ def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Le
     pixels = [s.pixels.astype(np.float32) for s in seen.values()]
     count = 2 * sum(len(p) for p in pixels)
     best: tuple[float, _Lens] | None = None
-    spread = np.inf
     for lens in LENSES:
         fixed = flags
         fixed |= 0 if 0 in lens else cv2.CALIB_FIX_K1
         fixed |= 0 if 1 in lens else cv2.CALIB_FIX_K2
         fixed |= 0 if 2 in lens else cv2.CALIB_ZERO_TANGENT_DIST
         try:
-            rms, K, bent, _, _, deviation, _, _ = cv2.calibrateCameraExtended(
+            rms, K, bent, _, _ = cv2.calibrateCamera(
                 corners, pixels, (camera.width, camera.height), None, None, flags=fixed
             )
         except cv2.error:
             continue  # as below: a lens that these poses leave open
-        if not (np.isfinite(K).all() and np.isfinite(deviation).all() and K[0, 0] > 0):
+        if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0):
             continue
-        worse = max(1.0, CORNER / max(rms, 1e-9))  # a lucky fit is no proof
-        relative = float(np.max(deviation.ravel()[:2] / (K[0, 0], K[1, 1]))) * worse
         score = count * np.log(max(rms, 0.2 * CORNER) ** 2) + len(lens) * np.log(count)
-        if relative < LOOSE and (best is None or score < best[0]):
+        if best is None or score < best[0]:
             values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], bent.ravel()[:5]])
             best = score, _Lens(values, np.array([0, 1, 2, 3, *(4 + k for k in lens)]))
-        spread = min(spread, relative)
     if best is None:
-        tilts = _tilts(board, seen)
-        raise CalibrationError(
-            f"{camera.name}: {len(seen)} poses of the board leave the lens open: its focal length "
-            f"is known to {spread:.1%} at best (limit {LOOSE:.0%}), the board's planes differ by "
-            f"{tilts:.0f}° at most: tilt the board by 30° or more in several directions, or keep "
-            "the nominal lens"
-        )
+        raise _open_lens(camera.name, len(seen), np.inf)
     return best[1]
 
 
-def _tilts(board: Board, seen: Mapping[str, Sighting]) -> float:
-    """Degrees between the two most different directions of foreshortening, roughly."""
-    normals = []
-    for s in seen.values():
-        H, _ = cv2.findHomography(board.corners[s.ids][:, :2], s.pixels)
-        if H is None:
-            continue
-        A = H[:2, :2] - np.outer(s.pixels.mean(axis=0), H[2, :2])
-        values = np.linalg.svd(A, compute_uv=False)
-        normals.append(np.degrees(np.arccos(np.clip(values[1] / values[0], 0, 1))))
-    return float(np.ptp(normals)) if normals else 0.0
+def _open_lens(name: str, poses: int, deviation: float) -> CalibrationError:
+    return CalibrationError(
+        f"{name}: {poses} poses of the board leave the lens open: its focal length is known to "
+        f"{deviation:.1%} (limit {LOOSE:.0%}): tilt the board by 30° or more in several "
+        "directions, or keep the nominal lens"
+    )
 
 
 def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid:
@@ -285,6 +270,13 @@ class _Bundle:
 
 def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> CameraSolution:
     x = solution.x
+    focal = {
+        n: float(max(solution.deviation[at[:2]] / x[at[:2]], default=0.0))
+        for n, at in zip(bundle.names, bundle.lens_at, strict=True)
+    }
+    for name, deviation in focal.items():
+        if not deviation < LOOSE:
+            raise _open_lens(name, len(bundle.usable[name]), deviation)
     found = []
     for k, c in enumerate(nominal):
         lens, pose = bundle.lens(x, k), bundle.camera_pose(x, k)
@@ -311,10 +303,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
         },
         rms={n: float(np.sqrt((r**2).sum(axis=1).mean())) for n, r in residuals.items()},
         seen={n: (len(s), sum(map(len, s.values()))) for n, s in bundle.usable.items()},
-        focal_deviation={
-            n: float(max(solution.deviation[at[:2]] / x[at[:2]], default=0.0))
-            for n, at in zip(bundle.names, bundle.lens_at, strict=True)
-        },
+        focal_deviation=focal,
         position_deviation={
             n: 0.0 if k == 0 else _position_deviation(solution, bundle.camera_at(k))
             for k, n in enumerate(bundle.names)

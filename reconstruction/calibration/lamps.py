@@ -1,9 +1,8 @@
-"""Lamps from what they do to spheres: highlights on mirrors, shading of diffuse ones.
+"""Lamps from highlights on mirror spheres, with what was known of them before.
 
-A mirror's highlight is a direction from the sphere, sharp but with the base line of the spheres
-alone for a distance. A diffuse sphere's shading says how far the light is by how it falls off over
-the sphere, and how strong it is. Each serves alone; together they make up for one another: the
-diffuse sphere's answer, with its covariance, is what the mirrors' bundle adjustment knows before.
+A highlight is a direction from the sphere, sharp but with the base line of the spheres alone for a
+distance. The shading of diffuse spheres (`shading`) knows distances; its answers, with their
+covariance, join the bundle adjustment of all highlights.
 """
 
 from __future__ import annotations
@@ -23,28 +22,8 @@ from reconstruction.lights import Light
 
 Array = NDArray[np.float64]
 
-MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better
 LOOSE = 0.05  # of the distance: a larger deviation is no position
 SAME_PLACE = np.radians(0.5)  # between rays that are to cross
-
-
-@dataclass(frozen=True, eq=False)
-class Shading:
-    """Samples of diffuse spheres under one lamp alone.
-
-    `points` and `normals (N, 3)`, `share (N,)`: albedo / π, `radiance (N, 3)` at full level, and
-    its `deviation (N,)` from noise. `centre (3,)` and `radius` are those of the (first) sphere,
-    `centre_deviation` in metres.
-    """
-
-    points: Array
-    normals: Array
-    share: Array
-    radiance: Array
-    deviation: Array
-    centre: Array
-    radius: float
-    centre_deviation: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,85 +52,6 @@ class Lamp:
     def deviation(self) -> float:
         """Of the position along its worst direction, metres."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
-
-
-def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
-    """Position and intensity of a lamp from diffuse spheres: near Lambertian shading.
-
-    Radiance = albedo / π · I · n·v / |v|³, v from the point to the lamp. `nominal` gives the
-    lamp's profile and aim, which stay, and where to begin.
-
-    Raises `CalibrationError` where the spheres are not lit or the distance stays open.
-    """
-    grey = shading.radiance.mean(axis=1)
-    lit = grey > 6 * np.maximum(shading.deviation, 1e-12)
-    if lit.sum() < 100:
-        raise CalibrationError(
-            f"lamp {nominal.name}: {int(lit.sum())} pixels of the diffuse sphere answer it, 100 "
-            "are needed: it is behind the sphere for every camera, dark, or too dim for the "
-            "exposure: move the sphere or expose longer"
-        )
-    start = _far(shading, grey, lit)
-    towards = start / np.linalg.norm(start)
-    distance = float(np.linalg.norm(nominal.position - shading.centre))
-    position = shading.centre + distance * towards
-    unit = replace(nominal, position=position, intensity=np.ones(3))
-    form = shading.share * unit.intensity_towards(shading.points)[:, 0]
-    cosine = shading.normals @ towards
-    use = lit & (cosine > 0.15) & (form > 0)
-    if use.sum() < 100:
-        raise CalibrationError(
-            f"lamp {nominal.name}: its light falls on the diffuse sphere from where no camera sees "
-            "it well: move the sphere, or aim a camera at its lit side"
-        )
-    x, n, s = shading.points[use], shading.normals[use], form[use]
-    value = grey[use]
-    error = np.hypot(shading.deviation[use], MODEL * value)
-
-    def function(p: Array) -> tuple[Array, Array]:
-        v = p[:3] - x
-        squared = (v * v).sum(axis=1)
-        nv = (n * v).sum(axis=1)
-        strength = s * np.exp(p[3]) / squared**1.5
-        model = strength * nv
-        slope = strength[:, None] * (n - (3 * nv / squared)[:, None] * v)
-        J = np.column_stack([slope, model]) / error[:, None]
-        return (model - value) / error, J
-
-    v = position - x
-    guess = s * (n * v).sum(axis=1) / (v * v).sum(axis=1) ** 1.5
-    begin = np.log(max(float(guess @ value / (guess @ guess)), 1e-12))
-    solution = minimise(function, np.append(position, begin))
-    found = solution.x[:3]
-    distance = float(np.linalg.norm(found - shading.centre))
-    # a sphere that is taken to be off its place turns every normal on it
-    lever = (distance / shading.radius * shading.centre_deviation) ** 2
-    covariance = solution.covariance[:3, :3] + lever * np.eye(3)
-    lamp = Lamp(
-        replace(nominal, position=found, intensity=np.full(3, np.exp(solution.x[3]))),
-        covariance,
-        float(solution.deviation[3]),
-    )
-    if not lamp.deviation < LOOSE * distance:
-        raise CalibrationError(
-            f"lamp {nominal.name}: shading leaves its position open by {lamp.deviation:.3g} m at "
-            f"{distance:.3g} m (limit {LOOSE:.0%}): use a larger sphere, or several places"
-        )
-    return with_intensity(lamp, shading)
-
-
-def with_intensity(lamp: Lamp, shading: Shading) -> Lamp:
-    """`lamp` with the intensity per channel that its place and the `shading` say."""
-    towards = lamp.light.position - shading.points
-    squared = (towards**2).sum(axis=1)
-    unit = replace(lamp.light, intensity=np.ones(3))
-    form = shading.share * unit.intensity_towards(shading.points)[:, 0]
-    form = form * (shading.normals * towards).sum(axis=1) / squared**1.5
-    use = form > 0.15 * form.max()
-    weight = 1 / (shading.deviation[use] ** 2 + (MODEL * shading.radiance[use].mean(axis=1)) ** 2)
-    A = form[use] * weight
-    intensity = A @ shading.radiance[use] / (A @ form[use])
-    return replace(lamp, light=replace(lamp.light, intensity=np.maximum(intensity, 0)))
 
 
 def mirrored_lamps(
@@ -243,18 +143,6 @@ def _lamps(
     pixels = solution.residual[: 2 * len(glints)].reshape(-1, 2)
     pixels = pixels * np.array([g.highlight.deviation for g in glints])[:, None]
     return out, centres, float(np.sqrt((pixels**2).sum(axis=1).mean()))
-
-
-def _far(shading: Shading, grey: Array, lit: NDArray[np.bool_]) -> Array:
-    """Direction and strength `(3,)` of a far light: radiance = max(n·g, 0)."""
-    use, g = lit, np.asarray((0.0, 0.0, 0.0))
-    for _ in range(4):
-        A = shading.normals[use] * shading.share[use, None]
-        g = np.asarray(np.linalg.lstsq(A, grey[use], rcond=None)[0], np.float64)
-        use = lit & (shading.normals @ g > 0.2 * np.linalg.norm(g))
-        if use.sum() < 20:
-            break
-    return g
 
 
 def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:

@@ -10,8 +10,7 @@ import numpy as np
 from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.calibration.cameras import CameraSolution, calibrate_cameras
 from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.lamps import Lamp, mirrored_lamps, shaded_lamp
-from reconstruction.calibration.lamps import with_intensity as lamp_with_intensity
+from reconstruction.calibration.lamps import Lamp, mirrored_lamps
 from reconstruction.calibration.projectors import (
     UNDETERMINED,
     Rows,
@@ -19,6 +18,7 @@ from reconstruction.calibration.projectors import (
     projector_intensities,
     rows_on_board,
 )
+from reconstruction.calibration.shading import refine_centres, shaded_lamp, with_intensity
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
@@ -182,6 +182,8 @@ def _lamps(
         shadings = gather_shading(
             diffuse, cameras, targets.diffuse_radius, targets.diffuse_albedo, names
         )
+        shadings = refine_centres({x.name: x for x in nominal.lights}, shadings)
+        stage.figures["diffuse_centres"] = next(iter(shadings.values())).centres.tolist()
     lamps: dict[str, Lamp] = {}
     for name, shading in shadings.items():
         try:
@@ -200,7 +202,7 @@ def _lamps(
             {x.name: x for x in nominal.lights}, glints, targets.mirror_radius, lamps
         )
         for name, lamp in by_mirror.items():
-            lamps[name] = lamp_with_intensity(lamp, shadings[name]) if name in lamps else lamp
+            lamps[name] = with_intensity(lamp, shadings[name]) if name in lamps else lamp
         stage.figures.update(
             highlights=len(glints),
             highlights_rms_px=rms,

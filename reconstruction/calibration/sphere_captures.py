@@ -6,17 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.frames import lamp_response
-from reconstruction.calibration.lamps import Glint, Shading
+from reconstruction.calibration.lamps import Glint
+from reconstruction.calibration.shading import Shading
 from reconstruction.calibration.spheres import find_highlight, find_outline, sphere_centre
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
 from reconstruction.silhouettes import NoSilhouette, background_noise, lit_image
 
 Array = NDArray[np.float64]
-Samples = tuple[Array, Array, Array, Array]
+Samples = tuple[Array, Array, NDArray[np.int64], Array, Array]
 
 MOST = 4000  # pixels of a camera
 RIM = 0.35  # cosine to the viewer below which a pixel's mean is not its middle
@@ -35,8 +37,8 @@ def gather_shading(
     a capture shows none.
     """
     found: dict[str, list[Samples]] = {name: [] for name in lights}
-    centres, worst = [], 0.0
-    for capture in captures:
+    centres, covariances = [], []
+    for number, capture in enumerate(captures):
         outlines = {}
         for c in cameras:
             try:
@@ -47,9 +49,10 @@ def gather_shading(
             cameras, outlines, radius, f"diffuse sphere in {capture.path}"
         )
         centres.append(centre)
-        worst = max(worst, float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))
+        covariances.append(covariance)
         for c in cameras:
-            pixels, points, normals = _disc(c, centre, radius)
+            pixels, rays = _disc(c, centre, radius)
+            eyes = np.broadcast_to(c.center, rays.shape)
             for name in lights if len(pixels) else ():
                 if not capture.has_light(name, c.name):
                     continue
@@ -57,18 +60,15 @@ def gather_shading(
                 x, y = pixels.T
                 ok = ~saturated[y, x]
                 values = image[y, x][ok].astype(np.float64)
-                # the mean of three channels, and the photons' share that grows with the light
-                noise = background_noise(image.mean(axis=-1))
-                error = np.full(len(values), noise)
-                found[name].append((points[ok], normals[ok], values, error))
+                error = np.full(len(values), background_noise(image.mean(axis=-1)))
+                which = np.full(len(values), number)
+                found[name].append((eyes[ok], rays[ok], which, values, error))
     out = {}
     for name, parts in found.items():
-        if not parts:
-            continue
-        points, normals, values, error = (np.concatenate(p) for p in zip(*parts, strict=True))
-        share = np.full(len(points), albedo / np.pi)
-        middle = np.mean(centres, axis=0)
-        out[name] = Shading(points, normals, share, values, error, middle, radius, worst)
+        if parts:
+            eyes, rays, which, values, error = (np.concatenate(p) for p in zip(*parts, strict=True))
+            places = np.array(centres), block_diag(*covariances)
+            out[name] = Shading(eyes, rays, which, values, error, *places, radius, albedo)
     if not out:
         raise CalibrationError(
             f"diffuse sphere: none of {[str(c.path) for c in captures]} holds frames of single "
@@ -94,12 +94,12 @@ def glints_of(
     return out
 
 
-def _disc(camera: Camera, centre: Array, radius: float) -> tuple[NDArray[np.int64], Array, Array]:
-    """Pixels `(N, 2)` well inside the sphere's picture, with points and normals `(N, 3)` there."""
+def _disc(camera: Camera, centre: Array, radius: float) -> tuple[NDArray[np.int64], Array]:
+    """Pixels `(N, 2)` well inside the sphere's picture, and their rays `(N, 3)`."""
     box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     at, depth = camera.project(centre + radius * box)
     if not (depth > 0).all():
-        return np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+        return np.zeros((0, 2), np.int64), np.zeros((0, 3))
     limit = (camera.width - 1, camera.height - 1)
     low, high = (
         np.clip(np.rint(e), 0, limit).astype(int) for e in (at.min(axis=0), at.max(axis=0))
@@ -111,9 +111,8 @@ def _disc(camera: Camera, centre: Array, radius: float) -> tuple[NDArray[np.int6
     towards = centre - camera.center
     along = rays @ towards
     inside = along**2 - (towards @ towards - radius**2)
-    points = camera.center + (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays
-    normals = (points - centre) / radius
-    good = (inside > 0) & (-(normals * rays).sum(axis=1) > RIM)
-    pixels, points, normals = pixels[good], points[good], normals[good]
+    # the cosine between ray and normal where they meet
+    good = (inside > 0) & (np.sqrt(np.maximum(inside, 0)) > RIM * radius)
+    pixels, rays = pixels[good], rays[good]
     every = max(1, -(-len(pixels) // MOST))
-    return pixels[::every], points[::every], normals[::every]
+    return pixels[::every], rays[::every]

@@ -73,8 +73,9 @@ def sphere_centre(
 ) -> tuple[Array, Array]:
     """Centre `(3,)` of a sphere of `radius` (metres) from its `outlines`, and covariance `(3, 3)`.
 
-    Rays through the outline pass the centre at one radius. One camera suffices; the more, the
-    better the depth. Raises `CalibrationError` naming `what` where no camera has an outline.
+    Rays through the outline pass the centre at one radius; how far outside of the rim all outlines
+    are found is solved for, too, or it would be taken for depth. One camera suffices; the more,
+    the better the depth. Raises `CalibrationError` naming `what` where no camera has an outline.
     """
     seen = [c for c in cameras if len(outlines.get(c.name, ())) >= 20]
     if not seen:
@@ -95,11 +96,12 @@ def sphere_centre(
     eye, ray, size = np.concatenate(eyes), np.concatenate(rays), np.concatenate(sizes)
 
     def residual(x: Array) -> Array:
-        off = np.linalg.norm(np.cross(x - eye, ray), axis=1)
-        return np.asarray((off - radius) / size)
+        off = np.linalg.norm(np.cross(x[:3] - eye, ray), axis=1)
+        return np.append((off - radius) / size - x[3], x[3])
 
-    solution = minimise(numeric(residual), np.median(start, axis=0), huber=2.0)
-    return solution.x, solution.covariance
+    begin = np.append(np.median(start, axis=0), 0.0)
+    solution = minimise(numeric(residual), begin, huber=2.0)
+    return solution.x[:3], solution.covariance[:3, :3]
 
 
 def find_highlight(image: NDArray[np.floating], saturated: NDArray[np.bool_]) -> Highlight | None:

@@ -1,0 +1,212 @@
+"""Lamps from the shading of diffuse spheres: Lambert's law near to a lamp.
+
+Radiance = albedo / π · I · n·v / |v|³, v from a point of the sphere to the lamp: the shading says
+where the light comes from, its fall-off over the sphere how far, and its strength how strong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.lamps import LOOSE, Lamp
+from reconstruction.calibration.least_squares import minimise
+from reconstruction.lights import Light
+
+Array = NDArray[np.float64]
+
+MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better
+STEEPEST = 0.15  # cosine of incidence: flatter light shows the sphere's grain
+
+
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """Pixels that see diffuse spheres of one radius and albedo under one lamp alone.
+
+    `eyes` and `rays (N, 3)`, the number of the `sphere (N,)` they meet, `radiance (N, 3)` at full
+    level, and its `deviation (N,)` from noise. `centres (S, 3)` with `covariance (3 S, 3 S)`.
+    """
+
+    eyes: Array
+    rays: Array
+    sphere: NDArray[np.int64]
+    radiance: Array
+    deviation: Array
+    centres: Array
+    covariance: Array
+    radius: float
+    albedo: float
+
+    @cached_property
+    def surface(self) -> tuple[Array, Array]:
+        """Points and normals `(N, 3)` where the rays meet the spheres, or come nearest to them."""
+        towards = self.centres[self.sphere] - self.eyes
+        along = (self.rays * towards).sum(axis=1)
+        inside = along**2 - ((towards * towards).sum(axis=1) - self.radius**2)
+        points = self.eyes + (along - np.sqrt(np.maximum(inside, 0)))[:, None] * self.rays
+        return points, (points - self.centres[self.sphere]) / self.radius
+
+    @cached_property
+    def grey(self) -> Array:
+        """Mean over the channels `(N,)`."""
+        return np.asarray(self.radiance.mean(axis=1))
+
+    @cached_property
+    def error(self) -> Array:
+        """Standard deviation of `grey (N,)`, of noise and of the law."""
+        return np.hypot(self.deviation, MODEL * self.grey)
+
+    def thinned(self, every: int) -> Shading:
+        """One in `every` pixels."""
+        picked = {
+            f: getattr(self, f)[::every]
+            for f in ("eyes", "rays", "sphere", "radiance", "deviation")
+        }
+        return replace(self, **picked)
+
+    def form(self, light: Light) -> Array:
+        """Radiance `(N,)` that `light` would give at an intensity of 1."""
+        points, normals = self.surface
+        v = light.position - points
+        strength = replace(light, intensity=np.ones(3)).intensity_towards(points)[:, 0]
+        falling = (normals * v).sum(axis=1) / (v * v).sum(axis=1) ** 1.5
+        return np.asarray(self.albedo / np.pi * strength * falling)
+
+    def used(self, light: Light) -> NDArray[np.bool_]:
+        """Pixels `(N,)` that `light` reaches well."""
+        points, normals = self.surface
+        v = light.position - points
+        cosine = (normals * v).sum(axis=1) / np.linalg.norm(v, axis=1)
+        return np.asarray((cosine > STEEPEST) & (self.grey > 6 * self.deviation))
+
+
+def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
+    """Position and intensity of a lamp from diffuse spheres in known places.
+
+    `nominal` gives the lamp's profile and aim, which stay, and a first distance. Raises
+    `CalibrationError` where the spheres are not lit or the distance stays open.
+    """
+    lit = shading.grey > 6 * np.maximum(shading.deviation, 1e-12)
+    if lit.sum() < 100:
+        raise CalibrationError(
+            f"lamp {nominal.name}: {int(lit.sum())} pixels of the diffuse sphere answer it, 100 "
+            "are needed: it is behind the sphere for every camera, dark, or too dim for the "
+            "exposure: move the sphere or expose longer"
+        )
+    middle: Array = shading.centres.mean(axis=0)
+    away = np.linalg.norm(nominal.position - middle) * _direction(shading, lit)
+    start = replace(nominal, position=middle + away, intensity=np.ones(3))
+    use = shading.used(start)
+    form = shading.form(start)
+    if use.sum() < 100 or not (form[use] > 0).all():
+        raise CalibrationError(
+            f"lamp {nominal.name}: its light falls on the diffuse sphere from where no camera sees "
+            "it well: move the sphere, or aim a camera at its lit side"
+        )
+    (x, n), value, error = (a[use] for a in shading.surface), shading.grey[use], shading.error[use]
+    v = start.position - x
+    # the profile changes little over the sphere and over the way to the solution
+    share = form[use] * (v * v).sum(axis=1) ** 1.5 / (n * v).sum(axis=1)
+
+    def function(p: Array) -> tuple[Array, Array]:
+        v = p[:3] - x
+        squared = (v * v).sum(axis=1)
+        nv = (n * v).sum(axis=1)
+        strength = share * np.exp(p[3]) / squared**1.5
+        model = strength * nv
+        slope = strength[:, None] * (n - (3 * nv / squared)[:, None] * v)
+        return (model - value) / error, np.column_stack([slope, model]) / error[:, None]
+
+    begin = np.log(max(float(form[use] @ value / (form[use] @ form[use])), 1e-12))
+    solution = minimise(function, np.append(start.position, begin))
+    found = solution.x[:3]
+    distance = float(np.linalg.norm(found - middle))
+    # a sphere that is taken to be off its place turns every normal on it
+    worst = float(np.linalg.eigvalsh(shading.covariance)[-1]) / len(shading.centres)
+    covariance = solution.covariance[:3, :3] + worst * (distance / shading.radius) ** 2 * np.eye(3)
+    light = replace(start, position=found)
+    lamp = Lamp(light, covariance, float(solution.deviation[3]))
+    if not lamp.deviation < LOOSE * distance:
+        raise CalibrationError(
+            f"lamp {nominal.name}: shading leaves its position open by {lamp.deviation:.3g} m at "
+            f"{distance:.3g} m (limit {LOOSE:.0%}): use a larger sphere, or several places"
+        )
+    return with_intensity(lamp, shading)
+
+
+def with_intensity(lamp: Lamp, shading: Shading) -> Lamp:
+    """`lamp` with the intensity per channel that its place and the `shading` say."""
+    use = shading.used(lamp.light)
+    form, weight = shading.form(lamp.light)[use], shading.error[use] ** -2
+    intensity = (form * weight) @ shading.radiance[use] / ((form * weight) @ form)
+    return replace(lamp, light=replace(lamp.light, intensity=np.maximum(intensity, 0)))
+
+
+def refine_centres(
+    lights: Mapping[str, Light], shadings: Mapping[str, Shading], rounds: int = 3
+) -> dict[str, Shading]:
+    """`shadings` with the centres that shading and outlines agree on.
+
+    An outline's light is not equal all around, which pulls it to one side by a tenth of a pixel;
+    from cameras on several sides that contradicts the shading. Each round solves for all lamps and
+    takes a Gauss-Newton step for the centres, with the lamps' answer to it eliminated.
+    """
+    first = next(iter(shadings.values()))
+    prior, centres = np.linalg.inv(first.covariance), first.centres
+    for _ in range(rounds):
+        A = prior.copy()
+        b = prior @ (centres - first.centres).ravel()
+        for name, whole in shadings.items():
+            shading = replace(whole, centres=centres).thinned(max(1, len(whole.rays) // 4000))
+            try:
+                light = shaded_lamp(lights[name], shading).light
+            except CalibrationError:
+                continue  # as the caller will find out
+            r, J = _derivatives(shading, light)
+            Q, _ = np.linalg.qr(J[:, :4])
+            K = J[:, 4:] - Q @ (Q.T @ J[:, 4:])
+            weight = 1 / max(1.0, float(r @ r) / len(r))
+            A += weight * K.T @ K
+            b += weight * K.T @ r
+        centres = centres - np.linalg.solve(A, b).reshape(-1, 3)
+    covariance = np.linalg.inv(A)
+    return {n: replace(s, centres=centres, covariance=covariance) for n, s in shadings.items()}
+
+
+def _derivatives(shading: Shading, light: Light) -> tuple[Array, Array]:
+    """Residuals `(N,)` and derivatives by the lamp's place, log intensity, and all centres."""
+    use = shading.used(light)
+    grey, error = shading.grey[use], shading.error[use]
+    strength = float(light.intensity.mean())
+
+    def model(place: Array, centres: Array) -> Array:
+        moved = replace(shading, centres=centres)
+        return strength * moved.form(replace(light, position=place))[use] / error
+
+    columns = []
+    for step in 1e-6 * np.eye(3):
+        ahead = model(light.position + step, shading.centres)
+        columns.append((ahead - model(light.position - step, shading.centres)) / 2e-6)
+    now = model(light.position, shading.centres)
+    columns.append(now)
+    for step in 1e-6 * np.eye(shading.centres.size):
+        d = step.reshape(-1, 3)
+        ahead = model(light.position, shading.centres + d)
+        columns.append((ahead - model(light.position, shading.centres - d)) / 2e-6)
+    return now - grey / error, np.stack(columns, axis=1)
+
+
+def _direction(shading: Shading, lit: NDArray[np.bool_]) -> Array:
+    """The way `(3,)` to a far light: radiance = max(n·g, 0)."""
+    normals, use, g = shading.surface[1], lit, np.asarray((0.0, 0.0, 1.0))
+    for _ in range(4):
+        g = np.asarray(np.linalg.lstsq(normals[use], shading.grey[use], rcond=None)[0])
+        use = lit & (normals @ g > 0.2 * np.linalg.norm(g))
+        if use.sum() < 20:
+            break
+    return g / max(float(np.linalg.norm(g)), 1e-300)

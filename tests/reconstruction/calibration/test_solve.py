@@ -1,0 +1,69 @@
+"""From captures to a rig file, through the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.solve import calibrate
+from reconstruction.capture import Capture
+from reconstruction.rig import Rig
+from stage_service.cli import main
+from stage_service.config import load_rig_file
+
+
+def test_captures_become_a_rig_file_that_is_near_the_truth(
+    tmp_path: Path,
+    true_rig: Rig,
+    board_captures: list[Capture],
+    mirror_captures: list[Capture],
+    diffuse_captures: list[Capture],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    truth, out = tmp_path / "truth.json", tmp_path / "found.json"
+    truth.write_text(json.dumps(true_rig.to_dict()))
+    command = ["calibrate", "rig", *[str(c.path) for c in board_captures], "--out", str(out)]
+    command += ["--mirror", *[str(c.path) for c in mirror_captures]]
+    command += ["--diffuse", *[str(c.path) for c in diffuse_captures], "--diffuse-radius-mm", "60"]
+    command += ["--paper-albedo", "0.8", "--truth", str(truth), "--json"]
+    assert main(command) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert load_rig_file(out).rig.name == "nominal"
+    errors = said["errors"]
+    for name, camera in errors["cameras"].items():
+        assert camera["reprojection_px"][0] < 0.3, name
+        assert camera["centre_mm"] < 2.0, name
+    assert errors["projectors"]["beam"]["plane_mm"] < 1.0
+    for name, lamp in errors["lamps"].items():
+        assert lamp["position"] < 0.01, name
+        assert lamp["intensity"] < 0.02, name
+    report = json.loads(out.with_suffix(".report.json").read_text())
+    assert [s["name"] for s in report["stages"]] == ["cameras", "projectors", "lamps"]
+    assert "rows say nothing" in said["stages"]["projectors"]["undetermined"]["beam"]
+    assert said["stages"]["lamps"]["undetermined"] == {}
+
+
+def test_what_no_capture_shows_stays_nominal_and_is_listed(
+    nominal_rig: Rig, board_captures: list[Capture]
+) -> None:
+    rig, report = calibrate(nominal_rig, board_captures[3:] + board_captures[3:4], keep_lens=True)
+    assert rig.lights == nominal_rig.lights
+    assert set(report["lamps"].figures["undetermined"]) == {x.name for x in nominal_rig.lights}
+    assert rig.projectors == nominal_rig.projectors
+    assert "0 points" in report["projectors"].figures["undetermined"]["beam"]
+
+
+def test_a_capture_without_the_board_is_an_error(
+    nominal_rig: Rig, diffuse_captures: list[Capture]
+) -> None:
+    with pytest.raises(CalibrationError, match="in 0 of the captures"):
+        calibrate(nominal_rig, diffuse_captures)
+
+
+def test_the_board_can_be_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "board", str(tmp_path / "board.png"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["width_mm"] == pytest.approx(243)
+    assert (tmp_path / "board.png").stat().st_size > 1000
