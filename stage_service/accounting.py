@@ -103,14 +103,19 @@ class FrameAccount:
         self.unanswered -= 1
 
     def place(
-        self, block_ids: Sequence[int], timestamps: Sequence[float], schedule: Sequence[float]
+        self,
+        block_ids: Sequence[int],
+        timestamps: Sequence[float],
+        schedule: Sequence[float],
+        steady: bool = True,
     ) -> list[int] | None:
         """The pulse that each frame of a hardware-stepped run belongs to, from 0.
 
         `schedule` has the pulses' times in seconds. Gaps in the block ids are frames that were
         lost on the way. A trigger that came while the camera was busy leaves no gap: then only the
-        timestamps can tell which. None where they cannot, or are missing: no frame of the run may
-        be used. Raises `IndexShift` for more frames than pulses, and for ids that repeat.
+        timestamps can tell which, of a run that kept its schedule (`steady`). None where they
+        cannot, or are missing: no frame of the run may be used. Raises `IndexShift` for more frames
+        than pulses, and for ids that repeat.
         """
         pulses = len(schedule)
         if not block_ids:
@@ -119,7 +124,8 @@ class FrameAccount:
         skipped = self._skipped(block_ids[0], pulses)
         after = [(b - block_ids[0]) % self.wrap for b in block_ids]
         rising = all(a < b for a, b in pairwise(after))
-        if not rising or after[-1] >= pulses:
+        known = all(1 <= b <= self.wrap for b in block_ids)
+        if not known or not rising or after[-1] >= pulses:
             raise self._shift(
                 f"at most {pulses} frames with rising numbers",
                 block_ids[-1],
@@ -131,7 +137,7 @@ class FrameAccount:
         whole = start + after[-1] == pulses - 1 and (self.unanswered == 0 or start == 0)
         places: list[int] | None = [start + k for k in after]
         if not whole:
-            places = _by_time(start, after, timestamps, schedule)
+            places = _by_time(start, after, timestamps, schedule) if steady else None
         self.last = block_ids[-1]
         self.unanswered = pulses - 1 - (places[-1] if places else after[-1])
         return places

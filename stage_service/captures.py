@@ -22,6 +22,7 @@ from stage_service.audit import SERVICE, AuditLog
 from stage_service.capture_run import CaptureRun, plan_of
 from stage_service.capture_status import CaptureStatus, read_status
 from stage_service.config import RigFile
+from stage_service.devices.lights.limited import LitTimes
 from stage_service.devices.stage import Stage
 from stage_service.events import EventLog
 from stage_service.flash import SLOW_HZ, FlashRefusal
@@ -80,7 +81,8 @@ class CaptureManager:
         self._lock = threading.RLock()
         self._talking = threading.Lock()
         self._running: CaptureRun | None = None
-        self._closed = False
+        self._closed = self._darkening = False
+        self._lit: LitTimes = {}
         self._done: dict[str, CaptureStatus] = {}
         for plan in sorted(self.folder.glob("*/plan.json")):
             # a folder that is no capture, or a damaged one, must not keep the service from starting
@@ -124,7 +126,7 @@ class CaptureManager:
                 "armed_by": armed_by,
                 "request": extra or {},
             }
-            stage = Stage.of(self.rig_file)
+            stage = Stage.of(self.rig_file, self._lit)
             writer = CaptureWriter.create(
                 self.folder / capture_id, self.rig_file.rig, description, masks=masks, head=head
             )
@@ -141,13 +143,15 @@ class CaptureManager:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
             self._check_flashing(plan, plan.cost(self.rig_file), armed_by)
-            stage = Stage.of(self.rig_file)
+            stage = Stage.of(self.rig_file, self._lit)
             self._begin(capture_id, plan, stage, CaptureWriter.reopen(path), armed_by)
             del self._done[capture_id]
 
     def _check_free(self) -> None:
         if self._closed:
             raise Busy("none, but the service is closing")
+        if self._darkening:
+            raise Busy("none, but the stage is being put dark")
         if self._running is not None:
             raise Busy(self._running.id)
         self.latch.check()
@@ -232,7 +236,7 @@ class CaptureManager:
             if run is not None:
                 lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
                 return {**run.sequencer.stage.status(connect=False), "safety": lit}
-            stage = Stage.of(self.rig_file)
+            stage = Stage.of(self.rig_file, self._lit)
             try:
                 return {**stage.status(connect=True), "safety": self.darkness()}
             finally:
@@ -252,7 +256,7 @@ class CaptureManager:
         if self.rig_file.devices is None:
             return
         with self._talking:
-            stage = Stage.of(self.rig_file)
+            stage = Stage.of(self.rig_file, self._lit)
             try:
                 self._learn(blackout(stage, attempts=1), stage)
             finally:
@@ -264,20 +268,30 @@ class CaptureManager:
         Returns {"safe": bool, "state": "dark" | "unknown, unsafe", "detail": str}; what is unknown
         is to be treated as lit.
         """
-        run = self._stop()
-        with self._talking:
-            if run is not None and run.sequencer.blackout is not None:
-                result = run.sequencer.blackout
-            else:
-                stage = run.sequencer.stage if run is not None else Stage.of(self.rig_file)
-                try:
-                    result = blackout(stage)
-                    self._learn(result, stage)
-                finally:
-                    stage.close()
+        with self._lock:
+            self._darkening = True  # nothing may begin between the run's end and the blackout
+        try:
+            run = self._stop()
+            with self._talking:
+                result = self._darken_after(run)
+        finally:
+            with self._lock:
+                self._darkening = False
         answer = result.to_dict()
         self.events.publish("stage.blackout", answer)
         return answer
+
+    def _darken_after(self, run: CaptureRun | None) -> Blackout:
+        """The blackout with which the run has ended, or one of our own."""
+        if run is not None and run.sequencer.blackout is not None:
+            return run.sequencer.blackout
+        stage = run.sequencer.stage if run is not None else Stage.of(self.rig_file, self._lit)
+        try:
+            result = blackout(stage)
+            self._learn(result, stage)
+            return result
+        finally:
+            stage.close()
 
     def close(self) -> None:
         """Stop what runs, lights off, wait for the thread; the manager starts nothing any more."""
@@ -317,21 +331,27 @@ class CaptureManager:
         finally:
             # `devices` may have opened the links once more after the sequencer closed them.
             with self._talking, self._lock:
-                stage = run.sequencer.stage
-                stage.close()
-                if run.sequencer.blackout is not None:
-                    self._learn(run.sequencer.blackout, stage)
-                status = run.status()
-                result = status.outcome or status.state
-                self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
-                self._done[run.id] = status
-                self._running = None
+                try:
+                    run.sequencer.stage.close()
+                finally:
+                    status = self._ended(run)
         if status.outcome == "completed" and self._on_complete is not None:
             try:
                 self._on_complete(status)
             except Exception as error:  # the capture is whole; what follows it is told apart
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
+
+    def _ended(self, run: CaptureRun) -> CaptureStatus:
+        """Put the run away; its last blackout is what is known of the stage."""
+        self._running = None
+        status = run.status()
+        self._done[run.id] = status
+        if run.sequencer.blackout is not None:
+            self._learn(run.sequencer.blackout, run.sequencer.stage)
+        result = status.outcome or status.state
+        self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
+        return status
 
     def _learn(self, result: Blackout, stage: Stage) -> None:
         """Keep what a blackout came to, and latch or unlatch."""

@@ -290,7 +290,7 @@ class SafetyLimits(Strict):
     duty_window_s: Seconds = 60.0
     max_lamps: int | None = Field(default=None, ge=1)
     max_power_w: float | None = Field(default=None, gt=0.0)
-    lamp_power_w: Seconds = 10.0
+    lamp_power_w: float = Field(default=10.0, gt=0.0)
     living_subject: bool = True
 
 

@@ -73,8 +73,13 @@ class Control:
 
     def blackout(self, caller: Caller) -> dict[str, Any]:
         """`CaptureManager.blackout`; anybody may."""
-        answer = self._captures.blackout()
-        self.audit.record(self._who(caller), "blackout", STAGE, answer["state"], answer["detail"])
+        who = self._who(caller)
+        try:
+            answer = self._captures.blackout()
+        except Exception as error:
+            self.audit.record(who, "blackout", STAGE, "failed", f"{type(error).__name__}: {error}")
+            raise
+        self.audit.record(who, "blackout", STAGE, answer["state"], answer["detail"])
         return answer
 
     def acknowledge(self, caller: Caller, name: str, note: str) -> dict[str, Any]:

@@ -38,7 +38,8 @@ class Shots:
 class HardwareRun:
     """One run on an armed stage; `shoot` blocks, `stop_asked` is looked at while it runs.
 
-    `schedule` has the seconds from the first pulse at which each step's pulse is due.
+    `schedule` has the seconds from the first pulse at which each step's pulse is due; `steady` says
+    that nothing but the box decides on them.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class HardwareRun:
             TableRow(len(list(same)), row.gates, row.settle_s, row.exposure_s, row.period_s)
             for row, same in groupby(each)
         ]
+        self.steady = not any("P" in r.gates for r in each)  # projectors hold the box up
         self.schedule = list(accumulate((r.period_s for r in each[:-1]), initial=0.0))
 
     def shoot(

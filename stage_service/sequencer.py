@@ -264,7 +264,7 @@ class Sequencer:
             self._clocked = 0
         first = self._pulses.count + 1
         self._pulses.ran(shots.progress.pulses, self.stage.trigger.count())
-        places = self._place(shots, run.schedule[: shots.progress.pulses])
+        places = self._place(shots, run)
         for camera in self.stage.cameras:
             for place, frame in zip(
                 places[camera.name] or (), shots.frames[camera.name], strict=False
@@ -283,10 +283,11 @@ class Sequencer:
             for step in steps:
                 self._tell_missing(step, todo[step], 0)
 
-    def _place(self, shots: Shots, schedule: list[float]) -> dict[str, list[int] | None]:
+    def _place(self, shots: Shots, run: HardwareRun) -> dict[str, list[int] | None]:
+        schedule = run.schedule[: shots.progress.pulses]
         return {
             name: self._accounts[name].place(
-                [f.block_id for f in frames], [f.timestamp for f in frames], schedule
+                [f.block_id for f in frames], [f.timestamp for f in frames], schedule, run.steady
             )
             for name, frames in shots.frames.items()
         }

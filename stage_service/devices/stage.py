@@ -27,7 +27,7 @@ from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
 from stage_service.devices.lights.interface import LightBank
-from stage_service.devices.lights.limited import LimitedLightBank
+from stage_service.devices.lights.limited import LimitedLightBank, LitTimes
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.projectors.pjlink import PjLinkProjector, Power
@@ -53,8 +53,11 @@ class Stage:
     powers: tuple[PjLinkProjector, ...] = ()
 
     @classmethod
-    def of(cls, rig_file: RigFile) -> Self:
-        """Make the drivers; connects to nothing. Raises `RigError` without `[devices]`."""
+    def of(cls, rig_file: RigFile, lit: LitTimes | None = None) -> Self:
+        """Make the drivers; connects to nothing. Raises `RigError` without `[devices]`.
+
+        `lit` has how long lamps were lit before, for their duty, and goes on being kept.
+        """
         config, rig = rig_file.devices, rig_file.rig
         if config is None:
             raise RigError(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
@@ -64,7 +67,9 @@ class Stage:
             projectors = SerialProjectorController(config.projectors, names)
         return cls(
             config,
-            LimitedLightBank(_light_bank(config.lights, len(rig.lights)), rig_file.safety),
+            LimitedLightBank(
+                _light_bank(config.lights, len(rig.lights)), rig_file.safety, past=lit
+            ),
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(_camera(config.cameras, c) for c in rig.cameras),

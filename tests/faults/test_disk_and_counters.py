@@ -10,6 +10,7 @@ import simulators.world
 import stage_service.devices.cameras.link
 from reconstruction.capture_verify import verify
 from reconstruction.capture_writer import CaptureWriter
+from stage_service.captures import CaptureManager
 from stage_service.devices.stage import Stage
 from stage_service.plan import CapturePlan
 from stage_service.sequencer import Sequencer
@@ -67,3 +68,23 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     run = Sequencer(Stage.of(rig_file), again, runs=runs)
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
+
+
+def test_the_duty_of_a_lamp_is_counted_over_several_captures(simulated, small_rig, tmp_path):
+    """Each capture alone keeps to the limit."""
+    safety = "[safety]\nmax_duty = 0.1\nduty_window_s = 2.0"
+    rig_file, world = simulated(rig=small_rig.replace("[safety]", safety))
+    plan = CapturePlan(
+        lights=("light_003",), projectors=(), sentinels=False, exposure={"olat": 0.09}
+    )
+    manager = CaptureManager(rig_file, tmp_path / "root")
+    captures = []
+    for _ in range(4):
+        captures.append(manager.wait(manager.start(plan), 30))
+        if captures[-1].outcome != "completed":
+            break
+    manager.close()
+    assert captures[0].outcome == "completed"
+    assert captures[-1].outcome == "failed"
+    assert "max_duty in [safety]" in str(captures[-1].error)
+    assert not world.lamps.power().any()

@@ -168,3 +168,16 @@ def test_time_stamps_tell_a_frame_of_an_earlier_pulse(offset, drift, jitter):
 def test_frames_behind_the_newest_are_named():
     with pytest.raises(IndexShift, match="received 1 behind block id 8"):
         account(last=7).arrived(8, left=1)
+
+
+def test_time_stamps_place_nothing_where_projectors_hold_the_box_up():
+    schedule = [0.1 * i for i in range(6)]
+    times = [3.0, 3.1, 3.3, 3.4, 3.5]
+    one = account(last=0)
+    assert one.place([1, 2, 3, 4, 5], times, schedule, steady=False) is None
+    assert account(last=0).place([*range(1, 7)], [0.0] * 6, schedule, steady=False) == [*range(6)]
+
+
+def test_a_block_id_out_of_range_is_refused_anywhere_in_a_run():
+    with pytest.raises(IndexShift):
+        account(last=65533).place([65534, 65535, 0], [0.0] * 3, range(3))

@@ -11,6 +11,9 @@ from stage_service.config import SafetyLimits
 from stage_service.devices.errors import SafetyRefusal
 from stage_service.devices.lights.interface import LightBank, LightStatus, Lit
 
+LitTimes = dict[int, deque[tuple[float, float]]]
+"""By lamp, from when until when it was lit; kept beyond a connection, or duty would begin anew."""
+
 AGAIN_S = 0.1
 """After so many seconds lamps that could not be put off are tried again."""
 
@@ -21,7 +24,8 @@ class LimitedLightBank:
     A lamp that stays lit too long, or too much of the time, is put off by a thread of this bank.
     From then on every command but `off` raises, heartbeats too, so that a bank that does not obey
     is left to its own watchdog; `connect` begins anew. Sequences that the trigger box clocks are
-    checked entry by entry; how long their lamps are lit follows from the plan.
+    checked entry by entry; how long their lamps are lit follows from the plan. `past` has how long
+    lamps were lit before, and goes on being kept.
     """
 
     def __init__(
@@ -29,12 +33,13 @@ class LimitedLightBank:
         bank: LightBank,
         limits: SafetyLimits,
         clock: Callable[[], float] = time.monotonic,
+        past: LitTimes | None = None,
     ) -> None:
         self.name, self.capabilities = bank.name, bank.capabilities
         self._bank, self._limits, self._clock = bank, limits, clock
         self._level = 1.0  # what a bank has at power-up, and one without levels always
         self._since: dict[int, float] = {}
-        self._past: dict[int, deque[tuple[float, float]]] = {}
+        self._past: LitTimes = {} if past is None else past
         self._refusal: SafetyRefusal | None = None
         self._changed = threading.Condition(threading.RLock())
         self._wakes = 0.0

@@ -68,6 +68,14 @@ class SerialTriggerBox:
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
         """Upload, compare checksum and number of steps with our own, and leave the box armed."""
         texts = [self._text(row) for row in _joined(rows)]
+        if self._table_rows == 0:
+            raise DeviceError(
+                self.name,
+                "uploading a table",
+                expected="a box that runs tables",
+                received="one without (version 1, or 0 rows)",
+                todo="Set hardware_stepping = false in [devices], or update the box's firmware.",
+            )
         if not 1 <= len(texts) <= self._table_rows:
             raise DeviceError(
                 self.name,
