@@ -1,9 +1,9 @@
 """Which pixels are hair and which are skin: the user's word, else geometry, else the light.
 
-Hair is wherever the user's mask says so. Without one, a pixel whose triangulated point stands off
-the head, or that shows the subject where the head is not, is hair. On the head, and without a head
-mesh everywhere, the light decides: a matte surface answers half of the lamps by `albedo n·l`,
-fibres mirror a few lamps and hide from the others.
+Hair is wherever the user's mask says so, or else the user's network, of what is lit. Without one,
+a pixel whose triangulated point stands off the head, or that shows the subject where the head is
+not, is hair. On the head, and without a head mesh everywhere, the light decides: a matte surface
+answers half of the lamps by `albedo n·l`, fibres mirror a few lamps and hide from the others.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.mesh import Mesh
-from reconstruction.silhouettes import NoSilhouette, silhouette
+from reconstruction.segmentation import Network
+from reconstruction.silhouettes import NoSilhouette, lit_rgb, silhouette
 
 Mask = NDArray[np.bool_]
-Source = Literal["user", "geometry", "photometry", "silhouette"]
+Source = Literal["user", "network", "geometry", "photometry", "silhouette"]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
 MATTE_CONTRAST = 1.29  # sqrt(1/6 - 1/16) / (1/4): cosine over all directions, deviation over mean
@@ -51,12 +52,13 @@ def hair_masks(
     head: Mesh | None = None,
     *,
     stands_off: float = STANDS_OFF,
+    network: Network | None = None,
 ) -> dict[str, HairMask]:
     """Masks of every camera that has a user's mask or a silhouette.
 
-    `points` are in the reference pose, `head` the digitised head in the world. A camera without any
-    frame to take a silhouette from, and without a user's mask, is left out. An empty silhouette
-    gives empty masks.
+    `network` is asked where the user gave no mask. `points` are in the reference pose, `head` the
+    digitised head in the world. A camera without any frame to take a silhouette from, and without
+    a user's mask, is left out. An empty silhouette gives empty masks.
     """
     off = None
     if head is not None and points is not None and len(points):
@@ -72,6 +74,9 @@ def hair_masks(
             subject = user
         if user is not None:
             masks[camera.name] = HairMask(subject | user, user, subject & ~user, "user", 1.0)
+        elif network is not None:
+            hair = network.hair_pixels(lit_rgb(capture, camera.name)) & subject
+            masks[camera.name] = HairMask(subject, hair, subject & ~hair, "network", 1.0)
         elif not subject.any():
             masks[camera.name] = HairMask(subject, subject, subject, "silhouette", 0.0)
         else:

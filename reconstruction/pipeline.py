@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -31,6 +31,7 @@ from reconstruction.report import Progress, Report, Stage, silent
 from reconstruction.rig import Rig
 from reconstruction.rooting import root_all
 from reconstruction.scalp import Scalp, find_scalp, sample_roots
+from reconstruction.segmentation import Network
 from reconstruction.strand_files import write_strands
 from reconstruction.strands import Strands
 from reconstruction.visual_hull import VoxelGrid, visual_hull
@@ -46,14 +47,15 @@ HEAD_OF_HAIR = 100_000 * 40e-6
 class ReconstructOptions:
     """What the reconstruction is asked for.
 
-    `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both
-    in metres; `roots` strands are grown from the scalp, then gaps are filled.
-    `max_length` (metres) is the hair's, which the user knows. `margin` (metres) is how far in
-    front of the seen surface the envelope reaches. `scalp_normals` holds the field to the scalp's
-    normals as the paper does; hair that lies flat on the head is bent wrongly by that.
-    `to_measured` ends strands from the scalp at their last measured voxel. `radius` of
-    the strands in metres; None takes the one that keeps a head of hair's coverage.
-    `explicit_seconds` of explicit diffusion are run beside the solver for the report.
+    `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both in
+    metres; `roots` strands are grown from the scalp, then gaps are filled. `max_length` (metres)
+    is the hair's, which the user knows. `margin` (metres) is how far in front of the seen surface
+    the envelope reaches. `network` holds the fields of `segmentation.Network`, which tells hair
+    from skin where the user's masks do not. `scalp_normals` holds the field to the scalp's normals
+    as the paper does; hair that lies flat on the head is bent wrongly by that. `to_measured` ends
+    strands from the scalp at their last measured voxel. `radius` of the strands in metres; None
+    takes the one that keeps a head of hair's coverage. `explicit_seconds` of explicit diffusion
+    are run beside the solver for the report.
     """
 
     held_out: tuple[str, ...] = ()
@@ -63,6 +65,7 @@ class ReconstructOptions:
     max_length: float = 0.3
     margin: float = 2e-3
     least_confidence: float = 0.1
+    network: dict[str, Any] | None = None
     scalp_normals: bool = False
     to_measured: bool = False
     spacing: float = 2e-3
@@ -106,7 +109,10 @@ def reconstruct(
         cloud.save(model / "points.npz")
     with report.stage("masks") as stage:
         # a held-out camera's mask says where to compare pictures; nothing here looks at it
-        every = hair_masks(whole, cloud if len(cloud) else None, head)
+        network = None if options.network is None else Network(**options.network)
+        every = hair_masks(whole, cloud if len(cloud) else None, head, network=network)
+        if network is not None:
+            stage.figures["network"] = network.to_dict()
         for name, mask in every.items():
             for kind, pixels in (("hair", mask.hair), ("skin", mask.skin)):
                 image = pixels.astype(np.uint8) * 255

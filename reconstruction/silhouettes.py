@@ -18,8 +18,8 @@ class NoSilhouette(ValueError):
     """A camera without the frames that a silhouette needs."""
 
 
-def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
-    """Mean of the camera's dark frames `(H, W)` (mean of the channels); zeros where none was shot.
+def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
+    """Mean of the camera's dark frames `(H, W, 3)`; zeros where none was shot.
 
     With `exposure`, only the dark frames at the nearest exposure count.
     """
@@ -29,8 +29,13 @@ def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> 
         steps = [s for s in steps if s.exposure == nearest]
     c = capture.rig.camera(camera)
     if not steps:
-        return np.zeros((c.height, c.width), np.float32)
-    return np.mean([capture.frame(s, camera).mean(axis=-1) for s in steps], axis=0)
+        return np.zeros((c.height, c.width, 3), np.float32)
+    return np.mean([capture.frame(s, camera) for s in steps], axis=0)
+
+
+def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
+    """`dark_rgb`'s mean over the channels `(H, W)`."""
+    return np.asarray(dark_rgb(capture, camera, exposure).mean(axis=-1))
 
 
 def background_noise(image: NDArray[np.floating]) -> float:
@@ -44,7 +49,12 @@ def background_noise(image: NDArray[np.floating]) -> float:
 
 
 def lit_image(capture: Capture, camera: str) -> NDArray[np.float32]:
-    """The subject under as many lamps as the capture has, less the dark frame `(H, W)`.
+    """`lit_rgb`'s mean over the channels `(H, W)`."""
+    return np.asarray(lit_rgb(capture, camera).mean(axis=-1))
+
+
+def lit_rgb(capture: Capture, camera: str) -> NDArray[np.float32]:
+    """The subject under as many lamps as the capture has, less the dark frame `(H, W, 3)`.
 
     The all-on frames' mean at full level, else the sum of the OLAT frames, else the first tracking
     frame. Raises `NoSilhouette` where the camera has none of them.
@@ -84,10 +94,10 @@ def _fill_pinholes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _sum(capture: Capture, camera: str, steps: list[Step]) -> NDArray[np.float32]:
     dark: dict[float, NDArray[np.float32]] = {}
     c = capture.rig.camera(camera)
-    total = np.zeros((c.height, c.width), np.float32)
+    total = np.zeros((c.height, c.width, 3), np.float32)
     for step in steps:
         if step.exposure not in dark:
-            dark[step.exposure] = dark_frame(capture, camera, step.exposure)
-        image = capture.frame(step, camera).mean(axis=-1) - dark[step.exposure]
+            dark[step.exposure] = dark_rgb(capture, camera, step.exposure)
+        image = capture.frame(step, camera) - dark[step.exposure]
         total += image / (step.level if step.level > 0 else 1.0)
     return total

@@ -6,18 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.capture import Capture, Step
-
-
-def dark_rgb(capture: Capture, camera: str, exposure: float) -> NDArray[np.float32]:
-    """Mean of the dark frames `(H, W, 3)` at the nearest exposure; zeros where none was shot."""
-    steps = [s for s in capture.of_kind("dark") if capture.has(s, camera)]
-    if not steps:
-        c = capture.rig.camera(camera)
-        return np.zeros((c.height, c.width, 3), np.float32)
-    nearest = min((s.exposure for s in steps), key=lambda e: abs(e - exposure))
-    return np.mean(
-        [capture.frame(s, camera) for s in steps if s.exposure == nearest], axis=0, dtype=np.float32
-    )
+from reconstruction.silhouettes import dark_rgb
 
 
 def dark_response(
