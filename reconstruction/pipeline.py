@@ -47,15 +47,15 @@ HEAD_OF_HAIR = 100_000 * 40e-6
 class ReconstructOptions:
     """What the reconstruction is asked for.
 
-    `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both in
-    metres; `roots` strands are grown from the scalp, then gaps are filled. `max_length` (metres)
+    `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both
+    in metres; `roots` strands are grown from the scalp, then gaps are filled. `max_length` (metres)
     is the hair's, which the user knows. `margin` (metres) is how far in front of the seen surface
     the envelope reaches. `network` holds the fields of `segmentation.Network`, which tells hair
     from skin where the user's masks do not. `scalp_normals` holds the field to the scalp's normals
     as the paper does; hair that lies flat on the head is bent wrongly by that. `to_measured` ends
     strands from the scalp at their last measured voxel. `radius` of the strands in metres; None
-    takes the one that keeps a head of hair's coverage. `explicit_seconds` of explicit diffusion
-    are run beside the solver for the report.
+    takes the one that keeps a head of hair's coverage. `explicit_seconds` of explicit diffusion are
+    run beside the solver for the report.
     """
 
     held_out: tuple[str, ...] = ()
