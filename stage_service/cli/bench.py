@@ -14,9 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from reconstruction.cameras import Camera
 from stage_service.cli.output import (
     FAILED,
     CommandError,
@@ -60,8 +57,11 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
 
 
 def _light(args: argparse.Namespace) -> dict[str, Any]:
+    import numpy as np
+
     from appearance.bench_light import Subject, run
     from appearance.hair_appearance import HairAppearance
+    from reconstruction.cameras import Camera
     from reconstruction.mesh import read_obj
     from reconstruction.rig import Rig
     from reconstruction.strand_files import read_strands
@@ -81,9 +81,9 @@ def _light(args: argparse.Namespace) -> dict[str, Any]:
             )
 
     camera = Rig.load(args.rig).cameras[0]
-    small = Camera.look_at(
-        camera.name, 128, 128, camera.center, camera.center + camera.R[2], _fov_deg(camera)
-    )
+    fov_deg = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0])))
+    ahead = camera.center + camera.R[2]
+    small = Camera.look_at(camera.name, 128, 128, camera.center, ahead, fov_deg)
     with progress_bar("bench light") as progress:
         progress("making the subjects", 0.0)
         subjects = {
@@ -93,10 +93,6 @@ def _light(args: argparse.Namespace) -> dict[str, Any]:
             "black curls": subject("curly", None, (3.35, 5.58, 10.96)),
         }
         return run(args.out, subjects, small, seed=args.seed, progress=progress)
-
-
-def _fov_deg(camera: Camera) -> float:
-    return float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0])))
 
 
 def _agreement(args: argparse.Namespace) -> dict[str, Any]:
