@@ -28,9 +28,9 @@ class Dome:
     then weighted by signal / (signal + noise) (Wiener), both measured on two halves of the
     samples: few samples give a smoother answer, many a sharper one.
 
-    Biased: degrees above `degree` are cut off and low ones shrunk. On blond hair and 6 degrees the
-    squared bias is below the variance up to some 60 paths a pixel, and the total error below the
-    unbiased renderer's up to some 250.
+    Biased: degrees above `degree` are cut off and low ones shrunk. The weights keep squared bias
+    and variance alike in size (at 16 paths a pixel 0.086 and 0.080 on blond hair); the total error
+    is below the unbiased renderer's up to some 150 (blond) to 250 paths (Sintel).
     """
 
     degree: int

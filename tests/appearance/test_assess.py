@@ -25,10 +25,10 @@ from reconstruction.rig import Rig
 from reconstruction.strand_files import write_strands
 from reconstruction.strands import Strands
 
-TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.35, 0.35)  # smoother hair is noise at this size
-HELD_OUT = HeldOut(("cam_2",), ("l10", "l7"))
+TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.2, 0.2)
+HELD_OUT = HeldOut(("cam_2",), ("l4", "l7"))
 OPTIONS = AssessOptions(
-    cameras=2, lights=3, spp=16, baseline_pixels=60, baseline_lights=8, relit_size=32, relit_spp=4
+    cameras=2, lights=3, spp=64, baseline_pixels=60, baseline_lights=8, relit_size=32, relit_spp=4
 )
 
 
@@ -62,7 +62,7 @@ def made(tmp_path_factory):
     write_strands(model / "strands.npz", strands)
     bright = []
     for camera in cameras:
-        images = render_olat(scene, camera, lights, spp=64, seed=7)
+        images = render_olat(scene, camera, lights, spp=256, seed=7)
         for step, image in zip(steps, images, strict=True):
             writer.write_frame(step, camera.name, image, pulse=1, block_id=1, timestamp=0.0)
         mask = coverage(scene, camera)["hair"] > 0.5
@@ -87,7 +87,7 @@ def test_the_true_model_beats_the_trivial_baselines(result):
         for baseline in ("mean_colour", "diffuse"):
             assert rows["ours"]["psnr"] > rows[baseline]["psnr"] + 2
             assert rows["ours"]["ssim"] > rows[baseline]["ssim"] + 0.05
-            assert rows["ours"]["relative_error"] < 0.85 * rows[baseline]["relative_error"]
+            assert rows["ours"]["relative_error"] < 0.5 * rows[baseline]["relative_error"]
     assert result["lpips"] is None
 
 
@@ -118,17 +118,17 @@ def test_a_baseline_that_is_not_beaten_is_warned_of():
 
 def test_a_group_with_nothing_held_out_is_left_out(made):
     capture, model, _ = made
-    found = assess(capture, model, held_out=HeldOut((), ("l10",)), options=OPTIONS)
+    found = assess(capture, model, held_out=HeldOut((), ("l4",)), options=OPTIONS)
     assert "held_out_lights" in found
     assert "held_out_camera" not in found
 
 
 def test_three_nearest_lights_are_training_lights(made):
     capture, _, _ = made
-    light = capture.rig.light("l10")
+    light = capture.rig.light("l4")
     mixed = three_nearest(capture, "cam_0", light, HELD_OUT)
     positions = {x.name: x.position @ light.position for x in capture.rig.lights}
-    nearest = sorted(set(positions) - {"l10", "l7"}, key=lambda n: -positions[n])[:3]
+    nearest = sorted(set(positions) - {"l4", "l7"}, key=lambda n: -positions[n])[:3]
     frames = capture.olat("cam_0", nearest)
     weights = 1 / np.arccos([positions[n] for n in nearest])
     want = np.tensordot(weights / weights.sum(), frames, 1)
@@ -137,9 +137,9 @@ def test_three_nearest_lights_are_training_lights(made):
 
 def test_smoothing_keeps_the_mean_and_takes_the_noise(made):
     capture, _, scene = made
-    camera, lights = capture.rig.cameras[0], [capture.rig.light("l10")]
+    camera, lights = capture.rig.cameras[0], [capture.rig.light("l4")]
     mask = coverage(scene, camera)["hair"] > 0.5
-    reference = capture.olat("cam_0", ["l10"])[0]
+    reference = capture.olat("cam_0", ["l4"])[0]
     plain = render_olat(scene, camera, lights, spp=9, thrift=0, seed=3)[0]
     smooth = olat_smoothed(scene, camera, lights, spp=9, seed=3)[0]
     # light is handed on by share of the pixels, so that a little crosses the mask's edge
