@@ -193,6 +193,61 @@ def solve_field(
 
     Raises `ValueError` for an empty envelope or when no datum falls into it.
     """
+    system = field_system(grid, points, directions, weights, boundary)
+    values, free = system.values.copy(), system.free
+    series: list[Series] = []
+    if len(free):
+        A, b, start = system.equations()
+        values[free], fast = conjugate_gradients(A, b, start, options.tolerance)
+        series.append(fast)
+        if options.explicit_seconds > 0:
+            begin = time.perf_counter()
+            series.append(explicit_diffusion(A, b, start, options.explicit_seconds, begin)[1])
+    directions_, eigenvalues = principal(values)
+    coherence = eigenvalues[:, 0] - eigenvalues[:, 1]
+    degenerate = ~system.empty & (coherence < options.least_coherence)
+    directions_[system.empty | degenerate] = 0
+    field = OrientationField(
+        grid, values, directions_, coherence, system.measured, system.empty, degenerate
+    )
+    return field, series
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSystem:
+    """What `solve_field` solves, on the M voxels of the envelope.
+
+    `values (M, 6)` are tensors, 0 where not `fixed (M,)`; `measured (M,)` and `empty (M,)` as in
+    the field; `free (F,)` numbers the unknowns.
+    """
+
+    laplacian: sparse.csr_array
+    values: Array
+    fixed: Bools
+    measured: Bools
+    empty: Bools
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Numbers `(F,)` of the voxels to solve for."""
+        return np.flatnonzero(~self.fixed & ~self.empty)
+
+    def equations(self) -> tuple[sparse.csr_array, Array, Array]:
+        """`A (F, F)`, `b (F, 6)` and a start `(F, 6)`: the mean of the data, so of trace 1."""
+        rows = self.laplacian[self.free]
+        known = np.flatnonzero(self.fixed)
+        b = -(rows[:, known] @ self.values[known])
+        return rows[:, self.free], b, np.broadcast_to(self.values[known].mean(axis=0), b.shape)
+
+
+def field_system(
+    grid: VoxelGrid,
+    points: NDArray[np.floating],
+    directions: NDArray[np.floating],
+    weights: NDArray[np.floating] | None = None,
+    boundary: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+) -> FieldSystem:
+    """The linear system of `solve_field`, which says what the arguments are and what it raises."""
     count = int(grid.inside.sum())
     if count == 0:
         raise ValueError("the hair's envelope is empty: check masks and poses")
@@ -214,39 +269,4 @@ def solve_field(
     pieces, piece = connected_components(laplacian, directed=False)
     has_data = np.zeros(pieces, bool)
     has_data[piece[fixed]] = True
-    empty = ~has_data[piece]
-    free = np.flatnonzero(~fixed & ~empty)
-    series: list[Series] = []
-    if len(free):
-        values[free], series = _solve_free(laplacian, values, free, fixed, options)
-    directions_, eigenvalues = principal(values)
-    coherence = eigenvalues[:, 0] - eigenvalues[:, 1]
-    degenerate = ~empty & (coherence < options.least_coherence)
-    directions_[empty | degenerate] = 0
-    return (
-        OrientationField(grid, values, directions_, coherence, measured, empty, degenerate),
-        series,
-    )
-
-
-def _solve_free(
-    laplacian: sparse.csr_array,
-    values: Array,
-    free: NDArray[np.int64],
-    fixed: Bools,
-    options: FieldOptions,
-) -> tuple[Array, list[Series]]:
-    """Tensors `(F, 6)` of the free voxels from those of the fixed ones."""
-    rows = laplacian[free]
-    A = rows[:, free]
-    known = np.flatnonzero(fixed)
-    b = -(rows[:, known] @ values[known])
-    mean = values[known].mean(axis=0)
-    start = np.broadcast_to(mean, b.shape)  # trace 1, as the answer has
-    x, fast = conjugate_gradients(A, b, start, options.tolerance)
-    series = [fast]
-    if options.explicit_seconds > 0:
-        begin = time.perf_counter()
-        _, slow = explicit_diffusion(A, b, start, options.explicit_seconds, begin)
-        series.append(slow)
-    return x, series
+    return FieldSystem(laplacian, values, fixed, measured, ~has_data[piece])

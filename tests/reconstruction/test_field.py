@@ -13,6 +13,7 @@ from reconstruction.envelope import carve, depth_map, inside_mesh, mesh_depth, s
 from reconstruction.field import FieldOptions, gather, principal, solve_field, to_tensors
 from reconstruction.laplace import (
     Multigrid,
+    compare_solvers,
     conjugate_gradients,
     explicit_diffusion,
     grid_laplacian,
@@ -117,6 +118,18 @@ def test_explicit_steps_reach_the_same_rest() -> None:
     slow, series = explicit_diffusion(A, b, start, 1.0)
     assert np.sqrt(((slow - fast) ** 2).mean()) < 0.2 * np.sqrt(((start - fast) ** 2).mean())
     assert series.points[-1][1] < series.points[0][1]
+
+
+def test_every_solver_comes_to_the_same_rest() -> None:
+    A, b = random_problem()
+    curves = compare_solvers(A, b, np.full(b.shape, 0.5), error=1e-6)
+    explicit, plain, multigrid = curves
+    assert explicit.name == "explicit steps"
+    assert all(curve.points[-1][1] < 1e-6 for curve in curves)
+    assert len(multigrid.points) < len(plain.points)
+    for curve in curves:
+        assert curve.points[0][1] == pytest.approx(curves[0].points[0][1])
+        assert (np.diff([seconds for seconds, _ in curve.points]) > 0).all()
 
 
 def test_solver_that_cannot_get_there_says_so() -> None:

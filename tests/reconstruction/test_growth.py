@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from reconstruction.field import OrientationField, to_tensors
+from reconstruction.field import OrientationField, solve_field, to_tensors
 from reconstruction.growth import Coverage, Method, fill_gaps, grow_from_roots, to_polylines, trace
+from reconstruction.growth_study import METHODS, compare_growth
 from reconstruction.mesh import Mesh
 from reconstruction.rooting import root_all
 from reconstruction.scalp import Scalp
@@ -53,6 +54,51 @@ def test_higher_order_strays_less_than_euler_at_equal_cost() -> None:
     assert euler > 5e-4  # half a millimetre outwards
     assert midpoint < 0.1 * euler
     assert rk4 < 0.1 * euler
+
+
+def helices(p: np.ndarray) -> np.ndarray:
+    """A lock: 31 mm a turn."""
+    return np.stack([-p[:, 1], p[:, 0], np.full(len(p), 5e-3)], axis=1)
+
+
+def reconstructed() -> OrientationField:
+    """The lock again, measured on its outside only and solved for inside."""
+    grid = VoxelGrid(np.array([-0.014, -0.014, -0.03]), 1e-3, np.ones((29, 29, 61), bool))
+    centers = grid.centers()
+    outside = np.linalg.norm(centers[:, :2], axis=1) > 9e-3
+    return solve_field(grid, centers[outside], helices(centers[outside]))[0]
+
+
+@pytest.mark.parametrize(
+    "field", [analytic(helices, (29, 29, 61)), reconstructed()], ids=["analytic", "reconstructed"]
+)
+def test_errors_of_the_methods_against_what_they_cost(field: OrientationField) -> None:
+    """Euler is of first order, midpoint of second; what is paid for midpoint is well spent."""
+    angle = np.linspace(0, 6, 20)
+    starts = np.stack([7e-3 * np.cos(angle), 7e-3 * np.sin(angle), np.full(20, -0.028)], axis=1)
+    steps = (2e-3, 1e-3, 5e-4)
+    curves = compare_growth(field, starts, helices(starts), steps=steps, max_length=0.04)
+    assert [c.name for c in curves] == list(METHODS)
+    assert all(seconds > 0 for c in curves for seconds, _ in c.points)
+    euler, midpoint, rk4 = (np.array([e for _, e in c.points]) for c in curves)
+    assert 1.5 < euler[0] / euler[2] < 8
+    assert midpoint[0] / midpoint[2] > 8
+    # equal cost: as many looks into the field, as COST has it
+    assert (midpoint[:2] < 0.1 * euler[1:]).all()
+    assert rk4[0] < 0.1 * euler[2]
+    assert midpoint[2] < 2e-5 < euler[2]
+    with pytest.raises(ValueError, match="multiple of the shortest"):
+        compare_growth(field, starts, helices(starts), steps=(7e-4, 5e-4))
+
+
+def test_strands_do_not_depend_on_threads() -> None:
+    field = analytic(helices, (29, 29, 61))
+    roots = np.random.default_rng(0).uniform([-0.01, -0.01, -0.03], [0.01, 0.01, 0.02], (4500, 3))
+    normals = np.tile([0, 0, 1.0], (len(roots), 1))
+    one, many = (grow_from_roots(field, roots, normals, threads=t) for t in (1, 4))
+    assert len(one) > 3000
+    assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
+    assert grow_from_roots(field, roots[:0], normals[:0]) == []
 
 
 def test_sign_follows_the_way_and_paths_end_at_the_envelope() -> None:
