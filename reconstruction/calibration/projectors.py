@@ -20,7 +20,7 @@ from reconstruction.calibration.boards import Board
 from reconstruction.calibration.cameras import CameraSolution
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.frames import dark_response
-from reconstruction.calibration.least_squares import Linearised, minimise, numeric
+from reconstruction.calibration.least_squares import Linearised, Solution, minimise, numeric
 from reconstruction.calibration.rigid import Rigid
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
@@ -30,7 +30,8 @@ from reconstruction.projectors import Projector
 Array = NDArray[np.float64]
 
 MOST = 20_000  # points: more do not make it better
-LOOSE = 0.02  # radians between planes, and metres: a larger deviation is no calibration
+HEAD = 0.1  # metres about the points' middle where planes of light are to be right
+LOOSE = 2e-3  # metres: where planes are known to no better there, that is no calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +58,17 @@ class Rows:
 class ProjectorSolution:
     """The calibrated `projector`; `points` used; `rms` of the rows' residuals, rows.
 
-    `axis_deviation` (metres) is of the line through the centre that all planes hold,
-    `turn_deviation` (radians) of the rotation; `conditioning` is `Solution.conditioning`.
+    `plane_deviation` (metres) is of the planes of light, at its largest within `HEAD` of the
+    points' middle; `axis_deviation` (metres) of the line that all of them hold, `turn_deviation`
+    (radians) of the rotation.
     """
 
     projector: Projector
     points: int
     rms: float
+    plane_deviation: float
     axis_deviation: float
     turn_deviation: float
-    conditioning: float
 
 
 UNDETERMINED = (
@@ -115,24 +117,38 @@ def calibrate_projector(nominal: Projector, rows: Rows) -> ProjectorSolution:
         )
     start = _linear(nominal, rows)
     solution = minimise(_linearised(nominal, rows), start)
-    deviation = solution.deviation
-    axis, turn = float(deviation[3:5].max()), float(deviation[:3].max())
-    if not max(axis, turn) < LOOSE:
+    loose = _plane_deviation(nominal, solution, rows.points.mean(axis=0))
+    if not loose < LOOSE:
         raise CalibrationError(
             f"{where}: {len(rows.row)} decoded points leave its planes of light open by "
-            f"{axis * 1e3:.3g} mm and {np.degrees(turn):.3g}° (limit {LOOSE * 1e3:g} mm, "
-            f"{np.degrees(LOOSE):.2g}°): {_shape(rows.points)}; shoot the sweep on boards at "
-            "several distances and tilts"
+            f"{loose * 1e3:.3g} mm within {HEAD * 1e3:g} mm of the board's middle (limit "
+            f"{LOOSE * 1e3:g} mm): {_shape(rows.points)}; shoot the sweep on boards at several "
+            "distances and tilts"
         )
     weighted = solution.residual * rows.deviation
     return ProjectorSolution(
         _projector(nominal, solution.x),
         len(rows.row),
         float(np.sqrt(np.mean(weighted**2))),
-        axis,
-        turn,
-        solution.conditioning,
+        loose,
+        float(solution.deviation[3:5].max()),
+        float(solution.deviation[:3].max()),
     )
+
+
+def _plane_deviation(nominal: Projector, solution: Solution, middle: Array) -> float:
+    """Metres, the largest over a ball about `middle`."""
+    way = np.random.default_rng(0).standard_normal((200, 3))
+    points = middle + HEAD * way / np.linalg.norm(way, axis=1, keepdims=True)
+
+    def row(x: Array) -> Array:
+        return np.asarray(_projector(nominal, x).project(points)[0][:, 1])
+
+    _, J = numeric(row)(solution.x)
+    found = _projector(nominal, solution.x)
+    variance = np.einsum("ni,ij,nj->n", J, solution.covariance, J)
+    metres = np.sqrt(variance) * found.project(points)[1] / found.K[1, 1]
+    return float(np.abs(metres).max())
 
 
 def projector_intensities(

@@ -148,6 +148,7 @@ def _projectors(
         figures[p.name] = {
             "points": one.points,
             "rms_rows": one.rms,
+            "plane_deviation_mm": 1e3 * one.plane_deviation,
             "axis_deviation_mm": 1e3 * one.axis_deviation,
             "turn_deviation_deg": float(np.degrees(one.turn_deviation)),
         }

@@ -48,7 +48,9 @@ def add(commands: Commands) -> None:
     )
     simulate.add_argument("--rig", type=Path, required=True, help="rig file")
     simulate.add_argument(
-        "--subject", default="wavy", help="wavy, straight, curly or a strand file"
+        "--subject",
+        default="wavy",
+        help="wavy, straight, curly or a strand file; board:N, mirror:N, diffuse:N to calibrate",
     )
     simulate.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
     simulate.add_argument("--state", type=Path, default=Path("runs/simulated"), help="state folder")
