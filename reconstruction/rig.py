@@ -248,7 +248,9 @@ def _lights(
             nearest = int(distance.argmin())
             beside[nearest] = camera.name
             positions[nearest] = camera.center - offset * camera.R[1]
-    shared = {f: dome[f] for f in ("profile", "radius", "size", "roll_deg") if f in dome}
+    shared = {f: dome[f] for f in ("profile", "size", "roll_deg") if f in dome}
+    if "lamp_radius" in dome:  # the dome's own `radius` is how far out the lamps stand
+        shared["radius"] = dome["lamp_radius"]
     if "profile" in shared or "size" in shared:
         aims = [{"aim": -p} for p in positions]
     else:

@@ -191,3 +191,17 @@ def test_a_rig_without_cameras_is_refused(tmp_path):
         Rig.load(path)
     with pytest.raises(RigError, match="no such rig file"):
         Rig.load(tmp_path / "none.toml")
+
+
+def test_the_domes_radius_is_not_that_of_its_lamps(tmp_path):
+    for name in ("demo", "stage331"):
+        rig = Rig.load(Path(__file__).resolve().parents[2] / "deploy" / "rigs" / f"{name}.toml")
+        assert {light.radius for light in rig.lights} == {0.0}
+    (tmp_path / "rig.toml").write_text(
+        "[dome]\nlights = 5\nradius = 1.2\nlamp_radius = 0.02\nintensity = [1.0, 1.0, 1.0]\n"
+        '[[cameras]]\nname = "c"\nposition = [0, -1, 0]\ntarget = [0, 0, 0]\nfov_deg = 20\n'
+        "width = 8\nheight = 8\n"
+    )
+    lights = Rig.load(tmp_path / "rig.toml").lights
+    assert {light.radius for light in lights} == {0.02}
+    np.testing.assert_allclose([np.linalg.norm(x.position) for x in lights], 1.2)
