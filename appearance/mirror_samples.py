@@ -111,14 +111,14 @@ def mirror_lights(
 def binned(samples: MirrorSamples, *, seed: int = 0) -> LobeBins:
     """Average the samples in 32 bins of |deviation| up to π/6 (Sun §5.1).
 
-    Raises `ValueError` where under 200 samples in 8 bins are left: the lights are too few, or the
+    Raises `ValueError` where under 100 samples in 8 bins are left: the lights are too few, or the
     hair's directions unknown.
     """
     inside = np.abs(samples.deviation) < WINDOW
     bin_of = np.where(inside, (np.abs(samples.deviation) / WINDOW * BINS).astype(int), BINS)
     counts = np.bincount(bin_of, minlength=BINS + 1)[:BINS]
     keep = np.flatnonzero(counts >= 5)
-    if counts.sum() < 200 or len(keep) < 8:
+    if counts.sum() < 100 or len(keep) < 8:
         raise ValueError(
             f"only {counts.sum()} samples in {len(keep)} of {BINS} bins lie near the mirror "
             "direction: the roughness needs more lights, or more hair pixels of one direction"
