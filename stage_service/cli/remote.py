@@ -84,10 +84,19 @@ def add(commands: Commands) -> None:
 def run_check(args: argparse.Namespace, output: Output, service: Service) -> int:
     """Cost a plan; with a rig file, without a service or a device."""
     if args.rig is not None:
+        from pydantic import ValidationError
+
         from stage_service.config import load_rig_file
         from stage_service.plan import CapturePlan
 
-        plan = CapturePlan.model_validate(_read_json(args.plan))
+        try:
+            plan = CapturePlan.model_validate(_read_json(args.plan))
+        except ValidationError as error:
+            problems = "; ".join(
+                f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}"
+                for e in error.errors()
+            )
+            raise CommandError(f"{args.plan}: {problems}", BAD_INPUT) from error
         cost = plan.cost(load_rig_file(args.rig)).model_dump(mode="json")
     else:
         cost = service.post("/plans:validate", _read_json(args.plan))

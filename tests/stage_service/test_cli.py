@@ -258,3 +258,9 @@ def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
     plan.write_text('{"lights": ["lamp"]}')
     code, data = run(capsys, *words, "--plan", plan)
     assert (code, "'lamp'" in data["error"]["detail"]) == (3, True)
+    plan.write_text('{"speed": 1}')
+    code, data = run(capsys, *words, "--plan", plan)
+    assert (code, data["error"]["detail"]) == (
+        3,
+        f"{plan}: speed: Extra inputs are not permitted, got 1",
+    )
