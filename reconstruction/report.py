@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from reconstruction.peak_memory import peak_memory
+
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share that is done, 0 to 1."""
 
@@ -38,7 +40,10 @@ class LeftOut:
 
 @dataclass
 class Stage:
-    """One stage of a pipeline: `figures` holds its numbers by name, JSON-ready."""
+    """One stage of a pipeline: `figures` holds its numbers by name, JSON-ready.
+
+    `peak_gb` is the most memory that the process held meanwhile, None where it is not known.
+    """
 
     name: str
     seconds: float = 0.0
@@ -46,6 +51,7 @@ class Stage:
     series: list[Series] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    peak_gb: float | None = None
 
     def leave_out(self, what: str, why: str, saved: str) -> None:
         """Record work that was not done because the scene does not need it."""
@@ -68,10 +74,12 @@ class Report:
         stage = Stage(name)
         self.stages = [s for s in self.stages if s.name != name] + [stage]
         start = time.perf_counter()
-        try:
-            yield stage
-        finally:
-            stage.seconds = time.perf_counter() - start
+        with peak_memory() as peak:
+            try:
+                yield stage
+            finally:
+                stage.seconds = time.perf_counter() - start
+        stage.peak_gb = peak.gb
 
     def __getitem__(self, name: str) -> Stage:
         for stage in self.stages:

@@ -91,7 +91,8 @@ def _run(
         key = cache_key(subject.digest(), rig.to_dict(), asdict(quality), args.seed)
         frames = FrameMaker(rig, responder, sensor, args.seed, args.cache, key)
         log = args.truth / EXPOSURES if args.truth is not None else None
-        world = World(rig, Lamps(len(rig.lights)), faults, frames.counts, log, args.processes)
+        lamps, moves = Lamps(len(rig.lights)), args.drift_mm > 0
+        world = World(rig, lamps, faults, frames.counts, log, args.processes, moves)
         free = args.ports == "auto"
         wires, paced = rig_file.devices, args.paced
         stage = SimulatedStage(world, sensor, faults, args.state, wires, free, paced)

@@ -104,9 +104,9 @@ class FrameMaker:
         power = np.float32(shot.show.power)
         for name, response in sweep.items():
             if shot.show.projector is None:
-                flat[response.pixels] += power * response.images.sum(axis=0)
+                flat[response.pixels] += power * response.total()
             elif shot.show.projector == name:
-                flat[response.pixels] += power * response.images[shot.show.row]
+                flat[response.pixels] += power * response.image(shot.show.row)
 
     def _all_lamps(self, camera: str) -> Response:
         if camera not in self._lamps:

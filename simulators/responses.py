@@ -43,11 +43,27 @@ class Quality:
 class Response:
     """Radiance at full level of the pixels that see the subject; every other pixel is dark.
 
-    `pixels (P,)` are flat indices, `images (N, P, 3)` float32, one for each light or row.
+    `pixels (P,)` are flat indices, `images (N, P, 3)` in units of `scale`, one for each light or
+    row: float32, or float16 for sweeps, whose rounding (0.05 %) is far below a camera's noise.
     """
 
     pixels: NDArray[np.int64]
-    images: Image
+    images: Image | NDArray[np.float16]
+    scale: float = 1.0
+
+    @classmethod
+    def halved(cls, pixels: NDArray[np.int64], images: Image) -> Response:
+        """In half the memory; the brightest value becomes 1024, far from overflow in sums of it."""
+        scale = float(images.max(initial=0.0)) / 1024 or 1.0
+        return cls(pixels, (images * np.float32(1 / scale)).astype(np.float16), scale)
+
+    def image(self, index: int) -> Image:
+        """Radiance `(P, 3)` of one light or row."""
+        return self.images[index] * np.float32(self.scale)
+
+    def total(self) -> Image:
+        """Radiance `(P, 3)` of all of them together."""
+        return self.images.sum(axis=0, dtype=np.float32) * np.float32(self.scale)
 
 
 class Responder(Protocol):
@@ -150,7 +166,7 @@ class MitsubaResponder:
             seed=self._seeds(camera, pose, 3),
             pixels=pixels,
         )
-        return {name: Response(pixels, images) for name, images in rows.items()}
+        return {name: Response.halved(pixels, images) for name, images in rows.items()}
 
     def _built(self) -> Any:
         if self._scene is None:

@@ -51,6 +51,8 @@ class World:
     exposure stays at its pose. The subject takes their place again, pose 0, when a new capture
     begins: when the first pulse after a reset sees no light, or a lamp alone is lit.
 
+    A subject that does not `move` keeps pose 0 throughout.
+
     `make` renders and exposes on one thread for each of `lanes`; camera number i belongs to lane
     i modulo `lanes`, and a camera's frames are made one after the other. `log`, when given, gets
     one JSON line a pulse with its pose.
@@ -64,6 +66,7 @@ class World:
         make: MakeCounts,
         log: Path | None = None,
         lanes: int = 1,
+        moves: bool = True,
     ) -> None:
         self.rig = rig
         self.lamps = lamps
@@ -72,6 +75,7 @@ class World:
         self._faults = faults
         self._make = make
         self._log = log
+        self._moves = moves
         self._lock = threading.RLock()
         self._pulses = 0
         self._fired = 0
@@ -109,7 +113,7 @@ class World:
             if self._faults.once("lights", "stuck", self._pulses):
                 self.lamps.stick()
             power, show = self.lamps.power(), self.projectors.show
-            if fires:
+            if fires and self._moves:
                 self._move_subject(power, show)
             shot = Snapshot(self._pulses, power, show, self._pose)
             for _ in range(fires):

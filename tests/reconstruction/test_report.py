@@ -105,3 +105,19 @@ def test_geometry_bars(tmp_path: Path) -> None:
     assert tall.shape[0] > 1.4 * flat.shape[0]
     with pytest.raises(ValueError, match="no results"):
         plot_geometry({}, tmp_path / "c.png")
+
+
+def test_a_stage_knows_its_peak_memory_and_gives_it_to_the_stage_around_it() -> None:
+    report = Report()
+    with report.stage("outer"):
+        with report.stage("inner"):
+            block = np.ones(40_000_000)  # 320 MB
+            assert block.sum() == len(block)
+            del block
+        with report.stage("small"):
+            pass
+    inner, outer, small = (report[n].peak_gb for n in ("inner", "outer", "small"))
+    if inner is None or outer is None or small is None:
+        pytest.skip("this system does not tell a process its peak memory")
+    assert inner > small + 0.2
+    assert outer >= inner
