@@ -46,6 +46,7 @@ class Peaks:
     pixel (N, 2) int (x, y); row (N,) fractional row; deviation (N,) of the row from noise and from
     depths mixed in the pixel, rows; brightness (N,) of the maximum; step (N,) `Step.index` of the
     frame with the maximum; saturated (N,) whether a frame at the maximum was at full scale.
+    Of all frames' `bright` pixels, `side_responses` are at no temporal maximum.
     """
 
     camera: str
@@ -57,6 +58,8 @@ class Peaks:
     step: NDArray[np.int64]
     saturated: NDArray[np.bool_]
     candidates: int = 0
+    bright: int = 0
+    side_responses: int = 0
     missing_rows: tuple[int, ...] = field(default=())
 
 
@@ -74,18 +77,17 @@ def find_peaks(
     scan = _Scan(capture, camera, sweep, device.height, options.per_pixel)
     for row in range(-REACH, device.height + REACH):
         scan.push(row)
-    found = scan.value > 0
-    layer, y, x = np.nonzero(found)
-    window = scan.window[layer, y, x].astype(np.float64)
-    value, at = scan.value[found].astype(np.float64), scan.at[found]
     noise = scan.noise()
+    floor = max(options.noise_factor * noise, options.faintest * _bright(scan.value[0]))
+    strong = scan.value > floor
+    layer, y, x = np.nonzero(strong)
+    window = scan.window[layer, y, x].astype(np.float64)
+    value, at = scan.value[strong].astype(np.float64), scan.at[strong]
     offset, deviation, correlation, amplitude = fit_stripes(window, device, noise)
     share = amplitude / np.maximum(np.maximum(scan.total[y, x], value), amplitude)
-    saturated = scan.clipped[found]
+    saturated = scan.clipped[strong]
     deviation[saturated] = np.maximum(deviation[saturated], 0.3)
-    strong = value > max(options.noise_factor * noise, options.faintest * _bright(scan.value[0]))
-    direct = (share >= options.direct_share) & (correlation >= options.correlation)
-    keep = strong & (direct | saturated)
+    keep = ((share >= options.direct_share) & (correlation >= options.correlation)) | saturated
     steps = np.array([sweep[r].index if r in sweep else -1 for r in range(device.height)])
     return Peaks(
         camera,
@@ -96,7 +98,9 @@ def find_peaks(
         value[keep],
         steps[at[keep]] if keep.any() else np.zeros(0, np.int64),
         saturated[keep],
-        candidates=int(strong.sum()),
+        candidates=len(value),
+        bright=scan.bright.above(floor),
+        side_responses=scan.bright.above(floor) - scan.maxima.above(floor),
         missing_rows=tuple(scan.missing),
     )
 
@@ -159,6 +163,21 @@ def _bright(value: NDArray[np.float32]) -> float:
     return float(np.percentile(some, 95)) if some.size else 0.0
 
 
+class _Tally:
+    """How many of many values lie above a floor that is known only afterwards, to a hundredth."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(1 << 15, np.int64)
+
+    def add(self, values: NDArray[np.float32]) -> None:
+        # the upper half of a positive float32: its exponent and seven bits more
+        positive = values[values > 0].view(np.uint32) >> 16
+        self._counts += np.bincount(positive, minlength=len(self._counts))
+
+    def above(self, floor: float) -> int:
+        return int(self._counts[(np.array(floor, np.float32).view(np.uint32) >> 16) + 1 :].sum())
+
+
 class _Scan:
     """The running state of one sweep: a ring of frames and each pixel's strongest maxima."""
 
@@ -176,6 +195,7 @@ class _Scan:
         self.window = np.zeros((layers, *shape, WINDOW), np.float32)
         self.clipped = np.zeros((layers, *shape), bool)
         self.total = np.zeros(shape, np.float32)
+        self.bright, self.maxima = _Tally(), _Tally()
         self.missing: list[int] = []
         self._noises: list[float] = []
         self._dark: dict[float, NDArray[np.float32]] = {}
@@ -196,6 +216,7 @@ class _Scan:
             else:
                 image, clipped = self._read(step)
                 self.total += image
+                self.bright.add(image)
         self.ring.append(image.ravel())
         self.clip.append(clipped.ravel())
         self.held.append(held)
@@ -216,7 +237,9 @@ class _Scan:
     def _insert(self, middle: int) -> None:
         """Keep the middle frame's maxima where they beat the weakest that a pixel has."""
         before, now, after = (self.ring[REACH + k] for k in (-1, 0, 1))
-        pixel = np.flatnonzero((now > before) & (now >= after) & (now > self.value[-1].ravel()))
+        highest = (now > before) & (now >= after)
+        self.maxima.add(now[highest])
+        pixel = np.flatnonzero(highest & (now > self.value[-1].ravel()))
         for layer in range(len(self.value)):
             better = now[pixel] > self.value[layer].ravel()[pixel]
             which, pixel = pixel[better], pixel[~better]

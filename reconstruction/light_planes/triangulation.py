@@ -93,6 +93,8 @@ def triangulate(
     clouds += [intersect(capture, p, motion, options) for p in peaks if len(p.row)]
     cloud = PointCloud.merged(clouds)
     counts = {
+        "bright_pixels": sum(p.bright for p in peaks),
+        "side_responses": sum(p.side_responses for p in peaks),
         "bright_maxima": sum(p.candidates for p in peaks),
         "stripes": sum(len(p.row) for p in peaks),
         "well_conditioned": len(cloud),
