@@ -48,10 +48,10 @@ class ScalpMap:
         """
         scalp = _scalp(head)
         faces = head.faces[scalp]
-        used = np.unique(faces)
-        d = head.vertices[used] - _sphere_center(head.vertices[used])
+        used, areas = np.unique(faces), head.face_areas()[scalp]
+        d = head.vertices[used] - sphere_center(head.vertices[used])
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        weight = np.bincount(faces.ravel(), np.repeat(head.face_areas()[scalp], 3))[used]
+        weight = np.bincount(faces.ravel(), np.repeat(areas, 3))[used]
         pole = weight @ d
         pole /= np.linalg.norm(pole)
         right = np.array([1.0, 0, 0]) - pole[0] * pole
@@ -61,7 +61,7 @@ class ScalpMap:
         flat *= np.sqrt(2 / np.maximum(1 + d @ pole, 1e-9))[:, None]
         uv = np.full((len(head.vertices), 2), np.nan)
         uv[used] = (flat - flat.min(axis=0)) / np.ptp(flat, axis=0)
-        folded = int((_signed_areas(uv[faces]) <= 0).sum())
+        folded = int(((_signed_areas(uv[faces]) <= 0) & (areas > 1e-9 * areas.max())).sum())
         if folded:
             raise ValueError(
                 f"the map of the scalp folds at {folded} of its {len(faces)} faces: they face the "
@@ -95,7 +95,7 @@ def _scalp(head: Mesh) -> NDArray[np.bool_]:
     return head.scalp
 
 
-def _sphere_center(points: Array) -> Array:
+def sphere_center(points: Array) -> Array:
     """Centre `(3,)` of the sphere that fits `points (N, 3)` best, by algebraic least squares."""
     middle = points.mean(axis=0)
     q = points - middle

@@ -1,0 +1,62 @@
+"""Lamp intensities by variable projection: they are linear, so nothing has to descend to them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.stage1.batches import Batch
+from appearance.stage1.losses import weights
+
+Array = NDArray[np.float64]
+PRIOR = 0.03
+"""Standard deviation of a lamp's calibrated intensity, relative."""
+_WINDOW = 20.0
+
+
+class Gains:
+    """Factors `(L,)` on the lamps' intensities, solved from what batches show.
+
+    A lamp's factor is Σ w I² / Σ w I R, R rendered with factor 1 and I captured: least squares with
+    the captured image as instrument, so that noise in R, which Σ w R² would count as light, does
+    not bias it. Batches are averaged over the latest 20 of a lamp; with the scatter between them as
+    error, the prior of 3 % about the calibration draws lamps that say little back to 1. The mean
+    factor stays 1: how bright all lamps are together, hair colour cannot be told from.
+    """
+
+    def __init__(self, sums: Array) -> None:
+        self.sums = sums
+
+    @staticmethod
+    def sums_of(gain: Array) -> Array:
+        """`sums (3, L)` (weight, log gain, its square) that say `gain (L,)`, not loudly."""
+        log = np.log(gain)
+        return np.stack([np.full_like(log, 1.0), log, log * log])
+
+    @property
+    def value(self) -> Array:
+        """The factors as they stand."""
+        n, total, squares = self.sums
+        known = n > 1
+        mean = np.divide(total, n, out=np.zeros_like(n), where=n > 0)
+        var = np.divide(squares, n, out=np.zeros_like(n), where=n > 0) - mean**2
+        pooled = float(np.mean(var[known])) if known.any() else PRIOR**2
+        error = (np.maximum(var, 0.25 * pooled) + 1e-8) / np.maximum(n, 1)
+        log = np.where(known, mean * PRIOR**2 / (PRIOR**2 + error), 0.0)
+        if known.any():
+            log[known] -= log[known].mean()
+        return np.asarray(np.exp(log))
+
+    def learn(
+        self, batch: Batch, rendered: Array, captured: Array, valid: NDArray[np.bool_]
+    ) -> None:
+        """`rendered (k, P, 3)` with the factors of `value`, beside `captured`."""
+        gain = self.value[batch.lights]
+        w = weights(captured) * valid[..., None]
+        top = (w * captured * captured).sum(axis=(1, 2))
+        below = (w * captured * rendered).sum(axis=(1, 2))
+        fine = (top > 0) & (below > 0)
+        log = np.log(top[fine] / below[fine] * gain[fine])
+        lamps = batch.lights[fine]
+        self.sums[:, lamps] *= 1 - 1 / _WINDOW
+        self.sums[:, lamps] += np.stack([np.ones_like(log), log, log * log])

@@ -1,0 +1,282 @@
+"""The fit: batches, gradients and steps until the watched error no longer falls."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.hair_maps import HairMaps
+from appearance.stage1.batches import Pairs
+from appearance.stage1.checkpoint import State
+from appearance.stage1.gains import Gains
+from appearance.stage1.problem import Effort, Problem
+from appearance.stage1.unknowns import Lamps, Raw, maps_of, raw_of
+from reconstruction.report import Progress, silent
+
+Array = NDArray[np.float64]
+Shape = tuple[int, int, int]
+
+COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
+ROWS: dict[str, tuple[tuple[str, ...], bool, bool]] = {
+    "original": (COLOUR, False, False),
+    "spatial": (COLOUR, True, False),
+    "correctives": ((*COLOUR, "rotation"), True, False),
+    "lights": ((*COLOUR, "rotation", "position", "turn", "profile"), True, True),
+}
+"""The ablations: what is free, whether it varies over the volume, and whether gains are solved."""
+PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation": 0.2}
+"""Standard deviations about the calibration, and of correctives in radians."""
+PRIOR_WEIGHT = 1e-3
+"""Of half the mean squared prior deviation, beside the image loss."""
+
+
+@dataclass(frozen=True)
+class Stage1Options:
+    """How a fit is run; the defaults are ours, the plain version has `plain()`.
+
+    `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
+    reached over `levels` doublings. `steps` at most, of `images` pairs each. `common_numbers`
+    repeats the same random numbers for a view in every step. `rendered` says what a step renders:
+    "hair" (a random part of the hair pixels, all lights of a view from shared paths) or "frames"
+    (whole frames, one at a time).
+    """
+
+    row: str = "lights"
+    tilt: bool = False
+    shape: Shape = (4, 8, 8)
+    levels: int = 3
+    steps: int = 150
+    images: int = 8
+    effort: Effort = field(default_factory=Effort)
+    loss: str = "squares"
+    lambda_sigma: float = 0.5
+    lambda_r: float = 10.0
+    residual_weighted: bool = True
+    common_numbers: bool = False
+    check_every: int = 10
+    halvings: int = 2
+    watched_views: int = 3
+
+    def __post_init__(self) -> None:
+        if self.row not in ROWS:
+            raise ValueError(f"row must be one of {list(ROWS)}, got {self.row!r}")
+        if self.loss not in ("squares", "l1"):
+            raise ValueError(f"loss must be 'squares' or 'l1', got {self.loss!r}")
+        counts = (*self.shape, self.levels, self.steps, self.images, self.check_every)
+        if min(counts) < 1:
+            raise ValueError(
+                "shape, levels, steps, images and check_every must be positive, got "
+                f"{self.shape}, {self.levels}, {self.steps}, {self.images}, {self.check_every}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a fit found, and how it came to an end.
+
+    `ended` is "converged", "all steps taken", or why it ended early; `start_error` and `error` are
+    watched errors of the start and of the result, under fresh random numbers and alike for both.
+    `history` holds (seconds, step, watched error).
+    """
+
+    maps: HairMaps
+    lamps: Lamps
+    ended: str
+    start_error: float
+    error: float
+    steps: int
+    history: list[tuple[float, int, float]] = field(default_factory=list)
+
+
+def run(
+    problem: Problem,
+    maps: HairMaps,
+    lamps: Lamps | None = None,
+    *,
+    options: Stage1Options | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> Outcome:
+    """Fit from `maps` and `lamps` (the calibration where None); never returns a worse guess.
+
+    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of another
+    fit is an error. The file stays: whoever starts the fit removes it.
+    """
+    options = options or Stage1Options()
+    return _Fit(problem, maps, lamps, options, checkpoint, progress, seed).run()
+
+
+class _Fit:
+    def __init__(
+        self,
+        problem: Problem,
+        maps: HairMaps,
+        lamps: Lamps | None,
+        options: Stage1Options,
+        checkpoint: Path | None,
+        progress: Progress,
+        seed: int,
+    ) -> None:
+        self.problem, self.options, self.seed = problem, options, seed
+        self.checkpoint, self.progress = checkpoint, progress
+        self.start = maps
+        self.lamps = Lamps.calibrated(len(problem.lights)) if lamps is None else lamps
+        free, self.spatial, self.solves_gains = ROWS[options.row]
+        self.free = [*free, *(["tilt_deg"] if options.tilt else [])]
+        self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
+        self.watched = problem.watched(self.pairs, options.watched_views, options.images)
+        self.series: list[tuple[float, int, float]] = []
+
+    def run(self) -> Outcome:
+        begun = time.perf_counter()
+        if not self.pairs.used.any():
+            return self._unchanged("no pair of camera and light shows lit hair")
+        state = self._begun()
+        gains = Gains(state.tables["gains"])
+        self.pairs.taught = state.tables["taught"]
+        ended = "all steps taken"
+        self.series = [(s, int(k), e) for s, k, e in state.history]
+        spent = self.series[-1][0] if self.series else 0.0
+        while state.step < self.options.steps:
+            if state.step % self.options.check_every == 0:
+                state.history = [list(p) for p in self.series]
+                state.save(self.checkpoint, self._fingerprint())
+                error = self._watch(state.average, gains.value, self.seed)
+                self.series.append((spent + time.perf_counter() - begun, state.step, error))
+                share = state.step / self.options.steps
+                self.progress(f"step {state.step}: error {max(error, 0.0) ** 0.5:.4f}", share)
+                if state.convergence.tell(error) and self._level(state.step) == self._last_level:
+                    ended = "converged"
+                    break
+            reason = self._step(state, gains)
+            if reason:
+                ended = reason
+                break
+        return self._judged(state, gains, ended, spent + time.perf_counter() - begun)
+
+    def _begun(self) -> State:
+        if self.checkpoint is not None and self.checkpoint.is_file():
+            return State.load(self.checkpoint, self._fingerprint())
+        raw = self._raw(self.start.resized(self._shape(0)))
+        state = State(raw, {k: v.copy() for k, v in raw.items()})
+        state.tables = {"taught": self.pairs.taught, "gains": Gains.sums_of(self.lamps.gain)}
+        state.convergence.halvings = self.options.halvings
+        return state
+
+    def _fingerprint(self) -> str:
+        """Of everything that the course of a fit depends on."""
+        total = hashlib.sha256(repr((self.options, self.seed, self.problem.scale)).encode())
+        arrays: list[NDArray[Any]] = [
+            *self._raw(self.start).values(),
+            self.lamps.gain,
+            *(o.radiance for o in self.problem.views),
+        ]
+        for array in arrays:
+            total.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return total.hexdigest()
+
+    def _raw(self, maps: HairMaps) -> Raw:
+        return raw_of(maps, self.lamps, self.problem.profile_of)
+
+    def _step(self, state: State, gains: Gains) -> str | None:
+        """One step; why the fit must end, if it must."""
+        options = self.options
+        rng = np.random.default_rng([self.seed, state.step])
+        self._refine(state)
+        batch = self.pairs.draw(options.images, rng)
+        numbers = batch.view if options.common_numbers else state.step
+        first = (self.seed << 16) + 2 * numbers
+        slope = self.problem.slope(
+            state.raw,
+            gains.value,
+            self.free,
+            batch,
+            options.effort,
+            (first, first + 1),
+            rng,
+            loss=options.loss,
+            lambdas=(options.lambda_sigma, options.lambda_r),
+        )
+        if not all(np.isfinite(g).all() for g in slope.gradient.values()):
+            return f"step {state.step}: the gradient is not finite"
+        self._pull_to_priors(state.raw, slope.gradient)
+        self.pairs.learn(batch, slope.rendered, slope.captured, slope.valid)
+        if self.solves_gains:
+            gains.learn(batch, slope.rendered, slope.captured, slope.valid)
+        state.descent.step(state.raw, slope.gradient, state.convergence.pace)
+        state.step += 1
+        share = max(0.1, 1 / (state.step - state.level_began))
+        for name, value in state.raw.items():
+            state.average[name] = state.average[name] + share * (value - state.average[name])
+        return None
+
+    def _pull_to_priors(self, raw: Raw, gradient: Raw) -> None:
+        for name, spread in PRIORS.items():
+            if name in gradient:
+                gradient[name] = gradient[name] + (
+                    PRIOR_WEIGHT * raw[name] / (raw[name].size * spread**2)
+                )
+
+    @property
+    def _last_level(self) -> int:
+        return self.options.levels - 1 if self.spatial else 0
+
+    def _level(self, step: int) -> int:
+        """Coarse levels take a sixth of the steps each."""
+        return min(step * 6 // self.options.steps, self._last_level)
+
+    def _shape(self, level: int) -> Shape:
+        if not self.spatial:
+            return 1, 1, 1
+        layers, columns, rows = self.options.shape
+        shrink = 2 ** (self._last_level - level)
+        return layers, max(1, columns // shrink), max(1, rows // shrink)
+
+    def _refine(self, state: State) -> None:
+        """Go over to a finer volume when its time has come."""
+        shape = self._shape(self._level(state.step))
+        if state.raw["sigma_a"].shape[:3] == shape:
+            return
+        for raw in (state.raw, state.average):
+            fine = self._raw(maps_of(raw).resized(shape))
+            raw |= {k: fine[k] for k in ("sigma_a", "rotation")}
+        for moments in (state.descent.first, state.descent.second):
+            for name in ("sigma_a", "rotation"):
+                moments.pop(name, None)
+        state.level_began = state.step
+        state.average = {k: v.copy() for k, v in state.raw.items()}
+
+    def _watch(self, raw: Raw, gain: Array, seed: int) -> float:
+        return self.problem.error(raw, gain, self.watched, self.options.effort, seed << 16)
+
+    def _judged(self, state: State, gains: Gains, ended: str, seconds: float) -> Outcome:
+        """The result, or the start where fresh random numbers say that it is better."""
+        effort = replace(self.options.effort, spp=4 * self.options.effort.spp)
+        before = self._raw(self.start)
+        seed = (self.seed << 16) + (1 << 24)
+        old, new = (
+            self.problem.error(raw, gain, self.watched, effort, seed)
+            for raw, gain in ((before, self.lamps.gain), (state.average, gains.value))
+        )
+        self.series.append((seconds, state.step, new))
+        if not new <= old:
+            reason = f"{ended}; kept the start, which is better ({old:.3g} against {new:.3g})"
+            return Outcome(self.start, self.lamps, reason, old, old, state.step, self.series)
+        raw = state.average
+        found = Lamps(
+            raw["position"],
+            raw["turn"],
+            gains.value if self.solves_gains else self.lamps.gain,
+            np.exp(raw["profile"])[self.problem.profile_of],
+        )
+        return Outcome(maps_of(raw), found, ended, old, new, state.step, self.series)
+
+    def _unchanged(self, reason: str) -> Outcome:
+        return Outcome(self.start, self.lamps, reason, 0.0, 0.0, 0)

@@ -1,0 +1,206 @@
+"""A fit's data and its two questions: how far off is a guess, and which way is down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.hair_maps import MappedStrands
+from appearance.observations import Observed
+from appearance.render.differentiable import DifferentiableOlat
+from appearance.render.olat import render_olat
+from appearance.stage1 import losses
+from appearance.stage1.batches import Batch, Pairs
+from appearance.stage1.unknowns import Raw, hair_values, maps_of
+from reconstruction.lights import Light
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What one step may cost: `pixels` of a view, paths a pixel of at most `max_depth` vertices.
+
+    The picture gets more paths (`spp`) than its gradient (`gradient_spp`): they cost a fifth, and
+    the picture's noise multiplies the gradient's.
+    """
+
+    pixels: int = 600
+    spp: int = 16
+    gradient_spp: int = 4
+    max_depth: int = 8
+    rr_depth: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Slope:
+    """A batch's gradient by each of the free numbers, and what was rendered `(k, P, 3)`."""
+
+    gradient: Raw
+    rendered: Array
+    captured: Array
+    valid: NDArray[np.bool_]
+
+
+class Problem:
+    """Hair pixels of `views` under `lights`, the geometry, and the exposure `scale`.
+
+    All views have the same lights. Rendered and captured values are in exposure units here.
+    """
+
+    def __init__(
+        self, mapped: MappedStrands, views: Sequence[Observed], scale: float, skin: Array
+    ) -> None:
+        self.mapped, self.views, self.scale, self.skin = mapped, tuple(views), scale, skin
+        self.lights: tuple[Light, ...] = views[0].lights if views else ()
+        profiles = list({id(x.profile): 0 for x in self.lights})
+        self.profile_of = np.array([profiles.index(id(x.profile)) for x in self.lights], np.int64)
+
+    def slope(
+        self,
+        raw: Raw,
+        gain: Array,
+        free: Sequence[str],
+        batch: Batch,
+        effort: Effort,
+        seeds: tuple[int, int],
+        rng: np.random.Generator,
+        *,
+        loss: str = "squares",
+        lambdas: tuple[float, float] = (0.0, 0.0),
+    ) -> Slope:
+        """The derivative of the loss of a batch; `seeds` are the picture's and the gradient's."""
+        import drjit as dr
+        import mitsuba as mi
+
+        o = self.views[batch.view]
+        few = np.sort(rng.permutation(len(o.pixels))[: effort.pixels])
+        captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
+        valid = o.valid[batch.lights][:, few]
+        leaves = {k: mi.TensorXf(v.astype(np.float32)) for k, v in raw.items()}
+        for name in free:
+            dr.enable_grad(leaves[name])
+        rendered = self.render(raw, gain, batch, few, effort, seeds[0])
+        weight = losses.slope(rendered, captured, valid, loss)
+        # a pair's loss is its mean over pixels; slope() took the mean over pairs too
+        weight *= batch.share[:, None, None] * len(batch.lights) * self.scale
+        op = self._op(raw, gain, batch, few, effort)
+        values = hair_values(leaves) | self._lamp_values(op, leaves, free, batch.lights)
+        known = op.parameters() | {k: dr.detach(v) for k, v in values.items()}
+        wanted = [k for k, v in values.items() if dr.grad_enabled(v)]
+        found = op.gradients(known, wanted, mi.TensorXf(weight.astype(np.float32)), seeds[1])
+        total = losses.smoothness(values, *lambdas)
+        for name in wanted:
+            total = total + dr.sum(found[name] * values[name], axis=None)
+        dr.backward(total)
+        gradient = {k: np.array(dr.grad(leaves[k]), float) for k in free}
+        return Slope(gradient, rendered, captured, valid)
+
+    def error(
+        self,
+        raw: Raw,
+        gain: Array,
+        pairs: Sequence[Batch],
+        effort: Effort,
+        seed: int,
+    ) -> float:
+        """Weighted mean squared difference over `pairs`, noise taken off, with fixed numbers."""
+        total, count = 0.0, 0
+        for batch in pairs:
+            o = self.views[batch.view]
+            few = np.sort(np.random.default_rng(seed).permutation(len(o.pixels))[: effort.pixels])
+            one, other = (
+                self.render(raw, gain, batch, few, effort, seed + k) for k in (0, 1 << 20)
+            )
+            captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
+            total += losses.squares(one, other, captured, o.valid[batch.lights][:, few])
+            count += 1
+        return total / max(count, 1)
+
+    def render(
+        self,
+        raw: Raw,
+        gain: Array,
+        batch: Batch,
+        few: NDArray[np.int64],
+        effort: Effort,
+        seed: int,
+    ) -> Array:
+        """A view's pixels number `few` under some lights, in exposure units `(k, P, 3)`."""
+        moved = self.lamps_at(raw, gain)
+        o = self.views[batch.view]
+        radiance = render_olat(
+            self.mapped.painted(maps_of(raw)).with_skin(self.skin),
+            o.camera,
+            [moved[i] for i in batch.lights],
+            spp=effort.spp,
+            max_depth=effort.max_depth,
+            thrift=0,
+            seed=seed,
+            pixels=o.pixels[few],
+        )
+        return radiance.astype(float) * self.scale
+
+    def lamps_at(self, raw: Raw, gain: Array) -> list[Light]:
+        """All lights as `raw` has them."""
+        from appearance.stage1.unknowns import Lamps
+
+        profile = np.exp(raw["profile"])[self.profile_of]
+        return Lamps(raw["position"], raw["turn"], gain, profile).of(self.lights)
+
+    def watched(self, pairs: Pairs, views: int, images: int) -> list[Batch]:
+        """Views and lights for `error`, spread evenly over what is used."""
+        usable = np.flatnonzero(pairs.used.any(axis=1))
+        out = []
+        for view in usable[:: max(1, len(usable) // views)][:views]:
+            lights = np.flatnonzero(pairs.used[view])
+            lights = lights[:: max(1, -(-len(lights) // images))]
+            out.append(Batch(int(view), lights, np.ones(len(lights))))
+        return out
+
+    def _op(
+        self, raw: Raw, gain: Array, batch: Batch, few: NDArray[np.int64], effort: Effort
+    ) -> DifferentiableOlat:
+        scene = self.mapped.painted(maps_of(raw)).with_skin(self.skin)
+        moved = self.lamps_at(raw, gain)
+        o = self.views[batch.view]
+        return DifferentiableOlat(
+            scene,
+            o.camera,
+            [moved[i] for i in batch.lights],
+            o.pixels[few],
+            spp=effort.gradient_spp,
+            max_depth=effort.max_depth,
+            rr_depth=effort.rr_depth,
+        )
+
+    def _lamp_values(
+        self,
+        op: DifferentiableOlat,
+        leaves: dict[str, Any],
+        free: Sequence[str],
+        lights: NDArray[np.int64],
+    ) -> dict[str, Any]:
+        """The lamps of a batch as functions of the leaves; the op's lamps are already moved."""
+        import drjit as dr
+        import mitsuba as mi
+
+        out: dict[str, Any] = {}
+        known = op.parameters()
+        rows = (lights[:, None] * 3 + np.arange(3)).ravel()
+        for name, parameter in (("position", "lamps.position"), ("turn", "lamps.turn")):
+            if name in free:
+                moved = dr.gather(mi.Float, leaves[name].array, mi.UInt32(rows.astype(np.uint32)))
+                moved = moved - dr.detach(moved)
+                out[parameter] = known[parameter] + mi.TensorXf(moved, (len(lights), 3))
+        if "profile" in free:
+            which = np.repeat(self.profile_of[lights], 3).astype(np.uint32)
+            factor = dr.gather(mi.Float, leaves["profile"].array, mi.UInt32(which))
+            factor = dr.exp(factor - dr.detach(factor))
+            intensity = known["lamps.intensity"]
+            out["lamps.intensity"] = intensity * mi.TensorXf(factor, (len(lights), 3))
+        return out

@@ -1,0 +1,69 @@
+"""The fit converges, resumes, repeats, and never returns less than it was given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.hair_appearance import HairAppearance
+from appearance.hair_maps import HairMaps
+from appearance.stage1.loop import Stage1Options, run
+
+START = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.35))
+
+
+@pytest.fixture
+def original(tufted):
+    return Stage1Options(row="original", steps=50, effort=tufted.quick)
+
+
+def far(maps: HairMaps, truth: HairAppearance) -> float:
+    """The largest |log| of a fitted number over its true one: absorption, beta_m."""
+    found = [*maps.sigma_a.reshape(-1, 3).mean(0), maps.beta_m]
+    return float(np.abs(np.log(np.array(found) / [*truth.sigma_a, truth.beta_m])).max())
+
+
+def test_one_colour_and_roughness_are_found_from_pictures(plain, tufted, original):
+    told = []
+    found = run(plain, START, options=original, progress=lambda what, share: told.append(what))
+    assert found.error < 0.5 * found.start_error
+    assert far(found.maps, tufted.truth) < 0.35 < far(START, tufted.truth)
+    assert "error" in told[0]
+    assert [step for _, step, _ in found.history][:3] == [0, 10, 20]
+
+
+def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_path):
+    options = replace(original, steps=20)
+    whole = run(plain, START, options=options, seed=1)
+    file = tmp_path / "fit.npz"
+
+    def killed(what, share):
+        if share > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(plain, START, options=options, seed=1, checkpoint=file, progress=killed)
+    resumed = run(plain, START, options=options, seed=1, checkpoint=file)
+    assert resumed.steps == whole.steps
+    np.testing.assert_allclose(resumed.maps.sigma_a, whole.maps.sigma_a, rtol=1e-3)
+    assert resumed.maps.beta_m == pytest.approx(whole.maps.beta_m, rel=1e-3)
+    with pytest.raises(ValueError, match="other data or options"):
+        run(plain, START, options=options, seed=2, checkpoint=file)
+
+
+def test_a_fit_from_the_truth_does_not_leave_it_for_noise(plain, tufted, original):
+    few = replace(tufted.quick, pixels=20, spp=1, gradient_spp=1)
+    found = run(plain, HairMaps.of(tufted.truth), options=replace(original, steps=10, effort=few))
+    assert found.error <= found.start_error
+    assert far(found.maps, tufted.truth) < 0.7
+
+
+def test_options_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="row must be one of"):
+        Stage1Options(row="all")
+    with pytest.raises(ValueError, match="must be positive"):
+        Stage1Options(steps=0)
+    with pytest.raises(ValueError, match="'squares' or 'l1'"):
+        Stage1Options(loss="l2")
