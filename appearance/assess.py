@@ -20,6 +20,7 @@ from appearance.render.smoothed import olat_smoothed
 from appearance.roughness_and_colour import fit_diffuse
 from appearance.scene import HairScene, build_scene
 from reconstruction.capture import Capture
+from reconstruction.fitted_head import model_head
 from reconstruction.lights import Light
 from reconstruction.report import Progress, Report, Stage, silent
 from reconstruction.strand_files import read_strands
@@ -82,7 +83,8 @@ def assess(
     strands = read_strands(model / "strands.npz")
     report = Report.load(model / "report.json")
     with report.stage("images") as stage:
-        scene = build_scene(strands, capture.head, hair=fitted.hair, skin=fitted.skin)
+        head = model_head(model, capture)
+        scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
         progress("fitting the baselines", 0.0)
         training = _training(capture, model, held_out, options, seed)
         colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
@@ -107,7 +109,7 @@ def assess(
         comparison_picture(model / "comparison.png", _rows(groups, fitted), COLUMNS)
         relight_model(
             model,
-            capture.head,
+            head,
             environment=environment,
             size=options.relit_size,
             spp=options.relit_spp,

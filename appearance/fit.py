@@ -32,6 +32,7 @@ from appearance.roughness_and_colour import (
 from appearance.scene import HairScene, build_scene
 from appearance.visible_fibres import VisibleFibres, visible_fibres
 from reconstruction.capture import Capture
+from reconstruction.fitted_head import model_head
 from reconstruction.report import Progress, Report, Series, Stage, silent
 from reconstruction.strand_files import read_strands
 
@@ -79,14 +80,15 @@ def fit(
         exposure = Exposure.of([o.radiance[o.valid] for o in hair])
         hair, skin = _reached(capture, hair, skin, exposure, stage)
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
-    scene = build_scene(strands, capture.head, hair=start)
+    head = model_head(model, capture)
+    scene = build_scene(strands, head, hair=start)
     fitting = _Fitting(scene, hair, skin, options, seed, progress)
     with report.stage("roughness") as stage:
         plain, printed, corrected, first = fitting.roughness(stage)
     with report.stage("colour") as stage:
         colours = fitting.colour(corrected, np.array(first.colour), np.array(first.skin), stage)
-        if capture.head is None:
-            stage.leave_out("skin colour", "the capture has no head mesh", "its renderings")
+        if head is None:
+            stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not skin:
             stage.warn("no camera sees skin: its colour is a guess")
     fitted = FittedAppearance(
@@ -117,13 +119,14 @@ def _observed(
     rng = np.random.default_rng(seed)
     cameras, lights = held_out.training_cameras(capture), held_out.training_lights(capture)
     hair, skin, seen = [], [], 0
+    has_head = model_head(model, capture) is not None
     for i, name in enumerate(cameras):
         progress("reading hair pixels", 0.3 * i / len(cameras))
         mask = model_mask(model, name, "hair", capture)
         bare = model_mask(model, name, "skin", capture) & ~mask
         seen += int(mask.sum())
         wanted = chosen(mask, options.hair_pixels, rng)
-        beside = chosen(bare if capture.head else bare & False, options.skin_pixels, rng)
+        beside = chosen(bare if has_head else bare & False, options.skin_pixels, rng)
         both = observe(capture, name, lights, np.concatenate([wanted, beside]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
         if len(wanted):

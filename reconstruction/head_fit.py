@@ -36,9 +36,11 @@ class Distances:
 
     `to_mesh_*` from the points that count (no outliers) to the mesh, `to_points_*` from the matched
     part of the mesh to the nearest point, which is never less than the points' own spacing and
-    large where the points leave the head uncovered. `_median` and `_p95` are quantiles.
+    large where the points leave the head uncovered. `_median` and `_p95` are quantiles, `_rms` is
+    the root mean square.
     """
 
+    to_mesh_rms: float
     to_mesh_median: float
     to_mesh_p95: float
     to_points_median: float
@@ -84,6 +86,7 @@ def fit_head(
     *,
     part: Literal["head", "scalp"] = "head",
     landmarks: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    turn: float | None = None,
     any_unit: bool = False,
     shape: ShapeOptions = ShapeOptions(),  # noqa: B008  frozen
     seed: int = 0,
@@ -93,8 +96,8 @@ def fit_head(
     The points, with outward unit `normals (N, 3)` where known, lie on any part of the head, or of
     the scalp alone (`part`), and may have outliers, up to about two in five. `landmarks` are
     places `(L, 3)` on the template and the same places `(L, 3)` among the points, L at least 3;
-    without them all turns about z are tried. Points are in the template's unit, metres, unless
-    `any_unit`. Raises `HeadFitError`.
+    without them all turns about z are tried, or `turn` (radians) alone. Points are in the
+    template's unit, metres, unless `any_unit`. Raises `HeadFitError`.
     """
     template = generic_head() if template is None else template
     at: Array = np.asarray(points, np.float64).reshape(-1, 3)
@@ -121,6 +124,7 @@ def fit_head(
         at,
         facing,
         start=start,
+        turn=turn,
         scales=(0.7 * middle, middle, 1.4 * middle) if any_unit else (1.0,),
         scale_deviation=None if any_unit else 0.1,
         size=size,
@@ -213,8 +217,10 @@ def _distances(mesh: Mesh, faces: Bools, points: Array, size: float) -> tuple[Di
     outliers = tukey(distance, 0.03 * size) == 0
     places, _, face = surface_samples(mesh, 0.08 * size)
     back = cKDTree(points[~outliers]).query(places[faces[face]])[0]
-    quantiles = [np.percentile(d, q) for d in (distance[~outliers], back) for q in (50, 95)]
-    return Distances(*(float(q) for q in quantiles)), outliers
+    used = distance[~outliers]
+    quantiles = [np.percentile(d, q) for d in (used, back) for q in (50, 95)]
+    rms = float(np.sqrt(np.mean(used**2)))
+    return Distances(rms, *(float(q) for q in quantiles)), outliers
 
 
 def _warnings(pose: Pose, outliers: Bools) -> tuple[str, ...]:

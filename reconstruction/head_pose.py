@@ -99,6 +99,7 @@ def find_pose(
     normals: Array | None = None,
     *,
     start: tuple[float, Array, Array] | None = None,
+    turn: float | None = None,
     scales: tuple[float, ...] = (1.0,),
     scale_deviation: float | None = 0.1,
     size: float = 0.1,
@@ -106,10 +107,10 @@ def find_pose(
 ) -> Pose:
     """The pose in which `surface` lies on `points (N, 3)`, both with z about upwards.
 
-    Without a `start`, twelve turns about z at each of `scales` are tried on a few hundred points,
-    the tops of both at one height. `scale_deviation` is what is known of the scale beforehand, a
-    standard deviation of its logarithm about the middle of `scales`, or None. `size` is the head's
-    radius in the points' unit, which distances are judged by.
+    Without a `start`, twelve turns about z (or `turn` alone, radians) at each of `scales` are tried
+    on a few hundred points, the tops of both at one height. `scale_deviation` is what is known of
+    the scale beforehand, a standard deviation of its logarithm about the middle of `scales`, or
+    None. `size` is the head's radius in the points' unit, which distances are judged by.
     """
     middle = float(np.exp(np.mean(np.log(scales))))
     known = None if scale_deviation is None else (middle, scale_deviation)
@@ -122,9 +123,10 @@ def find_pose(
         return points[few], None if normals is None else normals[few]
 
     coarse, facing = some(_COARSE)
+    yaws = np.arange(_YAWS) * 2 * np.pi / _YAWS if turn is None else np.array([turn])
     tries = []
     for scale in scales:
-        for yaw in np.arange(_YAWS) * 2 * np.pi / _YAWS:
+        for yaw in yaws:
             rotation = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
             moved = scale * surface.points @ rotation.T
             shift = np.median(coarse, axis=0) - np.median(moved, axis=0)

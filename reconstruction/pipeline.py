@@ -16,9 +16,11 @@ from reconstruction.cameras import Camera
 from reconstruction.capture import Capture, CaptureError
 from reconstruction.envelope import carve, depth_map, inside_mesh, mesh_depth
 from reconstruction.field import FieldOptions, OrientationField, solve_field
+from reconstruction.fitted_head import FittedHead, digitised_points, lay_head, skin_points
 from reconstruction.growth import Coverage, fill_gaps, grow_from_roots
 from reconstruction.light_planes import (
     Motion,
+    MotionOptions,
     PointCloud,
     solve_motion,
     sweep_peaks,
@@ -29,6 +31,7 @@ from reconstruction.measure import Measured, MeasureOptions, measure_tangents
 from reconstruction.mesh import Mesh
 from reconstruction.report import Progress, Report, Stage, silent
 from reconstruction.rig import Rig
+from reconstruction.root_map import save_root_map
 from reconstruction.rooting import root_all
 from reconstruction.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.segmentation import Network
@@ -51,11 +54,13 @@ class ReconstructOptions:
     in metres; `roots` strands are grown from the scalp, then gaps are filled. `max_length` (metres)
     is the hair's, which the user knows. `margin` (metres) is how far in front of the seen surface
     the envelope reaches. `network` holds the fields of `segmentation.Network`, which tells hair
-    from skin where the user's masks do not. `scalp_normals` holds the field to the scalp's normals
-    as the paper does; hair that lies flat on the head is bent wrongly by that. `to_measured` ends
-    strands from the scalp at their last measured voxel. `radius` of the strands in metres; None
-    takes the one that keeps a head of hair's coverage. `explicit_seconds` of explicit diffusion are
-    run beside the solver for the report.
+    from skin where the user's masks do not. `scalp_points` is a file of digitised points of the
+    scalp to lay a head under, where the capture has no `head.obj` or a better one is wanted, and
+    `head_mesh` (OBJ) the head to lay there instead of the generic one. `scalp_normals` holds the
+    field to the scalp's normals as the paper does; hair that lies flat on the head is bent wrongly
+    by that. `to_measured` ends strands from the scalp at their last measured voxel. `radius` of the
+    strands in metres; None takes the one that keeps a head of hair's coverage. `explicit_seconds`
+    of explicit diffusion are run beside the solver for the report.
     """
 
     held_out: tuple[str, ...] = ()
@@ -66,12 +71,15 @@ class ReconstructOptions:
     margin: float = 2e-3
     least_confidence: float = 0.1
     network: dict[str, Any] | None = None
+    scalp_points: str | None = None
+    head_mesh: str | None = None
     scalp_normals: bool = False
     to_measured: bool = False
     spacing: float = 2e-3
     radius: float | None = None
     seed: int = 0
     explicit_seconds: float = 1.0
+    motion: MotionOptions = MotionOptions()  # noqa: RUF009  frozen
     measure: MeasureOptions = MeasureOptions()  # noqa: RUF009  frozen
 
 
@@ -81,20 +89,21 @@ def reconstruct(
     *,
     method: Literal["light_planes"] = "light_planes",
     options: ReconstructOptions = ReconstructOptions(),
+    motion: Motion | None = None,
     progress: Progress = silent,
 ) -> Report:
     """Reconstruct the strands of `capture` into the folder `model`.
 
-    Writes `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`, `masks/*.png` and
-    `report.json`, whose stages of the same name are replaced. Raises `CaptureError` where the
-    capture lacks what the method cannot do without: OLAT frames, a head, two cameras.
+    `motion` is the subject's where it is known from elsewhere; None solves for it.
+
+    Writes `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`, `scalp_map.npz`,
+    `masks/*.png`, `head.obj` where the capture has none, and `report.json`, whose stages of the
+    same name are replaced. Raises `CaptureError` where the capture lacks what the method cannot do
+    without: OLAT frames, a head or points to lay one under, two cameras.
     """
     if method != "light_planes":
         raise ValueError(f"unknown method {method!r}; there is 'light_planes'")
     whole, capture = capture, _without(capture, options.held_out)
-    head = capture.head
-    if head is None:
-        raise CaptureError(f"{capture.path}: no head.obj: strands need a scalp to be rooted on")
     if bent := [c.name for c in capture.rig.cameras if c.distorted]:
         raise CaptureError(
             f"{capture.path}: the lenses of {bent} bend lines, and the reconstruction takes them "
@@ -103,9 +112,12 @@ def reconstruct(
     model = Path(model)
     (model / "masks").mkdir(parents=True, exist_ok=True)
     report = Report.load(model / "report.json")
+    head, fitted = capture.head, _digitised_head(capture, model, options, report)
+    if fitted is not None:
+        head = fitted.mesh
 
     with report.stage("triangulation") as stage:
-        cloud = _points(capture, report, stage, progress)
+        cloud = _points(capture, motion, options, report, stage, progress)
         cloud.save(model / "points.npz")
     with report.stage("masks") as stage:
         # a held-out camera's mask says where to compare pictures; nothing here looks at it
@@ -120,6 +132,11 @@ def reconstruct(
         masks = {k: m for k, m in every.items() if k not in options.held_out}
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
         stage.figures["source"] = {k: m.source for k, m in masks.items()}
+    if head is None:
+        with report.stage("head") as stage:
+            skin = skin_points(capture, cloud, masks)
+            fitted = lay_head(skin, options.head_mesh, model, stage, cloud=cloud, seed=options.seed)
+        head = fitted.mesh
     with report.stage("envelope") as stage:
         envelope, depths = build_envelope(capture, cloud, masks, head, options, stage)
     with report.stage("orientation") as stage:
@@ -133,8 +150,24 @@ def reconstruct(
         strands = grow(field, scalp, options, stage, progress)
         for suffix in ("npz", "hair", "usdc"):
             write_strands(model / f"strands.{suffix}", strands)
+        save_root_map(model, strands, scalp, fitted.scalp_map if fitted else None, stage)
     report.save(model / "report.json")
     return report
+
+
+def _digitised_head(
+    capture: Capture, model: Path, options: ReconstructOptions, report: Report
+) -> FittedHead | None:
+    """The head under the user's scalp points; they win over `head.obj` where asked for."""
+    (model / "head.obj").unlink(missing_ok=True)
+    report.stages = [s for s in report.stages if s.name != "head"]
+    if capture.head is not None and options.scalp_points is None:
+        return None
+    points = digitised_points(capture, options.scalp_points)
+    if points is None:
+        return None
+    with report.stage("head") as stage:
+        return lay_head(points, options.head_mesh, model, stage, seed=options.seed)
 
 
 def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
@@ -150,7 +183,14 @@ def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
     return out
 
 
-def _points(capture: Capture, report: Report, stage: Stage, progress: Progress) -> PointCloud:
+def _points(
+    capture: Capture,
+    motion: Motion | None,
+    options: ReconstructOptions,
+    report: Report,
+    stage: Stage,
+    progress: Progress,
+) -> PointCloud:
     """Triangulated points in the reference pose; none where there was no sweep."""
     names = tuple(c.name for c in capture.rig.cameras)
     if not capture.of_kind("scanline"):
@@ -158,9 +198,12 @@ def _points(capture: Capture, report: Report, stage: Stage, progress: Progress) 
         stage.leave_out("triangulation and motion", why, "the scanline sweep and its solve")
         return PointCloud.empty(names, tuple(p.name for p in capture.rig.projectors))
     peaks = sweep_peaks(capture, progress=progress)
-    first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
-    with report.stage("motion") as motion_stage:
-        motion: Motion = solve_motion(capture, first, progress=progress, stage=motion_stage)
+    if motion is None:
+        first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
+        with report.stage("motion") as motion_stage:
+            motion = solve_motion(
+                capture, first, options=options.motion, progress=progress, stage=motion_stage
+            )
     return triangulate(
         capture,
         motion=None if motion.still else motion,

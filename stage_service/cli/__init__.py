@@ -14,6 +14,7 @@ from stage_service.cli import (
     captures,
     demo_command,
     evaluate,
+    heads,
     models,
     processes,
     remote,
@@ -42,6 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
         bench,
         rigs,
         calibrate,
+        heads,
     ):
         group.add(commands)
     return parser

@@ -21,6 +21,7 @@ from appearance.scene import HairScene, build_scene
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
 from reconstruction.exr import write_exr
+from reconstruction.fitted_head import model_head
 from reconstruction.report import Progress
 from reconstruction.strand_files import read_strands
 
@@ -44,7 +45,7 @@ def render_model(args: argparse.Namespace, progress: Progress) -> dict[str, Any]
         camera = capture.rig.camera(args.camera)
     scene = build_scene(
         strands,
-        capture.head if capture is not None else None,
+        model_head(args.model, capture),
         hair=appearance.hair,
         skin=appearance.skin,
     )

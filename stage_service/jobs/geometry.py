@@ -29,11 +29,12 @@ def evaluate_geometry(
     from appearance.observations import model_mask
     from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
     from reconstruction.evaluation import compare_strands
+    from reconstruction.fitted_head import model_head
     from reconstruction.strand_files import read_strands
     from reconstruction.visibility import Visibility
 
     true = read_strands(truth)
-    cameras, head = capture.rig.cameras, capture.head
+    cameras, head = capture.rig.cameras, model_head(model, capture)
     progress("what the cameras see of the true strands", 0.0)
     visibility = Visibility(cameras, true, head)
 

@@ -98,6 +98,8 @@ def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera])
     assert len(PointCloud.load(folder / "points.npz")) == 0
     sizes = {s: len(read_strands(folder / f"strands.{s}")) for s in ("npz", "hair", "usdc")}
     assert len(set(sizes.values())) == 1
+    with np.load(folder / "scalp_map.npz") as data:
+        assert len(data["roots"]) == sizes["npz"]
     for camera in around:
         for kind in ("hair", "skin"):
             image = cv2.imread(str(folder / "masks" / f"{camera.name}_{kind}.png"), 0)
@@ -159,6 +161,30 @@ def test_a_sweep_is_triangulated(
     assert len(points) > 500
     assert np.median(np.abs(np.linalg.norm(points, axis=1) - RADIUS)) < 1e-3
     assert len(read_strands(tmp_path / "strands.npz")) > 20
+
+
+def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
+    shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
+) -> None:
+    capture = shoot(cameras=around, projectors=[], lights=LIGHTS, extra=hair)
+    whole = ball(HEAD)
+    upper = whole.vertices[whole.vertices[:, 2] > 0]
+    write_obj(capture.path / "scalp.obj", Mesh(upper, np.zeros((0, 3))))
+    write_obj(tmp_path / "larger.obj", ball(1.08 * HEAD))
+    options = replace(QUICK, head_mesh=str(tmp_path / "larger.obj"))
+    report = reconstruct(capture, tmp_path / "model", options=options)
+    assert report["head"].figures["used_share"] > 0.9
+    assert report["head"].figures["rms_mm"] < 0.5
+    assert any("taken to face" in w for w in report["head"].warnings)
+    strands = read_strands(tmp_path / "model" / "strands.npz")
+    assert np.abs(np.linalg.norm(strands.roots, axis=1) - HEAD).max() < 2e-3
+    with np.load(tmp_path / "model" / "scalp_map.npz") as data:
+        assert data["roots"].shape == (len(strands), 2)
+    # once it has a head of its own, none is laid
+    write_obj(capture.path / "head.obj", ball(HEAD))
+    report = reconstruct(Capture(capture.path), tmp_path / "model", options=QUICK)
+    assert "head" not in [s.name for s in report.stages]
+    assert not (tmp_path / "model" / "head.obj").exists()
 
 
 def test_no_sweep_is_said(

@@ -1,0 +1,130 @@
+"""Files of points: what a digitiser or a scanner writes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SUFFIXES = (".obj", ".ply", ".csv", ".npy")
+_KINDS = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def read_points(path: str | Path) -> tuple[Array, Array | None]:
+    """Points `(N, 3)` of a file, and their unit normals `(N, 3)` where it has one for each.
+
+    `.obj` and `.ply`: the vertices, faces are ignored. `.csv`: x, y, z and perhaps a normal a line,
+    between commas, semicolons or blanks, after perhaps one line of names. `.npy`: `(N, 3)` or
+    `(N, 6)`. Raises `ValueError` naming the file and what is wrong.
+    """
+    path = Path(path)
+    readers = {".obj": _obj, ".ply": _ply, ".csv": _csv, ".npy": _npy}
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"{path}: expected a file of points ({', '.join(SUFFIXES)})")
+    try:
+        rows = readers[path.suffix.lower()](path)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    if rows.ndim != 2 or rows.shape[1] not in (3, 6) or not len(rows):
+        raise ValueError(f"{path}: expected (N, 3) or (N, 6) numbers, got {rows.shape}")
+    if not np.isfinite(rows).all():
+        bad = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
+        raise ValueError(f"{path}: point {bad} is not finite: {rows[bad].tolist()}")
+    if rows.shape[1] == 3:
+        return rows, None
+    length = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    if not (length > 0).all():
+        return rows[:, :3], None
+    return rows[:, :3], rows[:, 3:] / length
+
+
+def _obj(path: Path) -> Array:
+    words = [line.split() for line in path.read_text().splitlines()]
+    points = [w[1:4] for w in words if w[:1] == ["v"]]
+    normals = [w[1:4] for w in words if w[:1] == ["vn"]]
+    rows = np.array(points, np.float64)
+    if len(normals) == len(points) and points:
+        rows = np.hstack([rows, np.array(normals, np.float64)])
+    return rows
+
+
+def _csv(path: Path) -> Array:
+    rows: list[list[float]] = []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        words = [w for w in re.split(r"[,;\s]+", line.partition("#")[0].strip()) if w]
+        if not words:
+            continue
+        try:
+            rows.append([float(w) for w in words])
+        except ValueError:
+            if number > 1:
+                raise ValueError(f"line {number}: expected numbers, got {line!r}") from None
+            continue
+        if len(rows[-1]) != len(rows[0]):
+            raise ValueError(f"line {number}: {len(rows[-1])} numbers, {len(rows[0])} before")
+    return np.array(rows, np.float64)
+
+
+def _npy(path: Path) -> Array:
+    return np.asarray(np.load(path, allow_pickle=False), np.float64)
+
+
+def _ply(path: Path) -> Array:
+    """The vertices of a PLY, which must be its first element."""
+    data = path.read_bytes()
+    head, end, body = data.partition(b"end_header")
+    lines = [line.split() for line in head.decode("ascii").splitlines()]
+    if not end or lines[:1] != [["ply"]]:
+        raise ValueError("no PLY header")
+    body = body.partition(b"\n")[2]
+    form = next((line[1] for line in lines if line[:1] == ["format"]), "none")
+    if form not in _ORDERS:
+        raise ValueError(f"format {form!r}; expected one of {', '.join(_ORDERS)}")
+    elements = [i for i, line in enumerate(lines) if line[:1] == ["element"]]
+    if not elements or lines[elements[0]][1] != "vertex":
+        raise ValueError("the first element must be 'vertex'")
+    count = int(lines[elements[0]][2])
+    stop = elements[1] if len(elements) > 1 else len(lines)
+    properties = [line[1:] for line in lines[elements[0] : stop] if line[:1] == ["property"]]
+    if any(p[0] not in _KINDS for p in properties):
+        raise ValueError("a vertex has a property that is not a plain number")
+    order = _ORDERS[form]
+    names = [p[-1] for p in properties]
+    wanted = ["x", "y", "z"]
+    if not set(wanted) <= set(names):
+        raise ValueError(f"a vertex has {names}, expected x, y and z")
+    if {"nx", "ny", "nz"} <= set(names):
+        wanted += ["nx", "ny", "nz"]
+    if order is None:
+        numbers = np.array(body.split()[: count * len(names)], np.float64)
+        if len(numbers) < count * len(names):
+            raise ValueError(f"{len(numbers)} numbers for {count} vertices of {len(names)}")
+        table = numbers.reshape(count, len(names))
+        return table[:, [names.index(n) for n in wanted]]
+    kind = np.dtype([(n, order + _KINDS[p[0]]) for n, p in zip(names, properties, strict=True)])
+    if len(body) < count * kind.itemsize:
+        raise ValueError(f"{len(body)} bytes for {count} vertices of {kind.itemsize}")
+    rows = np.frombuffer(body, kind, count)
+    return np.stack([rows[n].astype(np.float64) for n in wanted], axis=1)

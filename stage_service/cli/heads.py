@@ -1,0 +1,101 @@
+"""`head`: a head under digitised points, and a user's mesh made a template."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from stage_service.cli.output import (
+    BAD_INPUT,
+    CommandError,
+    Commands,
+    Output,
+    add_command,
+    add_group,
+)
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    group = add_group(commands, "head", "heads for captures that have none")
+    fit = add_command(
+        group,
+        "fit",
+        run_fit,
+        "lay a head mesh under points of a head or of its scalp",
+        "Fit the generic head, or the user's, to points (.obj, .ply, .csv, .npy; metres, z up) and "
+        "write it with its scalp marked: put it into a capture as head.obj.",
+    )
+    fit.add_argument("points", type=Path)
+    fit.add_argument("--part", choices=["head", "scalp"], default="scalp", help="what they lie on")
+    fit.add_argument("--mesh", type=Path, help="the head to lay there (default: the generic one)")
+    fit.add_argument("--turn-deg", type=float, help="of the head about z, where known; 0 faces −y")
+    fit.add_argument("--out", type=Path, required=True, help=".obj")
+
+    mark = add_command(
+        group,
+        "mark",
+        run_mark,
+        "a user's head mesh as a template: upright, in metres, its scalp marked",
+        "Cut and turn a head or body of any unit, mark the generic head's scalp on it, and write "
+        "it in the generic head's frame, for 'head fit --mesh' or the option head_mesh.",
+    )
+    mark.add_argument("mesh", type=Path, help=".obj")
+    mark.add_argument("--up", choices=["y", "z"], default="z", help="the mesh's upward axis")
+    mark.add_argument("--above", type=float, help="cut off what is lower, in the mesh's unit")
+    mark.add_argument("--out", type=Path, required=True, help=".obj")
+
+
+def run_fit(args: argparse.Namespace, output: Output) -> int:
+    """Fit a head."""
+    import numpy as np
+
+    from reconstruction.generic_head import generic_head
+    from reconstruction.head_fit import fit_head
+    from reconstruction.head_template import template
+    from reconstruction.mesh import read_obj, write_obj
+    from reconstruction.point_files import read_points
+
+    _require_obj(args.out)
+    shape = generic_head() if args.mesh is None else template(read_obj(args.mesh))[0]
+    points, normals = read_points(args.points)
+    turn = None if args.turn_deg is None else float(np.radians(args.turn_deg))
+    fit = fit_head(points, normals, shape, part=args.part, turn=turn)
+    write_obj(args.out, fit.mesh)
+    rms, used = 1e3 * fit.bent.to_mesh_rms, 1 - float(fit.outliers.mean())
+    lines = [f"{args.out}: {rms:.2f} mm rms from {used:.0%} of {len(points)} points"]
+    lines += [f"warning: {w}" for w in fit.warnings]
+    output.result(
+        {
+            "head": str(args.out),
+            "points": len(points),
+            "rms_mm": rms,
+            "used_share": used,
+            "fit": fit.figures(),
+            "warnings": list(fit.warnings),
+        },
+        "\n".join(lines),
+    )
+    return 0
+
+
+def run_mark(args: argparse.Namespace, output: Output) -> int:
+    """Make a template."""
+    from reconstruction.head_template import template
+    from reconstruction.mesh import read_obj, write_obj
+
+    _require_obj(args.out)
+    mesh, fit = template(read_obj(args.mesh), up=args.up, above=args.above)
+    write_obj(args.out, mesh)
+    assert mesh.scalp is not None
+    scalp = float(mesh.face_areas()[mesh.scalp].sum() * 1e4)
+    data = {"head": str(args.out), "faces": len(mesh.faces), "scalp_cm2": scalp}
+    if fit is not None:
+        data |= {"unit_m": 1 / fit.pose.scale, "fit": fit.figures(), "warnings": list(fit.warnings)}
+    output.result(data, f"{args.out}: {scalp:.0f} cm² of scalp on {len(mesh.faces)} faces")
+    return 0
+
+
+def _require_obj(path: Path) -> None:
+    if path.suffix != ".obj":
+        raise CommandError(f"--out must end in .obj, got {path}", BAD_INPUT, "BadInput")
