@@ -42,9 +42,9 @@ class Stage1Options:
 
     `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
     reached over `levels` doublings. `steps` at most, of `images` pairs each. `common_numbers`
-    repeats the same random numbers for a view in every step. `rendered` says what a step renders:
-    "hair" (a random part of the hair pixels, all lights of a view from shared paths) or "frames"
-    (whole frames, one at a time).
+    repeats the same random numbers for a view in every step. `repeatable` gives the same bytes for
+    the same seed, with gradients in a single thread. The watched error is that of `watched_views`
+    views, every `check_every` steps; after `halvings` of the pace it has converged.
     """
 
     row: str = "lights"
@@ -59,6 +59,7 @@ class Stage1Options:
     lambda_r: float = 10.0
     residual_weighted: bool = True
     common_numbers: bool = False
+    repeatable: bool = True
     check_every: int = 10
     halvings: int = 2
     watched_views: int = 3
@@ -203,6 +204,7 @@ class _Fit:
             rng,
             loss=options.loss,
             lambdas=(options.lambda_sigma, options.lambda_r),
+            repeatable=options.repeatable,
         )
         if not all(np.isfinite(g).all() for g in slope.gradient.values()):
             return f"step {state.step}: the gradient is not finite"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,8 +73,12 @@ class Problem:
         *,
         loss: str = "squares",
         lambdas: tuple[float, float] = (0.0, 0.0),
+        repeatable: bool = True,
     ) -> Slope:
-        """The derivative of the loss of a batch; `seeds` are the picture's and the gradient's."""
+        """The derivative of the loss of a batch; `seeds` are the picture's and the gradient's.
+
+        Threads add up a gradient in no fixed order: a `repeatable` one takes a single thread.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -92,7 +97,10 @@ class Problem:
         values = hair_values(leaves) | self._lamp_values(op, leaves, free, batch.lights)
         known = op.parameters() | {k: dr.detach(v) for k, v in values.items()}
         wanted = [k for k, v in values.items() if dr.grad_enabled(v)]
-        found = op.gradients(known, wanted, mi.TensorXf(weight.astype(np.float32)), seeds[1])
+        with _threads(1 if repeatable else None):
+            found = op.gradients(known, wanted, mi.TensorXf(weight.astype(np.float32)), seeds[1])
+            dr.eval(found)
+            dr.sync_thread()
         total = losses.smoothness(values, *lambdas)
         for name in wanted:
             total = total + dr.sum(found[name] * values[name], axis=None)
@@ -204,3 +212,15 @@ class Problem:
             intensity = known["lamps.intensity"]
             out["lamps.intensity"] = intensity * mi.TensorXf(factor, (len(lights), 3))
         return out
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    import drjit as dr
+
+    before = dr.thread_count()
+    dr.set_thread_count(count or before)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)

@@ -29,7 +29,7 @@ def test_one_colour_and_roughness_are_found_from_pictures(plain, tufted, origina
     told = []
     found = run(plain, START, options=original, progress=lambda what, share: told.append(what))
     assert found.error < 0.5 * found.start_error
-    assert far(found.maps, tufted.truth) < 0.35 < far(START, tufted.truth)
+    assert far(found.maps, tufted.truth) < 0.4 < far(START, tufted.truth)
     assert "error" in told[0]
     assert [step for _, step, _ in found.history][:3] == [0, 10, 20]
 
