@@ -1,59 +1,12 @@
-"""One place that finds libLLVM, chooses Mitsuba's back end, and says what to install."""
+"""Chooses Mitsuba's back end, or says what to install."""
 
 from __future__ import annotations
 
-import ctypes
-import os
-import re
 import sys
-from pathlib import Path
 
-OLDEST_LLVM = 16
-_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/lib")
+from reconstruction.array_backend import BackendError, chosen_variant, find_libllvm
 
-
-class BackendError(RuntimeError):
-    """No back end can run here; the message says what to install."""
-
-
-def find_libllvm() -> str:
-    """Path of the newest libLLVM of version 16 or newer.
-
-    `DRJIT_LIBLLVM_PATH` wins when it is set. Dr.Jit 1.5 aborts the process on LLVM 15, so an older
-    library is an error here, before Mitsuba is imported. Raises `BackendError`.
-    """
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    candidates = [Path(named)] if named else _installed()
-    found = sorted(((_version(p), str(p)) for p in candidates), reverse=True)
-    for version, path in found:
-        if version >= OLDEST_LLVM and _loads(path):
-            return path
-    seen = f"found only {', '.join(f'{p} (LLVM {v})' for v, p in found)}" if found else "found none"
-    raise BackendError(
-        f"hairstage needs libLLVM {OLDEST_LLVM} or newer and {seen}: "
-        "run 'apt-get install libllvm19' (or set DRJIT_LIBLLVM_PATH to the library)"
-    )
-
-
-def _installed() -> list[Path]:
-    pattern = re.compile(r"libLLVM(-\d+)?\.so(\.\d+)*$")
-    folders = [p for f in _FOLDERS for p in (Path(f), *Path(f).glob("*-linux-gnu*"))]
-    folders += [p for f in _FOLDERS for p in Path(f).glob("llvm-*/lib")]
-    files = (p for folder in folders if folder.is_dir() for p in folder.iterdir())
-    return list({p.resolve() for p in files if pattern.match(p.name)})
-
-
-def _version(path: Path) -> int:
-    match = re.search(r"libLLVM[-.](?:so\.)?(\d+)", path.resolve().name)
-    return int(match.group(1)) if match else 0
-
-
-def _loads(path: str) -> bool:
-    try:
-        ctypes.CDLL(path)
-    except OSError:
-        return False
-    return True
+__all__ = ["BackendError", "ensure_backend", "find_libllvm"]
 
 
 def ensure_backend(variant: str | None = None) -> str:
@@ -62,9 +15,7 @@ def ensure_backend(variant: str | None = None) -> str:
     `variant` or `HAIRSTAGE_VARIANT` overrides the choice; otherwise LLVM, which runs on every CPU.
     Raises `BackendError` when libLLVM is too old or absent.
     """
-    chosen = variant or os.environ.get("HAIRSTAGE_VARIANT") or "llvm_ad_rgb"
-    if chosen.startswith("llvm"):
-        os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
+    chosen = chosen_variant(variant)
     import mitsuba as mi
 
     if mi.variant() != chosen:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,8 @@ from reconstruction.envelope import carve, depth_map, inside_mesh, mesh_depth
 from reconstruction.field import FieldOptions, OrientationField, solve_field
 from reconstruction.fitted_head import FittedHead, digitised_points, lay_head, skin_points
 from reconstruction.growth import Coverage, fill_gaps, grow_from_roots
+from reconstruction.light_codes.line_strands import both, line_strands
+from reconstruction.light_codes.options import LightCodeOptions
 from reconstruction.light_planes import (
     Motion,
     MotionOptions,
@@ -29,6 +31,7 @@ from reconstruction.light_planes import (
 from reconstruction.masks import HairMask, hair_masks
 from reconstruction.measure import Measured, MeasureOptions, measure_tangents
 from reconstruction.mesh import Mesh
+from reconstruction.methods import METHODS, Method
 from reconstruction.report import Progress, Report, Stage, silent
 from reconstruction.rig import Rig
 from reconstruction.root_map import save_root_map
@@ -81,13 +84,14 @@ class ReconstructOptions:
     explicit_seconds: float = 1.0
     motion: MotionOptions = MotionOptions()  # noqa: RUF009  frozen
     measure: MeasureOptions = MeasureOptions()  # noqa: RUF009  frozen
+    light_codes: LightCodeOptions = LightCodeOptions()  # noqa: RUF009
 
 
 def reconstruct(
     capture: Capture,
     model: Path,
     *,
-    method: Literal["light_planes"] = "light_planes",
+    method: Method = "light_planes",
     options: ReconstructOptions = ReconstructOptions(),
     motion: Motion | None = None,
     progress: Progress = silent,
@@ -101,8 +105,8 @@ def reconstruct(
     same name are replaced. Raises `CaptureError` where the capture lacks what the method cannot do
     without: OLAT frames, a head or points to lay one under, two cameras.
     """
-    if method != "light_planes":
-        raise ValueError(f"unknown method {method!r}; there is 'light_planes'")
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
     whole, capture = capture, _without(capture, options.held_out)
     if bent := [c.name for c in capture.rig.cameras if c.distorted]:
         raise CaptureError(
@@ -132,6 +136,10 @@ def reconstruct(
         masks = {k: m for k, m in every.items() if k not in options.held_out}
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
         stage.figures["source"] = {k: m.source for k, m in masks.items()}
+    if method in ("photometric", "lmvs"):
+        _write(model, _line_strands(capture, masks, head, method, options, report, progress))
+        report.save(model / "report.json")
+        return report
     if head is None:
         with report.stage("head") as stage:
             skin = skin_points(capture, cloud, masks)
@@ -143,16 +151,57 @@ def reconstruct(
         measured = measure_tangents(
             capture, cloud.points, masks, depths, envelope, options.measure, stage, progress
         )
+    seen: list[Array] = []
+    if method == "fused":
+        seen, segments = line_strands(
+            capture, masks, head, report, options=options.light_codes, progress=progress
+        )
+        measured = both(measured, segments, options.light_codes.field_weight)
     with report.stage("field") as stage:
         scalp = find_scalp(head, envelope)
         field = _field(envelope, measured, scalp, options, stage)
     with report.stage("strands") as stage:
-        strands = grow(field, scalp, options, stage, progress)
-        for suffix in ("npz", "hair", "usdc"):
-            write_strands(model / f"strands.{suffix}", strands)
+        strands = grow(field, scalp, options, stage, progress, seen)
+        _write(model, strands)
         save_root_map(model, strands, scalp, fitted.scalp_map if fitted else None, stage)
     report.save(model / "report.json")
     return report
+
+
+def _line_strands(
+    capture: Capture,
+    masks: Mapping[str, HairMask],
+    head: Mesh | None,
+    method: Literal["photometric", "lmvs"],
+    options: ReconstructOptions,
+    report: Report,
+    progress: Progress,
+) -> Strands:
+    """Strands from line stereo alone: only what is seen, none of them rooted."""
+    polylines, _ = line_strands(
+        capture,
+        masks,
+        head,
+        report,
+        method=method,
+        options=options.light_codes,
+        progress=progress,
+    )
+    with report.stage("strands") as stage:
+        radius = options.radius or float(np.clip(HEAD_OF_HAIR / max(len(polylines), 1), 4e-5, 4e-4))
+        strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
+        stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
+        stage.leave_out(
+            "roots",
+            "line stereo measures what is seen; the method 'fused' leads it to the scalp",
+            "the field and the growth",
+        )
+    return strands
+
+
+def _write(model: Path, strands: Strands) -> None:
+    for suffix in ("npz", "hair", "usdc"):
+        write_strands(model / f"strands.{suffix}", strands)
 
 
 def _digitised_head(
@@ -333,8 +382,12 @@ def grow(
     options: ReconstructOptions,
     stage: Stage,
     progress: Progress = silent,
+    seen: Sequence[Array] = (),
 ) -> Strands:
-    """Strands from the scalp, then through the gaps that those leave, all of them rooted."""
+    """Strands from the scalp, then through the gaps that those leave, all of them rooted.
+
+    `seen` polylines `(n, 3)` were measured as they are; they get roots like those through gaps.
+    """
     roots, normals = sample_roots(scalp, options.roots, options.seed)
     progress("growing strands", 0.1)
     rooted = grow_from_roots(
@@ -348,6 +401,8 @@ def grow(
     coverage = Coverage(field)
     for path in rooted:
         coverage.add(path)
+    for polyline in seen:
+        coverage.add(polyline)
     share = float(coverage.covered[field.valid].mean())
     progress("filling gaps", 0.4)
     loose = fill_gaps(
@@ -355,6 +410,7 @@ def grow(
     )
     filled = float(coverage.covered[field.valid].mean())
     progress("rooting strands", 0.7)
+    loose = [polyline.astype(np.float32) for polyline in seen] + loose
     result = root_all(rooted, loose, scalp)
     if not result.strands:
         raise CaptureError("no strand could be grown: the envelope does not reach the scalp")

@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from appearance.hair_appearance import HairAppearance
+from reconstruction.cameras import Camera
 from reconstruction.generic_head import generic_head
 from reconstruction.mesh import Mesh, read_obj
 from reconstruction.rig import Rig
@@ -119,15 +121,22 @@ def load_subject(
 
 
 def check_fits(subject: Subject, rig: Rig) -> None:
-    """Raise `SubjectError` unless every camera sees at least half of the hair's points."""
+    """Raise `SubjectError` unless every camera sees half of the hair or is half filled by it."""
     points = subject.strands.points.astype(float)
     for camera in rig.cameras:
         pixels, depth = camera.project(points)
-        share = float(np.mean(camera.inside(pixels) & (depth > 0.05)))
-        if share < 0.5:
+        on = camera.inside(pixels) & (depth > 0.05)
+        share = float(np.mean(on))
+        if share < 0.5 and _filled(camera, pixels[on]) < 0.5:
             low, high = points.min(axis=0).round(3), points.max(axis=0).round(3)
             raise SubjectError(
                 f"subject {subject.name}: {camera.name} of rig {rig.name} sees only {share:.0%} of "
                 f"the hair, which spans {low} to {high} m; the stage expects metres, z up, face "
                 "towards −y, the head's centre at the origin: convert the file"
             )
+
+
+def _filled(camera: Camera, pixels: NDArray[np.float64]) -> float:
+    """Share of the image's 16x16 tiles that `pixels (N, 2)` fall into."""
+    tiles = (pixels + 0.5) * 16 / [camera.width, camera.height]
+    return len(np.unique(tiles.astype(int) @ [1, 16])) / 256

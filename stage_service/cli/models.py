@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from reconstruction.methods import METHODS
 from stage_service.cli.output import (
     BAD_INPUT,
     CommandError,
@@ -27,7 +28,7 @@ def add(commands: Commands) -> None:
         "Write MODEL/strands.npz, .hair and .usdc, and MODEL/report.json.",
     )
     reconstruct.add_argument("capture", type=Path)
-    reconstruct.add_argument("--method", choices=["light_planes"], default="light_planes")
+    reconstruct.add_argument("--method", choices=METHODS, default="light_planes")
     reconstruct.add_argument("--out", type=Path, required=True, help="model folder")
     reconstruct.add_argument("--options", help="the method's options as JSON")
     _held_out(reconstruct)

@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from reconstruction.methods import Method
+
 JobState = Literal["queued", "running", "done"]
 JobOutcome = Literal["succeeded", "failed", "cancelled"]
 
@@ -22,7 +24,7 @@ class JobOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: Literal["light_planes"] = "light_planes"
+    method: Method = "light_planes"
     compress: bool = True
     held_out_cameras: tuple[str, ...] = ()
     held_out_lights: tuple[str, ...] = ()

@@ -1,0 +1,1 @@
+"""Photometric line stereo: shadow bits match pixels across views, lines give segments (Sun §4)."""

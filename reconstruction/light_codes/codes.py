@@ -1,0 +1,86 @@
+"""Lightcodes: which lights reach a pixel, one bit for each, packed in words (Sun §4.2.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Words = NDArray[np.uint32]
+Bools = NDArray[np.bool_]
+Images = NDArray[np.floating]
+
+WORD = 32
+
+
+@dataclass(frozen=True, eq=False)
+class CodeMap:
+    """One view's lightcodes.
+
+    `words (H, W, ceil(L / 32)) uint32` hold light `i` in bit `i % 32` of word `i // 32`, 0 outside
+    the mask. `varying (words,)` marks the lights whose bit is not the same all over the hair: the
+    others say nothing within this view. `threshold` is the response at which a pixel counts as
+    lit, `noise` the part of it that the sensor's noise asked for.
+    """
+
+    words: Words
+    varying: Words
+    threshold: float
+    noise: float
+
+
+def pack(bits: Bools) -> Words:
+    """Words `(..., ceil(L / 32))` of `bits (..., L)`; the last word is filled up with zeros."""
+    count = bits.shape[-1]
+    width = -(-count // WORD) * WORD
+    padded = np.zeros((*bits.shape[:-1], width), bool)
+    padded[..., :count] = bits
+    packed = np.packbits(padded, axis=-1, bitorder="little")
+    return np.ascontiguousarray(packed).view("<u4").astype(np.uint32)
+
+
+def unpack(words: Words, count: int) -> Bools:
+    """The `count` bits `(..., count)` of `words (..., W)`; the inverse of `pack`."""
+    raw = np.ascontiguousarray(words, dtype="<u4").view(np.uint8)
+    return np.unpackbits(raw, axis=-1, bitorder="little", count=count).astype(bool)
+
+
+def match(a: Words, b: Words, asked: Words) -> NDArray[np.float32]:
+    """Share of equal bits among those `asked`: `(...)` of `(..., W)` words; 1 where none is."""
+    equal = np.bitwise_count(~(a ^ b) & asked).sum(axis=-1, dtype=np.int64)
+    total = np.bitwise_count(asked).sum(axis=-1, dtype=np.int64)
+    share = np.divide(equal, total, out=np.ones(np.broadcast(equal, total).shape), where=total > 0)
+    return share.astype(np.float32)
+
+
+def asked_bits(a: CodeMap, b: CodeMap) -> Words:
+    """The lights `(W,)` that a pair of views is compared by: those that vary in either of them."""
+    return a.varying | b.varying
+
+
+def code_map(
+    responses: Images,
+    mask: Bools,
+    furthest: int,
+    noise: float = 0.0,
+    saturated: Bools | None = None,
+) -> CodeMap:
+    """Lightcodes from responses `(L, H, W)` to single lights of equal irradiance on the subject.
+
+    A pixel is lit where it exceeds the median over the mask `(H, W)` under light `furthest`, the
+    one furthest from the camera, which shows what a shadow looks like; and three times `noise`,
+    the responses' standard deviation. `saturated (L, H, W)` pixels are lit whatever their value.
+    Raises `ValueError` where shapes disagree.
+    """
+    if responses.ndim != 3 or responses.shape[1:] != mask.shape:
+        raise ValueError(f"expected responses (L, {mask.shape}), got {responses.shape}")
+    shadow = float(np.median(responses[furthest][mask])) if mask.any() else 0.0
+    threshold = max(shadow, 3 * noise, 0.0)
+    lit = (responses > threshold) & mask
+    if saturated is not None:
+        lit |= saturated & mask
+    bits = np.moveaxis(lit, 0, -1)
+    inside = bits[mask]
+    varying = np.asarray(inside.any(axis=0) & ~inside.all(axis=0))
+    return CodeMap(pack(bits), pack(varying), threshold, noise)

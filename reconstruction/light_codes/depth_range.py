@@ -1,0 +1,66 @@
+"""Between which depths a pixel's hair can lie: the hull of what the cameras see, and the head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from reconstruction.cameras import Camera
+from reconstruction.envelope import inside_mesh
+from reconstruction.mesh import Mesh
+from reconstruction.visual_hull import VoxelGrid, visual_hull
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+def hair_volume(
+    cameras: Sequence[Camera],
+    subject: Mapping[str, Bools],
+    head: Mesh | None,
+    spacing: float,
+    bounds: NDArray[np.float64] | None = None,
+) -> VoxelGrid:
+    """Voxels that can hold hair: in the hull of the masks `(H, W)` of the subject, off the head.
+
+    A point that three views cannot see is of no use to line stereo; with two cameras, two do.
+    """
+    used = {c.name: subject[c.name] for c in cameras if subject[c.name].any()}
+    hull = visual_hull(cameras, used, spacing=spacing, bounds=bounds, least_views=3)
+    inside = hull.inside & ~inside_mesh(hull, head) if head is not None else hull.inside
+    return VoxelGrid(hull.origin, hull.spacing, inside)
+
+
+def depth_range(camera: Camera, volume: VoxelGrid, most: float) -> tuple[Floats, Floats]:
+    """Nearest and furthest depth `(H, W)` of the volume behind each pixel, both 0 where none is.
+
+    At most `most` metres apart: hair deeper under the volume's surface is not seen.
+    """
+    near = np.zeros((camera.height, camera.width), np.float32)
+    centers = volume.centers()
+    pixels, depth = camera.project(centers) if len(centers) else (np.zeros((0, 2)), np.zeros(0))
+    ok = (depth > volume.spacing) & np.isfinite(pixels).all(axis=1)
+    pixels, depth = pixels[ok], depth[ok]
+    if not len(depth):
+        return near, near.copy()
+    # tiles as large as a voxel's picture: none is missed between the voxels' centres
+    focal = max(camera.K[0, 0], camera.K[1, 1])
+    tile = max(1, int(np.ceil(focal * volume.spacing / float(depth.min()))))
+    shape = -(-camera.height // tile) + 2, -(-camera.width // tile) + 2
+    column, row = (np.floor((pixels + 0.5) / tile).astype(np.int64) + 1).T
+    on = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
+    first, last = np.full(shape, np.inf), np.full(shape, -np.inf)
+    np.minimum.at(first, (row[on], column[on]), depth[on])
+    np.maximum.at(last, (row[on], column[on]), depth[on])
+    first = ndimage.minimum_filter(first, 3)[1:-1, 1:-1] - volume.spacing
+    last = ndimage.maximum_filter(last, 3)[1:-1, 1:-1] + volume.spacing
+    last = np.minimum(last, first + most)
+    y, x = np.arange(camera.height) // tile, np.arange(camera.width) // tile
+    found = np.isfinite(first)[np.ix_(y, x)]
+    return (
+        np.where(found, first[np.ix_(y, x)], 0).astype(np.float32),
+        np.where(found, last[np.ix_(y, x)], 0).astype(np.float32),
+    )

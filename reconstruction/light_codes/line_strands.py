@@ -1,0 +1,72 @@
+"""Strands from line stereo alone, and its part in the fusion with light planes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.capture import Capture
+from reconstruction.envelope import surface_samples
+from reconstruction.light_codes.options import DEFAULTS, LightCodeOptions
+from reconstruction.light_codes.pipeline import measure_segments, string_together
+from reconstruction.light_codes.segments import Segments
+from reconstruction.masks import HairMask
+from reconstruction.measure import Measured
+from reconstruction.mesh import Mesh
+from reconstruction.report import Progress, Report, silent
+
+Array = NDArray[np.float64]
+
+
+def line_strands(
+    capture: Capture,
+    masks: Mapping[str, HairMask],
+    head: Mesh | None,
+    report: Report,
+    *,
+    method: Literal["photometric", "lmvs"] = "photometric",
+    options: LightCodeOptions = DEFAULTS,
+    bounds: Array | None = None,
+    progress: Progress = silent,
+) -> tuple[list[Array], Segments]:
+    """Polylines `(n, 3)` from line stereo, the end that is nearer to the head first.
+
+    Without a head it is the higher end. None of them is rooted. Also the segments that they come
+    from. Raises `CaptureError` as `measure_segments` does.
+    """
+    views, segments = measure_segments(
+        capture,
+        masks,
+        head,
+        report,
+        method=method,
+        options=options,
+        bounds=bounds,
+        progress=progress,
+    )
+    return _roots_first(string_together(views, segments, report, options), head), segments
+
+
+def both(measured: Measured, segments: Segments, weight: float) -> Measured:
+    """The measurements of both methods; segments count by their confidence times `weight`."""
+    return Measured(
+        np.concatenate([measured.points, segments.points]),
+        np.concatenate([measured.directions, segments.directions]),
+        np.concatenate([measured.confidence, weight * segments.confidence]),
+    )
+
+
+def _roots_first(polylines: list[Array], head: Mesh | None) -> list[Array]:
+    if not polylines:
+        return []
+    ends = np.stack([[p[0] for p in polylines], [p[-1] for p in polylines]], axis=1)
+    if head is None:
+        far = -ends[:, :, 2]
+    else:
+        samples, _, _ = surface_samples(head, 2e-3)
+        far = cKDTree(samples).query(ends)[0]
+    return [p if a <= b else p[::-1] for p, (a, b) in zip(polylines, far, strict=True)]

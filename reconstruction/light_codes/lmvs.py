@@ -1,0 +1,171 @@
+"""The baseline: line stereo without lightcodes, after Nam et al. 2019 as Sun §4 describes it.
+
+Depth and direction are both unknown and searched together; the cost is the angle between projected
+and seen lines, minimised over the nearest cameras whether or not they see the pixel. As in other
+multi-view stereo without visibility, the better half of the cameras counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.light_codes.device_views import DeviceViews
+from reconstruction.light_codes.objective import Pixels, line_through
+from reconstruction.light_codes.search import DepthSearch, Floats
+
+FAN = np.radians(np.linspace(-60, 60, 9))
+"""Inclinations towards the camera at which a line is tried at every depth."""
+
+COARSE_SAMPLES, COARSE_NEIGHBOURS = 5, 8
+ROUNDS = 3
+
+
+class LmvsSearch(DepthSearch):
+    """Searches depth and inclination; same inputs and outputs as `DepthSearch`."""
+
+    def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """All neighbours `(P, N)`: nothing says which of them see a pixel."""
+        return np.ones((len(x), len(self.neighbours[view])), bool)
+
+    def search(
+        self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
+    ) -> tuple[Any, ...]:
+        """See `DepthSearch.search`; the agreement is 1 less the cost over a right angle."""
+        t, options = self.types, self.options
+        along = self._in_plane(view, x, y)
+        near, number = t.Float(start), t.UInt32(counts)
+        step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, options.samples)
+        fan = t.Float(FAN.astype(np.float32))
+        total = len(self.neighbours[view])
+        few = min(COARSE_NEIGHBOURS, total)
+        coarse = _Cost(self.device, pixels, along, few, options.length)
+        cost, depth, tilt = _sweep(
+            coarse, near, step, number, fan, len(FAN), dr.opaque(t.UInt32, COARSE_SAMPLES)
+        )
+        fine = _Cost(self.device, pixels, along, total, options.length)
+        cost = fine(depth, tilt, samples)
+        move, turn = 0.5 * options.step, 0.5 * float(FAN[1] - FAN[0])
+        for _ in range(ROUNDS):
+            for dz, da in ((move, 0.0), (-move, 0.0), (0.0, turn), (0.0, -turn)):
+                d, a = depth + dr.opaque(t.Float, dz), tilt + dr.opaque(t.Float, da)
+                here = fine(d, a, samples)
+                better = here < cost
+                cost = dr.select(better, here, cost)
+                depth, tilt = dr.select(better, d, depth), dr.select(better, a, tilt)
+                dr.eval(cost, depth, tilt)
+            move, turn = 0.5 * move, 0.5 * turn
+        line = line_through(self.device, pixels, pixels.at(depth), t.Bool(True))
+        direction = along(tilt)
+        dr.eval(depth, direction, cost, line.spread, line.misfit)
+        return (
+            depth.numpy(),
+            direction.numpy().T.copy(),
+            1 - cost.numpy() / np.float32(np.pi / 2),
+            line.spread.numpy(),
+            line.misfit.numpy(),
+        )
+
+    def _in_plane(self, view: int, x: NDArray[np.int64], y: NDArray[np.int64]) -> Any:
+        """A function from inclinations to unit directions in the plane of each pixel's line."""
+        own, t = self.views[view], self.types
+        pixel = np.stack([x, y], axis=1).astype(float)
+        line = own.lines[y, x].astype(float)
+        line /= np.linalg.norm(line, axis=1, keepdims=True)
+        ray = own.camera.rays(pixel)
+        across = own.camera.rays(pixel + line) - ray
+        across -= (across * ray).sum(axis=1, keepdims=True) * ray
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        a, r = (t.Array3f(*(t.Float(c.astype(np.float32)) for c in v.T)) for v in (across, ray))
+        return lambda tilt: dr.cos(tilt) * a + dr.sin(tilt) * r
+
+
+class _Cost:
+    """Mean angle, over the better half of the nearest `count` views, of a line at a depth."""
+
+    def __init__(
+        self, views: DeviceViews, pixels: Pixels, along: Any, count: int, length: float
+    ) -> None:
+        self.views, self.pixels, self.along = views, pixels, along
+        self.count = count
+        self.kept = max(1, count // 2)
+        self.length = dr.opaque(views.types.Float, length)
+
+    def __call__(self, depth: Any, tilt: Any, samples: Any) -> Any:
+        apart = self.length / dr.maximum(self.views.types.Float(samples) - 1, 1)
+        direction = apart * self.along(tilt)
+        best = _best_angles(
+            self.views,
+            self.pixels,
+            self.pixels.at(depth),
+            direction,
+            samples,
+            dr.opaque(self.views.types.UInt32, self.count + 1),
+            self.kept,
+        )
+        return sum(best) / self.kept
+
+
+@dr.syntax
+def _best_angles(
+    views: DeviceViews,
+    pixels: Pixels,
+    point: Any,
+    along: Any,
+    samples: Any,
+    count: Any,
+    kept: int,
+) -> list[Any]:
+    """The `kept` smallest mean angles among the neighbours, a right angle where no line is."""
+    t = views.types
+    best = [t.Float(np.pi / 2) for _ in range(kept)]
+    n = t.UInt32(1)
+    while n < count:
+        view = dr.gather(t.UInt32, pixels.neighbours, n)
+        middle = views.projection(view, point, 1)
+        step = views.projection(view, along, 0)
+        frame = views.corner(view)
+        h = middle - 0.5 * (t.Float(samples) - 1) * step
+        angle = t.Float(0)
+        s = t.UInt32(0)
+        while s < samples:
+            seen = views.look(frame, [], [], h, t.Bool(True))
+            ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
+            norm = (ux * ux + uy * uy) * (seen.lx * seen.lx + seen.ly * seen.ly)
+            cosine = dr.abs(ux * seen.lx + uy * seen.ly) * dr.rsqrt(dr.maximum(norm, 1e-20))
+            angle += dr.select(seen.there, dr.acos(dr.minimum(cosine, 1)), np.pi / 2)
+            h += step
+            s += 1
+        here = angle / t.Float(samples)
+        for i in range(kept):
+            better = here < best[i]
+            old = best[i]
+            best[i] = dr.select(better, here, old)
+            here = dr.select(better, old, here)
+        n += 1
+    return best
+
+
+@dr.syntax
+def _sweep(
+    cost: _Cost, near: Any, step: Any, number: Any, fan: Any, tilts: int, samples: Any
+) -> tuple[Any, Any, Any]:
+    """The least cost over all depths and the fan's inclinations, with its depth and inclination."""
+    t = cost.views.types
+    least, depth, tilt = t.Float(np.inf), t.Float(near), t.Float(0)
+    k = t.UInt32(0)
+    while k < number:
+        d = near + step * t.Float(k)
+        i = t.UInt32(0)
+        while i < tilts:
+            a = dr.gather(t.Float, fan, i)
+            here = cost(d, a, samples)
+            better = here < least
+            least = dr.select(better, here, least)
+            depth, tilt = dr.select(better, d, depth), dr.select(better, a, tilt)
+            i += 1
+        k += 1
+    return least, depth, tilt

@@ -1,0 +1,170 @@
+"""What a depth is worth: the line through a point and how well all views agree with it (Sun §4.2).
+
+Written once for Dr.Jit's CPU and GPU back ends. `reference` in the tests is the same in numpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from reconstruction.light_codes.device_views import DeviceViews
+
+
+class Pixels:
+    """Reference pixels, one a lane. No dataclass: Dr.Jit would carry it through every loop.
+
+    `origin` and `ray` give the point at depth d along the camera's axis: origin + d · ray. `code`
+    holds the words of the lightcode. `view` is the reference's number; `neighbours` (device array)
+    begins with it, has `count` views, and `visible` has bit n set where neighbour n sees the pixel.
+    """
+
+    def __init__(
+        self,
+        origin: Any,
+        ray: Any,
+        code: list[Any],
+        view: Any,
+        neighbours: Any,
+        count: Any,
+        visible: Any,
+    ) -> None:
+        self.origin, self.ray, self.code, self.view = origin, ray, code, view
+        self.neighbours, self.count, self.visible = neighbours, count, visible
+
+    def at(self, depth: Any) -> Any:
+        """The points at `depth`."""
+        return self.origin + depth * self.ray
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A direction through a point.
+
+    With the singular values s1 >= s2 >= s3 of the planes' normals: `spread` is s2 / s1, 0 where all
+    planes are parallel and any direction in them would do; `misfit` is s3 / s2, 0 where all planes
+    share one line.
+    """
+
+    direction: Any
+    spread: Any
+    misfit: Any
+
+
+@dr.syntax
+def line_through(views: DeviceViews, pixels: Pixels, point: Any, active: Any) -> Line:
+    """The direction that lies in the planes of the visible views' lines (Sun Eq. 4).
+
+    The singular vector of the smallest singular value of the planes' normals, weighted by the
+    lines' confidence and by how well the lightcodes match: an eigenvector of a 3x3 matrix.
+    """
+    t = views.types
+    xx, yy, zz = t.Float(0), t.Float(0), t.Float(0)
+    xy, xz, yz = t.Float(0), t.Float(0), t.Float(0)
+    n = t.UInt32(0)
+    while n < pixels.count:
+        view = dr.gather(t.UInt32, pixels.neighbours, n)
+        sees = active & ((pixels.visible >> n) & 1 == 1)
+        h = views.projection(view, point, 1)
+        asked = views.asked(view, pixels.view)
+        seen = views.look(views.corner(view), asked, pixels.code, h, sees)
+        line = t.Array3f(-seen.ly, seen.lx, seen.x * seen.ly - seen.y * seen.lx)
+        normal = views.across(view, line)
+        square = dr.squared_norm(normal)
+        own = seen.lx * seen.lx + seen.ly * seen.ly
+        weight = dr.select(
+            seen.there & (square > 0), own * seen.equal / dr.maximum(square, 1e-30), 0
+        )
+        xx += weight * normal.x * normal.x
+        yy += weight * normal.y * normal.y
+        zz += weight * normal.z * normal.z
+        xy += weight * normal.x * normal.y
+        xz += weight * normal.x * normal.z
+        yz += weight * normal.y * normal.z
+        n += 1
+    return smallest_axis(t, xx, yy, zz, xy, xz, yz)
+
+
+def smallest_axis(t: Any, xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Line:
+    """Eigenvector of a positive 3x3 matrix's smallest eigenvalue, in closed form.
+
+    Eigenvalues by the trigonometric formula, the vector as the longest cross product of two rows
+    of A - λI, refined by nothing: errors are of the order of float32's rounding over `spread`².
+    """
+    scale = dr.maximum(xx + yy + zz, 1e-30)
+    xx, yy, zz, xy, xz, yz = (a / scale for a in (xx, yy, zz, xy, xz, yz))
+    mean = t.Float(1.0 / 3)
+    dx, dy, dz = xx - mean, yy - mean, zz - mean
+    off = xy * xy + xz * xz + yz * yz
+    p = dr.sqrt(dr.maximum((dx * dx + dy * dy + dz * dz + 2 * off) / 6, 1e-20))
+    det = dx * (dy * dz - yz * yz) - xy * (xy * dz - yz * xz) + xz * (xy * yz - dy * xz)
+    angle = dr.acos(dr.clip(det / (2 * p * p * p), -1, 1)) / 3
+    big = mean + 2 * p * dr.cos(angle)
+    small = mean + 2 * p * dr.cos(angle + 2 * dr.pi / 3)
+    middle = 1 - big - small
+    r0 = t.Array3f(xx - small, xy, xz)
+    r1 = t.Array3f(xy, yy - small, yz)
+    r2 = t.Array3f(xz, yz, zz - small)
+    best = dr.cross(r0, r1)
+    for other in (dr.cross(r0, r2), dr.cross(r1, r2)):
+        best = dr.select(dr.squared_norm(other) > dr.squared_norm(best), other, best)
+    length = dr.norm(best)
+    direction = dr.select(length > 1e-12, best / dr.maximum(length, 1e-12), t.Array3f(0, 0, 0))
+    middle, small = dr.maximum(middle, 0), dr.maximum(small, 0)
+    misfit = dr.sqrt(small / dr.maximum(middle, 1e-12))
+    return Line(direction, dr.sqrt(middle / dr.maximum(big, 1e-12)), dr.minimum(misfit, 1))
+
+
+@dr.syntax
+def agreement(
+    views: DeviceViews, pixels: Pixels, point: Any, along: Any, samples: Any, active: Any
+) -> Any:
+    """Sun's Eq. 6 over the number of its terms: 0 to 1.
+
+    `samples` points stand `along` apart about `point`; each term is the share of equal bits times
+    the cosine between the projected line and the view's own, times the confidence there.
+    """
+    t = views.types
+    total, terms = t.Float(0), t.Float(0)
+    n = t.UInt32(0)
+    while n < pixels.count:
+        view = dr.gather(t.UInt32, pixels.neighbours, n)
+        sees = active & ((pixels.visible >> n) & 1 == 1)
+        middle = views.projection(view, point, 1)
+        step = views.projection(view, along, 0)
+        asked = views.asked(view, pixels.view)
+        frame = views.corner(view)
+        h = middle - 0.5 * (t.Float(samples) - 1) * step
+        s = t.UInt32(0)
+        while s < samples:
+            seen = views.look(frame, asked, pixels.code, h, sees)
+            ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
+            cosine = dr.abs(ux * seen.lx + uy * seen.ly) * dr.rsqrt(
+                dr.maximum(ux * ux + uy * uy, 1e-20)
+            )
+            total += dr.select(seen.there, seen.equal * cosine, 0)
+            h += step
+            s += 1
+        terms += dr.select(sees, t.Float(samples), 0)
+        n += 1
+    return total / dr.maximum(terms, 1)
+
+
+@dr.syntax
+def code_agreement(views: DeviceViews, pixels: Pixels, point: Any, active: Any) -> Any:
+    """Mean share of equal bits over the visible views but the reference: the cheap first stage."""
+    t = views.types
+    total, terms = t.Float(0), t.Float(0)
+    n = t.UInt32(1)
+    while n < pixels.count:
+        view = dr.gather(t.UInt32, pixels.neighbours, n)
+        sees = active & ((pixels.visible >> n) & 1 == 1)
+        h = views.projection(view, point, 1)
+        asked = views.asked(view, pixels.view)
+        seen = views.look(views.corner(view), asked, pixels.code, h, sees)
+        total += seen.equal
+        terms += dr.select(sees, t.Float(1), 0)
+        n += 1
+    return total / dr.maximum(terms, 1)

@@ -1,0 +1,39 @@
+"""What the photometric methods are asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from reconstruction.light_codes.chains import ChainOptions
+from reconstruction.light_codes.extension import ExtensionOptions
+from reconstruction.light_codes.mean_shift import MeanShiftOptions
+from reconstruction.light_codes.search import SearchOptions
+from reconstruction.orientation import LogGaborBank
+
+
+@dataclass(frozen=True)
+class LightCodeOptions:
+    """Options of line stereo and of what strings its segments together.
+
+    `volume_grid` metres are the voxels in which depths are bounded, at most `deepest` metres behind
+    where a ray enters the hair's volume. Segments count that at least `least_views` views found
+    alike, within `support_distance` metres and `support_angle_deg`. `thin` metres are the cells
+    that lines are averaged in before they are strung together. Segments count `field_weight` times
+    their confidence in an orientation field that both methods feed.
+    """
+
+    bank: LogGaborBank = LogGaborBank(count=32, spread=1.0)  # noqa: RUF009  frozen
+    volume_grid: float = 4e-3
+    deepest: float = 0.06
+    least_views: int = 3
+    support_distance: float = 1e-3
+    support_angle_deg: float = 10.0
+    thin: float = 3e-4
+    field_weight: float = 4.0
+    search: SearchOptions = SearchOptions()  # noqa: RUF009
+    mean_shift: MeanShiftOptions = MeanShiftOptions()  # noqa: RUF009
+    chains: ChainOptions = ChainOptions()  # noqa: RUF009
+    extension: ExtensionOptions = ExtensionOptions()  # noqa: RUF009
+
+
+DEFAULTS = LightCodeOptions()

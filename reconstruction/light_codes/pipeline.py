@@ -1,0 +1,142 @@
+"""From a capture's single-light frames to segments, and from segments to strands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture import Capture, CaptureError
+from reconstruction.light_codes.chains import chains
+from reconstruction.light_codes.depth_range import depth_range, hair_volume
+from reconstruction.light_codes.extension import extend, fewest_views
+from reconstruction.light_codes.from_capture import views_of
+from reconstruction.light_codes.lmvs import LmvsSearch
+from reconstruction.light_codes.mean_shift import mean_shift, thinned_lines
+from reconstruction.light_codes.options import DEFAULTS, LightCodeOptions
+from reconstruction.light_codes.search import DepthSearch
+from reconstruction.light_codes.segments import Segments, count_supports, to_segments
+from reconstruction.light_codes.views import View
+from reconstruction.masks import HairMask
+from reconstruction.mesh import Mesh
+from reconstruction.report import Progress, Report, silent
+
+Array = NDArray[np.float64]
+
+
+def measure_segments(
+    capture: Capture,
+    masks: Mapping[str, HairMask],
+    head: Mesh | None,
+    report: Report,
+    *,
+    method: Literal["photometric", "lmvs"] = "photometric",
+    options: LightCodeOptions = DEFAULTS,
+    bounds: Array | None = None,
+    progress: Progress = silent,
+) -> tuple[list[View], Segments]:
+    """The views, and the segments that `least_views` of them agree on.
+
+    Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
+    there are no two views of hair, or no segment is left.
+    """
+    cameras = [c for c in capture.rig.cameras if c.name in masks]
+    hair = {c.name: masks[c.name].hair for c in cameras}
+    subject = {c.name: masks[c.name].subject for c in cameras}
+    if not any(m.any() for m in hair.values()):
+        raise CaptureError(f"{capture.path}: no camera's mask holds hair: check the masks")
+    with report.stage("lightcodes") as stage:
+        try:
+            volume = hair_volume(cameras, subject, head, options.volume_grid, bounds)
+        except ValueError as error:
+            raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
+        if not volume.inside.any():
+            raise CaptureError(
+                f"{capture.path}: no volume is seen by enough cameras: check masks, head.obj and "
+                "poses"
+            )
+        center = volume.centers().mean(axis=0)
+        views = views_of(capture, hair, center, options.bank, stage, progress)
+    with report.stage("depth") as stage:
+        search = (
+            DepthSearch(views, center, options.search)
+            if method == "photometric"
+            else LmvsSearch(views, center, options.search)
+        )
+        maps = []
+        for k, view in enumerate(views):
+            progress("searching depths", k / len(views))
+            near, far = depth_range(view.camera, volume, options.deepest)
+            maps.append(search.run(k, near, far))
+        found = {v.camera.name: len(m.x) for v, m in zip(views, maps, strict=True)}
+        spreads = np.concatenate([m.spread for m in maps])
+        misfits = np.concatenate([m.misfit for m in maps])
+        agreements = np.concatenate([m.agreement for m in maps])
+        seen = np.concatenate([m.seen_by for m in maps])
+        stage.figures.update(
+            segments=found,
+            reference_pixels={v.camera.name: int(v.mask.sum()) for v in views},
+            visible_neighbours=float(seen.mean()) if len(seen) else 0.0,
+            agreement=_percentiles(agreements),
+            spread=_percentiles(spreads),
+            misfit=_percentiles(misfits),
+        )
+    with report.stage("segments") as stage:
+        segments = to_segments(views, maps)
+        segments = count_supports(
+            views,
+            maps,
+            segments,
+            distance=options.support_distance,
+            angle_deg=options.support_angle_deg,
+        )
+        supports = np.bincount(segments.supports, minlength=len(views) + 1)
+        kept = segments.subset(segments.supports >= options.least_views)
+        stage.figures.update(
+            found=len(segments),
+            kept=len(kept),
+            views_in_agreement={str(k): int(n) for k, n in enumerate(supports) if n},
+        )
+        if not len(kept):
+            raise CaptureError(
+                f"{capture.path}: no segment of {len(segments)} is found alike in "
+                f"{options.least_views} of {len(views)} views: more cameras with overlapping "
+                "views, sharper or finer pictures, or a lower least_views may help"
+            )
+    return views, kept
+
+
+def string_together(
+    views: list[View],
+    segments: Segments,
+    report: Report,
+    options: LightCodeOptions = DEFAULTS,
+) -> list[Array]:
+    """Polylines `(n, 3)` through the segments, with what grows from their tips."""
+    with report.stage("connection") as stage:
+        points, directions = mean_shift(
+            segments.points, segments.directions, segments.confidence, options.mean_shift
+        )
+        points, directions, _ = thinned_lines(points, directions, segments.confidence, options.thin)
+        found = chains(points, directions, options.chains)
+        grown = extend(views, found, options.extension)
+        stage.figures.update(
+            lines=len(points),
+            strands=len(found),
+            metres=_metres(found),
+            metres_extended=_metres(grown),
+            views_to_extend=fewest_views(len(views)),
+        )
+    return grown
+
+
+def _metres(polylines: list[Array]) -> float:
+    return float(sum(np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in polylines))
+
+
+def _percentiles(values: NDArray[np.floating]) -> dict[str, float]:
+    if not len(values):
+        return {}
+    return {f"p{q}": float(np.percentile(values, q)) for q in (10, 50, 90)}

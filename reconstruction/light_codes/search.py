@@ -1,0 +1,296 @@
+"""Depth by maximising agreement: two stages, then below a step (Sun §4.2.4 and §4.2.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.array_backend import array_types
+from reconstruction.light_codes.codes import unpack
+from reconstruction.light_codes.device_views import DeviceViews
+from reconstruction.light_codes.objective import (
+    Pixels,
+    agreement,
+    code_agreement,
+    line_through,
+)
+from reconstruction.light_codes.views import View, nearest_views
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+MOST_NEIGHBOURS = 31  # and the reference itself: their bits fill a word
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How depths are searched.
+
+    `step` metres between depths. `samples` points of a segment, `length` metres end to end, are
+    compared in up to `neighbours` nearest visible views. `candidates` depths of each pixel with the
+    best matching lightcodes go on to the full objective; 0 gives it all of them (brute force).
+    `least_confidence` of a pixel's line for it to be a reference. Segments whose planes' `spread`
+    is lower are dropped as nearly parallel, and those with a `misfit` above. `variant` as in
+    `array_backend.chosen_variant`.
+    """
+
+    step: float = 2.5e-4
+    samples: int = 25
+    length: float = 5e-3
+    neighbours: int = 16
+    candidates: int = 24
+    least_confidence: float = 0.1
+    least_spread: float = 0.05
+    most_misfit: float = 1.0
+    variant: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.step > 0 or not self.length > 0:
+            raise ValueError(f"step and length must be positive, got {self.step}, {self.length}")
+        if self.samples < 1 or not 1 <= self.neighbours <= MOST_NEIGHBOURS or self.candidates < 0:
+            raise ValueError(
+                f"need samples >= 1, 1 <= neighbours <= {MOST_NEIGHBOURS}, candidates >= 0, got "
+                f"{self.samples}, {self.neighbours}, {self.candidates}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """What the search found in one view, over its pixels `(P,)`, the reference pixels.
+
+    `x`, `y` integers; `depth` along the camera's axis, metres; `direction (P, 3)`; `agreement` in
+    [0, 1]; `spread` and `misfit` as in `objective.Line`; `seen_by` counts the visible neighbours.
+    """
+
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    depth: Floats
+    direction: Floats
+    agreement: Floats
+    spread: Floats
+    misfit: Floats
+    seen_by: NDArray[np.int64]
+
+
+class DepthSearch:
+    """Searches the depths of every view; holds all views on the device.
+
+    `subject (3,)` is the point by which views count as near one another.
+    """
+
+    def __init__(
+        self, views: Sequence[View], subject: Any, options: SearchOptions = SearchOptions()
+    ) -> None:
+        if len(views) < 2:
+            raise ValueError(f"line stereo needs at least two views of hair, got {len(views)}")
+        self.views, self.options = tuple(views), options
+        self.types = array_types(options.variant)
+        self.device = DeviceViews(self.types, views)
+        self.neighbours = nearest_views(views, subject, options.neighbours)
+
+    def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which neighbours see the pixels `(P, N)`: a light beside them lights the pixel.
+
+        A neighbour without a light beside it is taken to see what it stands near to.
+        """
+        own = self.views[view]
+        words = own.codes.words[y, x]
+        bits = unpack(words, 32 * words.shape[1])
+        sees = [
+            bits[:, b] if (b := self.views[k].beside) >= 0 else np.ones(len(x), bool)
+            for k in self.neighbours[view]
+        ]
+        return np.stack(sees, axis=1) if sees else np.zeros((len(x), 0), bool)
+
+    def pixels(
+        self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]
+    ) -> tuple[Pixels, NDArray[np.int64]]:
+        """The pixels as lanes, and how many neighbours see each `(P,)`."""
+        t, own = self.types, self.views[view]
+        visible = self.visible(view, y, x)
+        bits = np.left_shift(1, np.arange(1, visible.shape[1] + 1)).astype(np.uint32)
+        mask = (visible * bits).sum(axis=1, dtype=np.uint32) | np.uint32(1)
+        camera = own.camera
+        rays = camera.rays(np.stack([x, y], axis=1))
+        rays /= (rays @ camera.R[2])[:, None]
+        code = own.codes.words[y, x].T
+        order = np.array([view, *self.neighbours[view]], np.uint32)
+        lanes = Pixels(
+            t.Array3f(*(float(c) for c in camera.center)),
+            t.Array3f(*(t.Float(c.astype(np.float32)) for c in rays.T)),
+            [t.UInt32(np.ascontiguousarray(w)) for w in code],
+            dr.opaque(t.UInt32, view),
+            t.UInt32(order),
+            dr.opaque(t.UInt32, len(order)),
+            t.UInt32(mask),
+        )
+        return lanes, visible.sum(axis=1)
+
+    def run(self, view: int, near: Floats, far: Floats) -> DepthMap:
+        """Search the reference pixels of `view` between depths `near` and `far (H, W)`, metres.
+
+        Where `far` is not above `near` there is nothing to search, as off the mask.
+        """
+        own, options = self.views[view], self.options
+        asked = own.mask & (own.confidence >= options.least_confidence) & (far > near)
+        y, x = np.nonzero(asked)
+        if not len(x) or not self.neighbours[view]:
+            return _nothing()
+        pixels, seen_by = self.pixels(view, y, x)
+        start = near[y, x].astype(np.float32)
+        counts = np.ceil((far[y, x] - start) / options.step).astype(np.uint32) + 1
+        found = self.search(pixels, x, y, start, counts, view)
+        depth, direction, agree, spread, misfit = found
+        keep = (seen_by > 0) & (spread >= options.least_spread) & (misfit <= options.most_misfit)
+        keep &= agree > 0
+        return DepthMap(
+            *(a[keep] for a in (x, y, depth, direction, agree, spread, misfit, seen_by))
+        )
+
+    def search(
+        self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
+    ) -> tuple[Any, ...]:
+        """Depth, direction, agreement, spread and misfit of every lane, as numpy arrays.
+
+        Lane i tries `counts[i]` depths from `start[i]` on.
+        """
+        return _search(self.device, pixels, self.options, start, counts)
+
+
+def _nothing() -> DepthMap:
+    none, no = np.zeros(0, np.int64), np.zeros(0, np.float32)
+    return DepthMap(none, none, no, np.zeros((0, 3), np.float32), no, no, no, none)
+
+
+def _search(
+    device: DeviceViews,
+    pixels: Pixels,
+    options: SearchOptions,
+    start: Floats,
+    counts: NDArray[np.uint32],
+) -> tuple[Any, ...]:
+    t = device.types
+    near, number = t.Float(start), t.UInt32(counts)
+    step = dr.opaque(t.Float, options.step)
+    samples = dr.opaque(t.UInt32, options.samples)
+    apart = dr.opaque(t.Float, options.length / max(options.samples - 1, 1))
+    if options.candidates:
+        steps = best_codes(device, pixels, near, step, number, options.candidates)
+        score, best = best_of(device, pixels, near, step, steps, samples, apart)
+    else:
+        score, best = best_of_all(device, pixels, near, step, number, samples, apart)
+    dr.eval(score, best)
+    depth = near + step * t.Float(best)
+    before = worth(device, pixels, depth - step, samples, apart, t.Bool(True))[0]
+    after = worth(device, pixels, depth + step, samples, apart, t.Bool(True))[0]
+    bend = before - 2 * score + after
+    shift = dr.select(bend < 0, 0.5 * (before - after) / dr.minimum(bend, -1e-12), 0)
+    depth += step * dr.clip(shift, -0.5, 0.5)
+    agree, line = worth(device, pixels, depth, samples, apart, t.Bool(True))
+    dr.eval(depth, agree, line.direction, line.spread, line.misfit)
+    return (
+        depth.numpy(),
+        line.direction.numpy().T.copy(),
+        agree.numpy(),
+        line.spread.numpy(),
+        line.misfit.numpy(),
+    )
+
+
+def worth(
+    device: DeviceViews, pixels: Pixels, depth: Any, samples: Any, apart: Any, active: Any
+) -> tuple[Any, Any]:
+    """The agreement at `depth` and the line that has it."""
+    point = pixels.at(depth)
+    line = line_through(device, pixels, point, active)
+    return agreement(device, pixels, point, apart * line.direction, samples, active), line
+
+
+@dr.syntax
+def best_of_all(
+    device: DeviceViews, pixels: Pixels, near: Any, step: Any, number: Any, samples: Any, apart: Any
+) -> tuple[Any, Any]:
+    """The best agreement over all depths and its number: brute force."""
+    t = device.types
+    score, best = t.Float(-1), t.UInt32(0)
+    k = t.UInt32(0)
+    while k < number:
+        here = worth(device, pixels, near + step * t.Float(k), samples, apart, t.Bool(True))[0]
+        better = here > score
+        score = dr.select(better, here, score)
+        best = dr.select(better, k, best)
+        k += 1
+    return score, best
+
+
+@dr.syntax
+def best_codes(
+    device: DeviceViews, pixels: Pixels, near: Any, step: Any, number: Any, count: int
+) -> list[Any]:
+    """Numbers of the `count` depths whose lightcodes match best: an array for each rank."""
+    t = device.types
+    scores = [t.Float(-1) for _ in range(count)]
+    steps = [t.UInt32(0) for _ in range(count)]
+    k = t.UInt32(0)
+    while k < number:
+        here = code_agreement(device, pixels, pixels.at(near + step * t.Float(k)), t.Bool(True))
+        moved = k
+        for i in range(count):  # insertion into the sorted list, without a branch
+            better = here > scores[i]
+            old_score, old_step = scores[i], steps[i]
+            scores[i] = dr.select(better, here, old_score)
+            steps[i] = dr.select(better, moved, old_step)
+            here = dr.select(better, old_score, here)
+            moved = dr.select(better, old_step, moved)
+        k += 1
+    return steps
+
+
+def best_of(
+    device: DeviceViews,
+    pixels: Pixels,
+    near: Any,
+    step: Any,
+    steps: list[Any],
+    samples: Any,
+    apart: Any,
+) -> tuple[Any, Any]:
+    """The best agreement over the given depths and its number."""
+    t = device.types
+    dr.eval(steps)
+    width = dr.width(steps[0])
+    table = dr.concat(steps)
+    return _best_listed(
+        device, pixels, near, step, table, dr.opaque(t.UInt32, width), len(steps), samples, apart
+    )
+
+
+@dr.syntax
+def _best_listed(
+    device: DeviceViews,
+    pixels: Pixels,
+    near: Any,
+    step: Any,
+    table: Any,
+    width: Any,
+    count: int,
+    samples: Any,
+    apart: Any,
+) -> tuple[Any, Any]:
+    t = device.types
+    lane = dr.arange(t.UInt32, len(near))
+    score, best = t.Float(-1), t.UInt32(0)
+    i = t.UInt32(0)
+    while i < count:
+        k = dr.gather(t.UInt32, table, i * width + lane)
+        here = worth(device, pixels, near + step * t.Float(k), samples, apart, t.Bool(True))[0]
+        better = here > score
+        score = dr.select(better, here, score)
+        best = dr.select(better, k, best)
+        i += 1
+    return score, best

@@ -1,0 +1,116 @@
+"""Line segments in space, one for each pixel, and which of them other views confirm (Sun §4.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.light_codes.search import DepthMap
+from reconstruction.light_codes.views import View
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """`points (N, 3)`, unit `directions (N, 3)` whose sign means nothing, and their origin.
+
+    `confidence (N,)` in [0, 1] is the agreement of the views; `view (N,)` numbers the view that
+    each was found in, `supports (N,)` counts the views that agree with it, its own among them.
+    """
+
+    points: Array
+    directions: Array
+    confidence: Array
+    view: NDArray[np.int64]
+    supports: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def subset(self, which: Bools) -> Segments:
+        """The segments where `which (N,)`."""
+        return Segments(
+            self.points[which],
+            self.directions[which],
+            self.confidence[which],
+            self.view[which],
+            self.supports[which],
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write an `.npz` with the fields' names."""
+        np.savez_compressed(
+            path,
+            points=self.points.astype(np.float32),
+            directions=self.directions.astype(np.float32),
+            confidence=self.confidence.astype(np.float32),
+            view=self.view.astype(np.int16),
+            supports=self.supports.astype(np.int16),
+        )
+
+
+def to_segments(views: Sequence[View], maps: Sequence[DepthMap]) -> Segments:
+    """All segments of the views' depth maps; each is supported by its own view alone."""
+    points, directions, confidence, owner = [], [], [], []
+    for k, (view, found) in enumerate(zip(views, maps, strict=True)):
+        points.append(_lift(view, found))
+        directions.append(found.direction.astype(float))
+        confidence.append(found.agreement.astype(float))
+        owner.append(np.full(len(found.x), k, np.int64))
+    return Segments(
+        np.concatenate(points),
+        np.concatenate(directions),
+        np.concatenate(confidence),
+        np.concatenate(owner),
+        np.ones(sum(map(len, owner)), np.int64),
+    )
+
+
+def count_supports(
+    views: Sequence[View],
+    maps: Sequence[DepthMap],
+    segments: Segments,
+    *,
+    distance: float = 1e-3,
+    angle_deg: float = 10.0,
+) -> Segments:
+    """The segments with the number of views that agree: each counts itself and others like it.
+
+    Another view agrees where it found, within a pixel of where it would see the segment, one of
+    its own within `distance` metres and `angle_deg` of it.
+    """
+    supports = np.ones(len(segments), np.int64)
+    least = np.cos(np.radians(angle_deg))
+    start = 0
+    for k, (view, found) in enumerate(zip(views, maps, strict=True)):
+        index = np.full((view.camera.height + 2, view.camera.width + 2), -1, np.int64)
+        index[found.y + 1, found.x + 1] = start + np.arange(len(found.x))
+        start += len(found.x)
+        other = np.flatnonzero(segments.view != k)
+        pixels, depth = view.camera.project(segments.points[other])
+        on = (depth > 0) & view.camera.inside(pixels)
+        other, at = other[on], np.rint(pixels[on]).astype(np.int64)
+        agrees = np.zeros(len(other), bool)
+        for dy, dx in np.ndindex(3, 3):
+            j = index[at[:, 1] + dy, at[:, 0] + dx]
+            some = np.flatnonzero((j >= 0) & ~agrees)
+            i, j = other[some], j[some]
+            near = np.linalg.norm(segments.points[i] - segments.points[j], axis=1) <= distance
+            cosine = np.einsum("nk,nk->n", segments.directions[i], segments.directions[j])
+            agrees[some] = near & (np.abs(cosine) >= least)
+        supports[other[agrees]] += 1
+    return Segments(
+        segments.points, segments.directions, segments.confidence, segments.view, supports
+    )
+
+
+def _lift(view: View, found: DepthMap) -> Array:
+    rays = view.camera.rays(np.stack([found.x, found.y], axis=1))
+    rays /= (rays @ view.camera.R[2])[:, None]
+    return view.camera.center + rays * found.depth[:, None].astype(float)
