@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -62,24 +63,67 @@ class LogGaborBank:
     def responses(self, images: Images) -> NDArray[np.float32]:
         """Magnitudes `(count, H, W)` of the answers to an image `(H, W)`, mirrored at its edges.
 
-        Of a stack `(N, H, W)`, the sum of the magnitudes: one pass over the filters serves all.
+        Of a stack `(N, H, W)`, the sum of the magnitudes.
         """
         images = np.asarray(images, np.float32)
         stack = images[None] if images.ndim == 2 else images
-        shape = stack.shape[1:]
+        out = np.zeros((self.count, *stack.shape[1:]), np.float32)
+        one = np.empty_like(out)
+        for image in stack:
+            self.answer(image, one)
+            out += one
+        return out
+
+    def answer(self, image: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+        """Write the magnitudes `(count, H, W)` of the answers to one image into `out`.
+
+        A filter's frequencies lie in a narrow wedge: only its rows (or columns, if these are fewer)
+        are transformed first, and of the result only what lies on the image.
+        """
+        shape = image.shape
         margin = int(
             min(4 * self.wavelength * max(1.0, self.count / (np.pi * self.spread * 6)), 48)
         )
         mode: Literal["reflect", "edge"] = "reflect" if min(shape) > margin else "edge"
-        padded = np.pad(stack, [(0, 0), (margin, margin), (margin, margin)], mode=mode)
-        h, w = (fft.next_fast_len(n) for n in padded.shape[1:])
-        spectra = fft.fft2(padded, (h, w), workers=-1)
-        out = np.empty((self.count, *shape), np.float32)
-        inner = (..., slice(margin, margin + shape[0]), slice(margin, margin + shape[1]))
-        for k, transfer in enumerate(self.filters(h, w)):
-            answers = fft.ifft2(spectra * transfer, overwrite_x=True, workers=-1)
-            out[k] = np.abs(answers[inner]).sum(axis=0)
-        return out
+        padded = np.pad(image, margin, mode=mode)
+        h, w = (fft.next_fast_len(n) for n in padded.shape)
+        spectrum = fft.fft2(padded, (h, w))
+        inner = tuple(slice(margin, margin + n) for n in shape)
+        for k, (axis, lines, transfer) in enumerate(_wedges(self, h, w)):
+            some = spectrum.take(lines, axis=1 - axis) * transfer
+            some = fft.ifft(some, axis=axis, overwrite_x=True)
+            across = (slice(None), inner[1]) if axis == 1 else (inner[0], slice(None))
+            full = np.zeros((h, shape[1]) if axis == 1 else (shape[0], w), np.complex64)
+            if axis == 1:
+                full[lines] = some[across]
+                answer = fft.ifft(full, axis=0, overwrite_x=True)[inner[0]]
+            else:
+                full[:, lines] = some[across]
+                answer = fft.ifft(full, axis=1, overwrite_x=True)[:, inner[1]]
+            np.abs(answer, out=out[k])
+
+
+_NEGLIGIBLE = 1e-6
+"""Of a filter's peak: what lies below is single precision's rounding."""
+
+
+@lru_cache(maxsize=4)
+def _wedges(
+    bank: LogGaborBank, height: int, width: int
+) -> list[tuple[int, NDArray[np.int64], NDArray[np.float32]]]:
+    """Each filter's axis to transform first, the lines along it that are not 0, and their values.
+
+    Axis 1 has rows `(R, width)`, axis 0 columns `(height, C)`.
+    """
+    out = []
+    for transfer in bank.filters(height, width):
+        there = transfer > _NEGLIGIBLE * transfer.max()
+        rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+        if len(rows) * width <= len(columns) * height:
+            out.append((1, rows, transfer[rows]))
+        else:
+            out.append((0, columns, np.ascontiguousarray(transfer[:, columns])))
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +173,10 @@ def orientations(
         )
     total = np.zeros(mask.shape, np.complex128)
     weight = np.zeros(mask.shape)
+    responses = np.empty((bank.count, *mask.shape), np.float32)
     for image in images:
-        responses = bank.responses(texture(image, mask))
-        angle, confidence = _winner(responses)
-        strength = responses.max(axis=0).astype(float)
+        bank.answer(texture(image, mask), responses)
+        angle, confidence, strength = _winner(responses)
         total += strength * confidence * np.exp(2j * angle)
         weight += strength
     confidence = np.abs(total) / np.maximum(weight, 1e-12)
@@ -143,19 +187,26 @@ def orientations(
     )
 
 
-def _winner(responses: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Angle of the strongest answer, refined below a bin, and the confidence; both `(H, W)`."""
+def _winner(
+    responses: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Angle of the strongest answer, refined below a bin, confidence and strength; each `(H, W)`."""
     count = len(responses)
-    best = responses.argmax(axis=0)
-    left, mid, right = (
+    peak = responses[0].copy()
+    best = np.zeros(peak.shape, np.int64)
+    for k in range(1, count):
+        higher = responses[k] > peak
+        np.copyto(peak, responses[k], where=higher)
+        np.copyto(best, k, where=higher)
+    left, right = (
         np.take_along_axis(responses, ((best + s) % count)[None], axis=0)[0].astype(float)
-        for s in (-1, 0, 1)
+        for s in (-1, 1)
     )
-    bend = left - 2 * mid + right
+    bend = left - 2.0 * peak + right
     shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
     angle = (best + np.clip(shift, -0.5, 0.5)) * np.pi / count
-    phase = np.exp(2j * np.pi * np.arange(count) / count)
-    total = np.tensordot(phase, responses, axes=1)
-    strength = responses.sum(axis=0, dtype=float)
-    said = responses.max(axis=0) > _FAINTEST
-    return angle, np.where(said, np.abs(total) / np.maximum(strength, 1e-12), 0.0)
+    phase = 2 * np.pi * np.arange(count) / count
+    waves = np.stack([np.cos(phase), np.sin(phase), np.ones(count)]).astype(np.float32)
+    real, imaginary, strength = (waves @ responses.reshape(count, -1)).reshape(3, *peak.shape)
+    share = np.hypot(real, imaginary) / np.maximum(strength, 1e-12)
+    return angle, np.where(peak > _FAINTEST, share, 0.0).astype(float), peak.astype(float)
