@@ -38,6 +38,7 @@ from reconstruction.root_map import save_root_map
 from reconstruction.rooting import root_all
 from reconstruction.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.segmentation import Network
+from reconstruction.straightened import as_shot, straightened
 from reconstruction.strand_files import write_strands
 from reconstruction.strands import Strands
 from reconstruction.visual_hull import VoxelGrid, visual_hull
@@ -107,15 +108,11 @@ def reconstruct(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
-    whole, capture = capture, _without(capture, options.held_out)
-    if bent := [c.name for c in capture.rig.cameras if c.distorted]:
-        raise CaptureError(
-            f"{capture.path}: the lenses of {bent} bend lines, and the reconstruction takes them "
-            "for straight: undistort the frames first and leave distortion out of rig.json"
-        )
     model = Path(model)
     (model / "masks").mkdir(parents=True, exist_ok=True)
     report = Report.load(model / "report.json")
+    whole = straightened(capture, report)
+    capture = _without(whole, options.held_out)
     head, fitted = capture.head, _digitised_head(capture, model, options, report)
     if fitted is not None:
         head = fitted.mesh
@@ -131,7 +128,7 @@ def reconstruct(
             stage.figures["network"] = network.to_dict()
         for name, mask in every.items():
             for kind, pixels in (("hair", mask.hair), ("skin", mask.skin)):
-                image = pixels.astype(np.uint8) * 255
+                image = as_shot(whole, name, pixels).astype(np.uint8) * 255
                 cv2.imwrite(str(model / "masks" / f"{name}_{kind}.png"), image)
         masks = {k: m for k, m in every.items() if k not in options.held_out}
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}

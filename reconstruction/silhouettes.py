@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from reconstruction.capture import Capture, Step
+from reconstruction.straightened import StraightenedCapture
 
 NOISE_FACTOR = 5.0
 FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light, even without noise
@@ -71,6 +72,8 @@ def silhouette(capture: Capture, camera: str) -> NDArray[np.bool_]:
 
     Raises `NoSilhouette` where the camera has no frame to tell from.
     """
+    if isinstance(capture, StraightenedCapture):  # resampled, the faintest light spreads by a pixel
+        return capture.straight(camera, silhouette(capture.source, camera))
     image = lit_image(capture, camera)
     positive = image[image > 0]
     bright = float(np.percentile(positive, 95)) if positive.size else 0.0
