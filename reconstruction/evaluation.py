@@ -8,24 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from reconstruction.cameras import Camera
 from reconstruction.mesh import Mesh
+from reconstruction.oriented_points import Block, Drawn, OrientedPoints, near_pairs
 from reconstruction.strands import Strands
 from reconstruction.visibility import Visibility
 
-Array = NDArray[np.floating]
 Bool = NDArray[np.bool_]
-
-STEP = 1e-3
-"""Metres between the points that both sets are resampled to."""
-
-MOST_PAIRS = 4_000_000
-"""Neighbour pairs that are looked at together: bounds the memory, not the answer."""
-
-OVERSAMPLING = 5
-"""Points that are tested for visibility, for each visible one that is wanted."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +35,115 @@ class Threshold:
 THRESHOLDS = (Threshold(1e-3, 10.0), Threshold(2e-3, 20.0), Threshold(3e-3, 30.0))
 
 
+class Matches:
+    """For each threshold, which of the `drawn (n,)` points match a point shown so far.
+
+    `found (T, n)` takes tangents as lines, `directed (T, n)` as arrows from root to tip.
+    """
+
+    def __init__(self, drawn: Drawn) -> None:
+        self.drawn = drawn
+        self.found = np.zeros((len(THRESHOLDS), len(drawn.points)), bool)
+        self.directed = np.zeros_like(self.found)
+
+    def look(self, block: Block) -> None:
+        """Match what has no match yet with the points of `block`."""
+        for k, threshold in enumerate(THRESHOLDS):
+            todo = np.flatnonzero(~self.directed[k])  # a directed match is an undirected one
+            for i, j in near_pairs(self.drawn.points[todo], block, threshold.distance):
+                a, b = self.drawn.tangents[todo[i]], block.tangents[j]
+                cosine = np.einsum("nk,nk->n", a, b)
+                least = np.cos(np.radians(threshold.angle))
+                # what matches narrowly matches widely
+                self.found[k:, todo[i[np.abs(cosine) > least]]] = True
+                self.directed[k:, todo[i[cosine > least]]] = True
+
+
+def scores(
+    precision: Matches,
+    recall: Matches,
+    *,
+    directed: bool = False,
+    predicted: Bool | None = None,
+    true: Bool | None = None,
+) -> dict[str, dict[str, float]]:
+    """Precision, recall and F at each threshold, as `compare_strands` returns them.
+
+    With `predicted (n,)` and `true (m,)` only of those of the drawn points.
+    """
+    out = {}
+    for k, threshold in enumerate(THRESHOLDS):
+        p, dp = _share(precision, k, directed, predicted)
+        r, dr = _share(recall, k, directed, true)
+        out[threshold.name] = {
+            "precision": p,
+            "recall": r,
+            "f": 2 * p * r / (p + r) if p + r > 0 else 0.0,
+            "precision_error": dp,
+            "recall_error": dr,
+        }
+    return out
+
+
+def _share(matches: Matches, k: int, directed: bool, among: Bool | None) -> tuple[float, float]:
+    """The share of points that match, and its standard error by sampling: 0 if all are scored."""
+    found = (matches.directed if directed else matches.found)[k]
+    found = found if among is None else found[among]
+    n = len(found)
+    share = float(found.mean()) if n else 0.0
+    sampled = n > 1 and not matches.drawn.complete
+    return share, float(np.sqrt(share * (1 - share) / (n - 1))) if sampled else 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Matches of both sets: points drawn from all, and from what cameras see."""
+
+    all: tuple[Matches, Matches]
+    visible: tuple[Matches, Matches] | None
+
+    @property
+    def of_predicted(self) -> list[Matches]:
+        """Those that have to be shown the truth."""
+        return [pair[0] for pair in (self.visible, self.all) if pair]
+
+    @property
+    def of_truth(self) -> list[Matches]:
+        """Those that have to be shown the prediction."""
+        return [pair[1] for pair in (self.visible, self.all) if pair]
+
+    def figures(self) -> dict[str, Any]:
+        """What `compare_strands` returns."""
+        parts = {"visible": self.visible, "all": self.all}
+        there = {name: pair for name, pair in parts.items() if pair}
+        return {
+            **{name: scores(*pair) for name, pair in there.items()},
+            "directed": {name: scores(*pair, directed=True) for name, pair in there.items()},
+        }
+
+
+def draw(
+    predicted: OrientedPoints,
+    truth: OrientedPoints,
+    *,
+    seed: int = 0,
+    samples: int | None = 40_000,
+    visibility: Visibility | None = None,
+) -> Comparison:
+    """Draw the points to compare; nothing is matched yet. Raises as `compare_strands` does."""
+    if truth.count == 0:
+        raise ValueError("there are no true strands to compare with")
+    rng = np.random.default_rng(seed)
+    visible = None
+    if visibility is not None:
+        seen = truth.draw(samples, rng, visibility)
+        if not len(seen.points):
+            raise ValueError("no camera sees any of the true strands: are they in one frame?")
+        visible = Matches(predicted.draw(samples, rng, visibility)), Matches(seen)
+    everything = Matches(predicted.draw(samples, rng)), Matches(truth.draw(samples, rng))
+    return Comparison(everything, visible)
+
+
 def compare_strands(
     pred: Strands,
     true: Strands,
@@ -62,141 +161,31 @@ def compare_strands(
     share of predicted points that match a true one, recall the share of true points that match a
     predicted one, F their harmonic mean.
 
-    Returns `{"visible": scores, "all": scores}`, or `{"all": scores}` without `cameras`. Visible
-    precision scores the visible predictions against all of the truth, visible recall the visible
-    truth against all predictions; visible is what is not hidden from every camera by the true
-    strands or the `head` by more than 1 mm. `scores` maps `1mm_10deg`, `2mm_20deg`, `3mm_30deg` to
-    `{"precision", "recall", "f", "precision_error", "recall_error"}`.
+    Returns `{"visible": scores, "all": scores, "directed": {"visible": scores, "all": scores}}`,
+    without the visible ones where there are no `cameras`. Visible precision scores the visible
+    predictions against all of the truth, visible recall the visible truth against all predictions;
+    visible is what is not hidden from every camera by the true strands or the `head` by more than
+    1 mm. Directed ones compare tangents as arrows from root to tip. `scores` maps `1mm_10deg`,
+    `2mm_20deg`, `3mm_30deg` to `{"precision", "recall", "f", "precision_error", "recall_error"}`.
 
     At most `samples` points of each set are scored (all of them for None), drawn by `seed`, always
     against the whole other set; the `_error`s are the standard errors that this leaves. Without
     predicted points to score, precision is 0. To score several predictions of one truth, make its
     `Visibility` once and hand it over.
 
-    Raises `ValueError` when there is no true strand, or no camera sees a true point.
+    Raises `ValueError` when there is no true strand, no camera sees a true point, or strands are
+    so long that they cannot be in metres.
     """
-    if len(true) == 0:
-        raise ValueError("there are no true strands to compare with")
-    rng = np.random.default_rng(seed)
-    predicted, truth = _Oriented(pred), _Oriented(true)
-    out: dict[str, Any] = {}
-    if cameras is not None:
-        sees = visibility if visibility is not None else Visibility(cameras, true, head)
-        seen_truth = truth.draw(samples, rng, sees)
-        if not seen_truth.chosen.size:
-            raise ValueError("no camera sees any of the true strands: are they in one frame?")
-        out["visible"] = _scores(
-            predicted.match(truth, predicted.draw(samples, rng, sees)),
-            truth.match(predicted, seen_truth),
-        )
-    out["all"] = _scores(
-        predicted.match(truth, predicted.draw(samples, rng)),
-        truth.match(predicted, truth.draw(samples, rng)),
+    predicted, truth = OrientedPoints(pred), OrientedPoints(true)
+    if cameras is not None and visibility is None:
+        visibility = Visibility(cameras, true, head)
+    comparison = draw(
+        predicted,
+        truth,
+        seed=seed,
+        samples=samples,
+        visibility=visibility if cameras is not None else None,
     )
-    return out
-
-
-@dataclass(frozen=True)
-class _Draw:
-    """Points to score: indices `chosen (n,)`, and whether they are all that there are to score."""
-
-    chosen: NDArray[np.int64]
-    complete: bool
-
-
-@dataclass(frozen=True)
-class _Matches:
-    """For each threshold, which of the scored points match `(T, n)`."""
-
-    found: Bool
-    complete: bool
-
-    def share(self) -> list[float]:
-        n = self.found.shape[1]
-        return [float(row.mean()) if n else 0.0 for row in self.found]
-
-    def error(self) -> list[float]:
-        """Standard error of `share` by sampling; 0 where all points were scored."""
-        n = self.found.shape[1]
-        if self.complete or n < 2:
-            return [0.0] * len(self.found)
-        return [float(np.sqrt(p * (1 - p) / (n - 1))) for p in self.share()]
-
-
-class _Oriented:
-    """Points with unit tangents at `STEP`, and a tree to find them by."""
-
-    def __init__(self, strands: Strands) -> None:
-        strands = strands.resampled(STEP)
-        self.points, self.tangents = strands.points, strands.tangents()
-        self.tree = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
-
-    def draw(
-        self, samples: int | None, rng: np.random.Generator, sees: Visibility | None = None
-    ) -> _Draw:
-        """At most `samples` of the points, or of those that `sees` says are visible."""
-        count = len(self.points)
-        if samples is None:
-            samples = count
-        tried = count if sees is None else min(count, OVERSAMPLING * samples)
-        chosen = np.arange(count)
-        if tried < count:
-            chosen = rng.choice(count, tried, replace=False)
-        if sees is not None:
-            chosen = chosen[sees(self.points[chosen])]
-        complete = tried == count and len(chosen) <= samples
-        if len(chosen) > samples:
-            chosen = rng.choice(chosen, samples, replace=False)
-        return _Draw(np.sort(chosen), complete)
-
-    def match(self, other: _Oriented, draw: _Draw) -> _Matches:
-        """Match the drawn points with `other`."""
-        which = draw.chosen
-        found = np.zeros((len(THRESHOLDS), len(which)), bool)
-        todo = np.arange(len(which) if len(other.points) else 0)
-        for k, threshold in enumerate(THRESHOLDS):
-            hit = self._near(other, which[todo], threshold)
-            found[k:, todo[hit]] = True  # what matches narrowly matches widely
-            todo = todo[~hit]
-        return _Matches(found, draw.complete)
-
-    def _near(self, other: _Oriented, which: NDArray[np.int64], threshold: Threshold) -> Bool:
-        """Which of the points `which` have a match in `other`."""
-        out = np.zeros(len(which), bool)
-        if len(which) == 0:
-            return out
-        points, reach = self.points[which], threshold.distance
-        near = other.tree.query_ball_point(points, reach, return_length=True, workers=-1)
-        part = np.cumsum(near) // MOST_PAIRS
-        for k in np.unique(part):
-            chunk = np.flatnonzero((part == k) & (near > 0))
-            if len(chunk) == 0:
-                continue
-            pairs = cKDTree(points[chunk]).sparse_distance_matrix(
-                other.tree, reach, output_type="ndarray"
-            )
-            a, b = self.tangents[which[chunk[pairs["i"]]]], other.tangents[pairs["j"]]
-            cosine = np.abs(np.einsum("nk,nk->n", a, b))
-            out[chunk[pairs["i"][cosine > np.cos(np.radians(threshold.angle))]]] = True
-        return out
-
-
-def _scores(precision: _Matches, recall: _Matches) -> dict[str, dict[str, float]]:
-    rows = zip(
-        THRESHOLDS,
-        precision.share(),
-        recall.share(),
-        precision.error(),
-        recall.error(),
-        strict=True,
-    )
-    return {
-        t.name: {
-            "precision": p,
-            "recall": r,
-            "f": 2 * p * r / (p + r) if p + r > 0 else 0.0,
-            "precision_error": dp,
-            "recall_error": dr,
-        }
-        for t, p, r, dp, dr in rows
-    }
+    truth.show(*comparison.of_predicted)
+    predicted.show(*comparison.of_truth)
+    return comparison.figures()

@@ -32,13 +32,15 @@ def plot_report(report: Report, folder: str | Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     out: list[Path] = []
     if report.stages:
-        out.append(_save(_seconds(report.stages), folder / "seconds.png"))
+        out.append(save_figure(_seconds(report.stages), folder / "seconds.png"))
     for stage in report.stages:
         drawn = [s for s in stage.series if any(e > 0 for _, e in s.points)]
         if drawn:
-            out.append(_save(_errors(stage.name, drawn), folder / f"error_{_slug(stage.name)}.png"))
+            out.append(
+                save_figure(_errors(stage.name, drawn), folder / f"error_{_slug(stage.name)}.png")
+            )
     if any(stage.left_out or stage.warnings for stage in report.stages):
-        out.append(_save(_left_out(report.stages), folder / "left_out.png"))
+        out.append(save_figure(_left_out(report.stages), folder / "left_out.png"))
     return out
 
 
@@ -77,19 +79,19 @@ def plot_geometry(results: Mapping[str, Mapping[str, Any]], path: str | Path) ->
             axes.set_xticks(range(len(names)), [_threshold(t) for t in names])
             axes.set_ylim(0, 1.08)
             axes.set_yticks([0, 0.5, 1], ["0", "50 %", "100 %"])
-            _clean(axes, grid_axis="y")
+            clean_axes(axes, grid_axis="y")
             if r == 0:
-                axes.set_title("F" if measure == "f" else measure.capitalize(), **_TITLE)
+                axes.set_title("F" if measure == "f" else measure.capitalize(), **TITLE)
         row[0].set_ylabel(f"{part} strands", color=INK)
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside lower center", ncols=len(results), frameon=False, fontsize=9
     )
-    return _save(figure, Path(path))
+    return save_figure(figure, Path(path))
 
 
 _BOLD: dict[str, Any] = {"fontweight": "bold", "color": INK}
-_TITLE: dict[str, Any] = {"loc": "left", "fontsize": 11, **_BOLD}
+TITLE: dict[str, Any] = {"loc": "left", "fontsize": 11, **_BOLD}
 
 
 def _seconds(stages: Sequence[Stage]) -> Figure:
@@ -112,8 +114,8 @@ def _seconds(stages: Sequence[Stage]) -> Figure:
     axes.set_yticks(rows, [_words(s.name) for s in stages])
     axes.set_xlim(0, 1.18 * max(float(seconds.max()), 1e-9))
     axes.set_xlabel("seconds", color=QUIET)
-    axes.set_title(f"Time per stage, {_duration(total)} in all", **_TITLE)
-    _clean(axes, grid_axis="x")
+    axes.set_title(f"Time per stage, {_duration(total)} in all", **TITLE)
+    clean_axes(axes, grid_axis="x")
     axes.tick_params(axis="y", colors=INK)
     return figure
 
@@ -148,7 +150,7 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
         axes.set_yscale("log")
         axes.set_xlabel("seconds", color=QUIET)
         axes.set_ylabel(_words(kind), color=QUIET)
-        _clean(axes, grid_axis="both")
+        clean_axes(axes, grid_axis="both")
         axes.legend(frameon=False, fontsize=9, labelcolor=INK)
     for axes in grid[len(kinds) :]:
         axes.remove()
@@ -204,7 +206,8 @@ def _left_out(stages: Sequence[Stage]) -> Figure:
     return figure
 
 
-def _clean(axes: Axes, grid_axis: Any) -> None:
+def clean_axes(axes: Axes, grid_axis: Any) -> None:
+    """Take away what carries no figure; faint lines across `grid_axis` (x, y or both)."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
     axes.tick_params(colors=QUIET, labelsize=9, length=0, which="both")
@@ -231,7 +234,8 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a PNG, whole or not at all, and return its path."""
     FigureCanvasAgg(figure)
     temporary = path.with_name(path.name + ".part")
     figure.savefig(temporary, format="png", dpi=130, facecolor="white")

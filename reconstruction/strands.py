@@ -120,29 +120,45 @@ class Strands:
 
         Strands of no length keep their two end points. A per-point radius is interpolated.
         """
+        every = Resampling(self, step)
+        points, radius = every(np.arange(every.offsets[-1]))
+        return Strands(points, every.offsets, radius)
+
+
+class Resampling:
+    """The points of `strands.resampled(step)`, any of them, without making the others.
+
+    `offsets (S + 1,)` are those of the resampled strands.
+    """
+
+    def __init__(self, strands: Strands, step: float) -> None:
         if not step > 0:
             raise ValueError(f"step must be positive, got {step}")
-        if len(self) == 0:
-            return self
-        p = self.points.astype(float)
-        starts = self.segment_starts
+        self.strands = strands
+        p, starts = strands.points, strands.segment_starts
         arc = np.zeros(len(p))
-        arc[starts + 1] = np.linalg.norm(p[starts + 1] - p[starts], axis=1)
-        arc = np.cumsum(arc)  # one growing coordinate over all strands: interpolate only once
-        lengths = self.lengths()
-        counts = np.maximum(np.ceil(lengths / step).astype(np.int64), 1) + 1
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        k = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts)
-        strand = np.repeat(np.arange(len(self)), counts)
-        s = arc[self.offsets[:-1]][strand] + lengths[strand] * (k / (counts[strand] - 1))
-        low, high = self.offsets[:-1][strand], self.offsets[1:][strand] - 2
+        arc[starts + 1] = np.linalg.norm(p[starts + 1].astype(float) - p[starts], axis=1)
+        self._arc = np.cumsum(arc)  # one growing coordinate over all strands: interpolate only once
+        self._lengths = strands.lengths()
+        counts = np.maximum(np.ceil(self._lengths / step).astype(np.int64), 1) + 1
+        self.offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+    def __call__(
+        self, index: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], float | NDArray[np.float32]]:
+        """Points `(n, 3)` at `index (n,)` among all the resampled ones, and their radius."""
+        p, offsets, arc = self.strands.points, self.strands.offsets, self._arc
+        strand = np.searchsorted(self.offsets, index, side="right") - 1
+        last = np.diff(self.offsets)[strand] - 1
+        k = index - self.offsets[strand]
+        s = arc[offsets[strand]] + self._lengths[strand] * (k / last)
+        low, high = offsets[strand], offsets[strand + 1] - 2
         left = np.clip(np.searchsorted(arc, s, side="right") - 1, low, high)
         span = arc[left + 1] - arc[left]
         w = np.clip(np.divide(s - arc[left], span, out=np.zeros_like(s), where=span > 0), 0, 1)
-        end = k == counts[strand] - 1
-        left, w = np.where(end, high, left), np.where(end, 1.0, w)
-        points = p[left] * (1 - w)[:, None] + p[left + 1] * w[:, None]
-        radius = self.radius
+        left, w = np.where(k == last, high, left), np.where(k == last, 1.0, w)
+        points = (p[left] * (1 - w)[:, None] + p[left + 1] * w[:, None]).astype(np.float32)
+        radius = self.strands.radius
         if isinstance(radius, np.ndarray):
             radius = (radius[left] * (1 - w) + radius[left + 1] * w).astype(np.float32)
-        return Strands(points.astype(np.float32), offsets, radius)
+        return points, radius

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from reconstruction.cameras import Camera
 from reconstruction.envelope import surface_samples
 from reconstruction.mesh import Mesh
-from reconstruction.strands import Strands
+from reconstruction.strands import Resampling, Strands
 
 Single = NDArray[np.float32]
 Points = NDArray[np.floating]
@@ -35,10 +35,14 @@ class Visibility:
     def __init__(self, cameras: Sequence[Camera], strands: Strands, head: Mesh | None = None):
         width = 2 * float(np.median(strands.radius)) if len(strands) else NARROWEST
         pixel = float(np.clip(width, NARROWEST, WIDEST))
-        dense = strands.resampled(pixel).points
-        self._buffers = [_DepthBuffer(camera, dense, pixel) for camera in cameras]
-        for buffer in self._buffers:
-            buffer.splat(dense)
+        dense = Resampling(strands, pixel)
+        count = int(dense.offsets[-1])
+        some, _ = dense(np.arange(0, count, max(1, count // 500_000)))
+        self._buffers = [_DepthBuffer(camera, some, pixel) for camera in cameras]
+        for first in range(0, count if self._buffers else 0, CHUNK):
+            points, _ = dense(np.arange(first, min(first + CHUNK, count)))
+            for buffer in self._buffers:
+                buffer.splat(points)
         if head is None or not self._buffers:
             return
         covering = np.any([b.over(head) for b in self._buffers], axis=0)
@@ -63,7 +67,7 @@ class _DepthBuffer:
 
     def __init__(self, camera: Camera, strands: Points, pixel: float) -> None:
         self.camera = camera
-        pixels, depth = camera.project(strands[:: max(1, len(strands) // 500_000)])
+        pixels, depth = camera.project(strands)
         front = depth > 1e-6
         self.scale, self.low, self.shape, self.span = 1.0, np.zeros(2), (1, 1), pixel
         if front.any():

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from reconstruction import oriented_points
 from reconstruction.cameras import Camera
 from reconstruction.evaluation import compare_strands
 from reconstruction.mesh import Mesh
+from reconstruction.oriented_points import OrientedPoints
 from reconstruction.strands import Strands
 from reconstruction.visibility import Visibility
 
@@ -67,10 +69,25 @@ def test_angles(angle: float, expected: tuple[int, int, int]) -> None:
     assert tuple(scores[n]["precision"] for n in NAMES) == expected
 
 
-def test_direction_of_travel_does_not_count() -> None:
+def test_direction_of_travel_counts_only_where_it_is_asked_for(front: Camera) -> None:
     true = curtain()
     flipped = Strands.from_list([true[i][::-1] for i in range(len(true))])
-    assert compare_strands(flipped, true)["all"]["1mm_10deg"]["f"] == 1.0
+    scores = compare_strands(flipped, true, cameras=[front])
+    for part in ("visible", "all"):
+        for name in NAMES:
+            assert scores[part][name]["f"] == 1.0
+            assert scores["directed"][part][name]["f"] == 0.0
+    same = compare_strands(true, true, cameras=[front])
+    assert same["directed"] == {part: same[part] for part in ("visible", "all")}
+
+
+def test_half_of_the_strands_upside_down() -> None:
+    true = curtain()
+    n = len(true)
+    pred = Strands.from_list([true[i][:: -1 if i < 10 else 1] for i in range(n)])
+    scores = compare_strands(pred, true)
+    assert scores["all"]["1mm_10deg"]["f"] == 1.0
+    assert scores["directed"]["all"]["1mm_10deg"]["precision"] == pytest.approx((n - 10) / n)
 
 
 def test_any_point_within_reach_may_match() -> None:
@@ -118,6 +135,50 @@ def test_sampling_is_within_its_error_and_repeats() -> None:
     for key in ("precision", "recall"):
         assert abs(some[key] - exact[key]) < 4 * some[f"{key}_error"] + 1e-12
     assert compare_strands(pred, true, samples=500, seed=3)["all"]["1mm_10deg"] == some
+
+
+def test_any_number_of_blocks_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = curtain(spacing=1e-3)
+    pred = moved(curtain(spacing=2e-3, tilt_deg=4), (0, 8e-4, 0))
+    whole = compare_strands(pred, true, samples=1500)
+    assert 0.1 < whole["all"]["1mm_10deg"]["precision"] < 0.99
+    for block in (1, 150, 2000):
+        monkeypatch.setattr(oriented_points, "BLOCK", block)
+        assert compare_strands(pred, true, samples=1500) == whole
+        monkeypatch.setattr(oriented_points, "MOST_PAIRS", 50)
+    assert compare_strands(pred, true, samples=1500) == whole
+
+
+def test_points_are_those_of_the_resampled_strands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oriented_points, "BLOCK", 500)
+    strands = curtain(tilt_deg=3)
+    points, expected = OrientedPoints(strands), strands.resampled(1e-3)
+    blocks = list(points.blocks())
+    assert len(blocks) > 2
+    np.testing.assert_array_equal(np.concatenate([b.points for b in blocks]), expected.points)
+    tangents = np.concatenate([b.tangents for b in blocks])
+    np.testing.assert_array_equal(tangents, expected.tangents())
+    some = points.of_strands(np.array([7, 2]))
+    wanted = expected.subset([7, 2])
+    np.testing.assert_array_equal(some.points, wanted.points)
+    np.testing.assert_allclose(some.tangents, wanted.tangents(), atol=1e-6)
+    assert set(some.strand) == {2, 7}
+
+
+def test_strands_of_no_length_match_nothing() -> None:
+    true = curtain()
+    still = Strands(np.repeat(true.roots, 2, axis=0), 2 * np.arange(len(true) + 1))
+    scores = compare_strands(still, true)["all"]["3mm_30deg"]
+    assert scores["precision"] == scores["recall"] == scores["f"] == 0.0
+
+
+def test_strands_in_another_unit_are_refused_before_they_fill_the_memory() -> None:
+    huge = Strands(curtain().points * np.float32(1e6), curtain().offsets).subset([0, 1])
+    with pytest.raises(ValueError, match=r"longest strand is 60,\d+ m .*in metres"):
+        compare_strands(huge, curtain())
+    many = Strands.from_list([np.array([[0, 0, 0], [0, 0, 900.0]])] * 400)
+    with pytest.raises(ValueError, match=r"360 km long together.*in metres"):
+        compare_strands(many, curtain())
 
 
 def test_what_hangs_behind_strands_is_hidden(front: Camera) -> None:

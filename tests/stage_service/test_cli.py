@@ -149,13 +149,56 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
     write_strands(tmp_path / "half.npz", Strands.from_list(strands[:1]))
     code, data = run(capsys, "evaluate", "geometry", tmp_path / "half.npz", tmp_path / "true.npz")
     assert code == 0
-    assert set(data) == {"all"}
+    assert "visible" not in data
     assert set(data["all"]) == {"1mm_10deg", "2mm_20deg", "3mm_30deg"}
     figures = data["all"]["1mm_10deg"]
     assert figures["precision"] == 1.0
     assert figures["recall"] == pytest.approx(0.5, abs=0.02)
     assert main(["evaluate", "geometry", *[str(tmp_path / "true.npz")] * 2]) == 0
-    assert "100.0 / 100.0 / 100.0" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert printed.count("100.0 / 100.0 / 100.0") >= 6
+    assert "root to tip" in printed
+
+
+def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(200, 3))
+    roots *= 0.09 / np.linalg.norm(roots, axis=1, keepdims=True)
+    hair = Strands.from_list([np.stack([r, 1.4 * r]) for r in roots])
+    write_strands(tmp_path / "true.npz", hair)
+    metres = hair.subset(np.arange(20))
+    write_strands(tmp_path / "mm.npz", Strands(1e3 * metres.points, metres.offsets))
+    write_strands(tmp_path / "none.npz", Strands.from_list([]))
+    np.savez(tmp_path / "nan.npz", points=hair.points * np.nan, offsets=hair.offsets)
+    (tmp_path / "empty.hair").touch()
+
+    command = "evaluate", "geometry"
+    true, out = tmp_path / "true.npz", tmp_path / "out"
+    code, data = run(capsys, *command, true, true, "--out", out)
+    assert (code, data["warnings"]) == (0, [])
+    assert json.loads((out / "report.json").read_text()) == data
+    assert {p.name for p in out.glob("*.png")} == {Path(p).name for p in data["pictures"]}
+    assert len(data["pictures"]) == 4
+    assert set(data["regions"]["scalp"]) == {"front", "top", "sides", "back", "nape"}
+
+    code, data = run(capsys, *command, tmp_path / "mm.npz", true)
+    assert code == 0
+    assert "both in metres?" in data["warnings"][0]
+    code, data = run(capsys, *command, tmp_path / "none.npz", true)
+    assert code == 0
+    assert data["warnings"] == ["there are no predicted strands: precision is given as 0"]
+    assert data["all"]["3mm_30deg"]["f"] == 0
+    for pred, other, said in [
+        (true, tmp_path / "none.npz", "none.npz: no strands"),
+        (tmp_path / "nan.npz", true, "nan.npz: points must be finite"),
+        (tmp_path / "empty.hair", true, "empty.hair: 0 bytes"),
+        (tmp_path / "absent.npz", true, "absent.npz: no such file"),
+        (tmp_path / "hair.obj", true, "unknown strand format '.obj'"),
+    ]:
+        code, data = run(capsys, *command, pred, other)
+        assert code == 3
+        assert said in data["error"]["detail"]
+        assert "\n" not in data["error"]["detail"]
 
 
 def test_evaluate_images_compares_files_and_folders(capsys, tmp_path):
