@@ -82,7 +82,7 @@ def fit(
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
     head = model_head(model, capture)
     scene = build_scene(strands, head, hair=start)
-    fitting = _Fitting(scene, hair, skin, options, seed, progress)
+    fitting = SunFit(scene, hair, skin, options, seed, progress)
     with report.stage("roughness") as stage:
         plain, printed, corrected, first = fitting.roughness(stage)
     with report.stage("colour") as stage:
@@ -183,7 +183,7 @@ def _under(o: Observed, lights: NDArray[np.int64]) -> Observed:
     return replace(o, lights=names, radiance=o.radiance[lights], valid=o.valid[lights])
 
 
-class _Fitting:
+class SunFit:
     """The observations and the geometry that the two fits share."""
 
     def __init__(

@@ -102,12 +102,13 @@ class HairMaps:
 class MappedStrands:
     """The strands of a scene with their places in the volume; `painted` puts maps on them.
 
-    `root_uv (S, 2)` are the roots' places on the scalp's map.
+    `root_uv (S, 2)` are the roots' places on the scalp's map, `coordinates` what the BSDF needs to
+    know of the curves (`strand_parameters`).
     """
 
     scene: HairScene
     root_uv: Array
-    _coordinates: dict[str, Any]
+    coordinates: dict[str, Any]
 
     @classmethod
     def of(cls, scene: HairScene, strands: Strands, root_uv: ArrayLike) -> MappedStrands:
@@ -139,7 +140,7 @@ class MappedStrands:
                 "eta": maps.eta,
                 "sigma_a": mi.TensorXf(maps.sigma_a.astype(np.float32)),
                 "rotation": mi.TensorXf(maps.rotation.astype(np.float32)),
-                **self._coordinates,
+                **self.coordinates,
             }
         )
         return replace(self.scene, hair=maps.mean(), hair_bsdf=bsdf)

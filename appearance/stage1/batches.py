@@ -28,6 +28,16 @@ class Batch:
     share: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A batch's pixels: `rendered`, `captured` and its local mean `level (k, P, 3)`; `valid`."""
+
+    rendered: Array
+    captured: Array
+    level: Array
+    valid: NDArray[np.bool_]
+
+
 class Pairs:
     """The pairs that show lit hair, and how much each still teaches.
 
@@ -81,15 +91,13 @@ class Pairs:
             return even
         return np.asarray(_UNIFORM * even + (1 - _UNIFORM) * score / score.sum())
 
-    def learn(
-        self, batch: Batch, rendered: Array, captured: Array, valid: NDArray[np.bool_]
-    ) -> None:
-        """Take note of a batch's differences `(k, P, 3)`, pixels in the order of the image.
+    def learn(self, batch: Batch, seen: Seen) -> None:
+        """Take note of what a batch has shown, its pixels in the order of the image.
 
         Neighbouring pixels have independent noise and nearly the same error: the mean product of
         their differences is the squared error without the noise.
         """
-        d = (rendered - captured) * np.sqrt(weights(captured)) * valid[..., None]
+        d = (seen.rendered - seen.captured) * np.sqrt(weights(seen.level)) * seen.valid[..., None]
         product = (d[:, 1:] * d[:, :-1]).mean(axis=(1, 2))
         for light, value in zip(batch.lights, product, strict=True):
             old = self.taught[batch.view, light]

@@ -48,14 +48,14 @@ class State:
         part.replace(path)
 
     @classmethod
-    def load(cls, path: Path, fingerprint: str) -> State:
-        """Read a state; `ValueError` where the file belongs to another fit."""
+    def load(cls, path: Path | None, fingerprint: str) -> State | None:
+        """Read a state; None where there is no file, or one of another fit."""
+        if path is None or not path.is_file():
+            return None
         with np.load(path) as data:
             numbers = json.loads(str(data["numbers"]))
             if numbers["fingerprint"] != fingerprint:
-                raise ValueError(
-                    f"{path} belongs to a fit of other data or options: remove it to begin anew"
-                )
+                return None
             state = cls({}, {}, Adam(numbers["count"]), Convergence(**numbers["convergence"]))
             for key in data.files:
                 kind, _, name = key.partition("/")

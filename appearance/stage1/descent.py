@@ -24,6 +24,8 @@ STEP = {
     "profile": 3e-3,
 }
 """In the unconstrained numbers' units; about a fiftieth of what each may be off at the start."""
+_OF_CELLS = 0.3
+"""A cell is told little by a step, and mostly noise: it moves less."""
 _FIRST, _SECOND, _TINY = 0.9, 0.98, 1e-12
 
 
@@ -50,9 +52,8 @@ class Adam:
             ahead = m / (1 - _FIRST**self.count)
             size = v / (1 - _SECOND**self.count)
             usual = size.mean()
-            raw[name] = raw[name] - pace * STEP[name] * ahead / np.sqrt(
-                np.maximum(size, usual) + _TINY**2
-            )
+            reach = pace * STEP[name] * (1.0 if g.size <= 3 else _OF_CELLS)
+            raw[name] = raw[name] - reach * ahead / np.sqrt(np.maximum(size, usual) + _TINY**2)
 
 
 @dataclass

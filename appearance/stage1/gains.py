@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance.stage1.batches import Batch
+from appearance.stage1.batches import Batch, Seen
 from appearance.stage1.losses import weights
 
 Array = NDArray[np.float64]
@@ -17,8 +17,8 @@ _WINDOW = 20.0
 class Gains:
     """Factors `(L,)` on the lamps' intensities, solved from what batches show.
 
-    A lamp's factor is Σ w I² / Σ w I R, R rendered with factor 1 and I captured: least squares with
-    the captured image as instrument, so that noise in R, which Σ w R² would count as light, does
+    A lamp's factor is Σ w Ī I / Σ w Ī R, R rendered with factor 1, I captured and Ī its local mean:
+    least squares with Ī as instrument, so that noise in R, which Σ w R² would count as light, does
     not bias it. Batches are averaged over the latest 20 of a lamp; with the scatter between them as
     error, the prior of 3 % about the calibration draws lamps that say little back to 1. The mean
     factor stays 1: how bright all lamps are together, hair colour cannot be told from.
@@ -47,14 +47,12 @@ class Gains:
             log[known] -= log[known].mean()
         return np.asarray(np.exp(log))
 
-    def learn(
-        self, batch: Batch, rendered: Array, captured: Array, valid: NDArray[np.bool_]
-    ) -> None:
-        """`rendered (k, P, 3)` with the factors of `value`, beside `captured`."""
+    def learn(self, batch: Batch, seen: Seen) -> None:
+        """Take note of a batch that was rendered with the factors of `value`."""
         gain = self.value[batch.lights]
-        w = weights(captured) * valid[..., None]
-        top = (w * captured * captured).sum(axis=(1, 2))
-        below = (w * captured * rendered).sum(axis=(1, 2))
+        instrument = weights(seen.level) * seen.level * seen.valid[..., None]
+        top = (instrument * seen.captured).sum(axis=(1, 2))
+        below = (instrument * seen.rendered).sum(axis=(1, 2))
         fine = (top > 0) & (below > 0)
         log = np.log(top[fine] / below[fine] * gain[fine])
         lamps = batch.lights[fine]

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from appearance.hair_maps import HairMaps
 from appearance.stage1.batches import Pairs
 from appearance.stage1.checkpoint import State
+from appearance.stage1.clusters import cell_colours
 from appearance.stage1.gains import Gains
 from appearance.stage1.problem import Effort, Problem
-from appearance.stage1.unknowns import Lamps, Raw, maps_of, raw_of
+from appearance.stage1.unknowns import Lamps, Raw, maps_of
 from reconstruction.report import Progress, silent
 
 Array = NDArray[np.float64]
@@ -32,6 +33,8 @@ ROWS: dict[str, tuple[tuple[str, ...], bool, bool]] = {
 """The ablations: what is free, whether it varies over the volume, and whether gains are solved."""
 PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation": 0.2}
 """Standard deviations about the calibration, and of correctives in radians."""
+_LATEST = 0.04
+"""Weight of the latest step in the running mean: noise of the steps averages out in it."""
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared prior deviation, beside the image loss."""
 
@@ -41,9 +44,10 @@ class Stage1Options:
     """How a fit is run; the defaults are ours, the plain version has `plain()`.
 
     `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
-    reached over `levels` doublings. `steps` at most, of `images` pairs each. `common_numbers`
-    repeats the same random numbers for a view in every step. `repeatable` gives the same bytes for
-    the same seed, with gradients in a single thread. The watched error is that of `watched_views`
+    reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. There are
+    at most `steps`, of `images` pairs each. `common_numbers` repeats the same random numbers for a
+    view in every step. `repeatable` gives the same bytes for the same seed, with gradients in a
+    single thread. The watched error is that of `watched_views`
     views, every `check_every` steps; after `halvings` of the pace it has converged.
     """
 
@@ -51,6 +55,7 @@ class Stage1Options:
     tilt: bool = False
     shape: Shape = (4, 8, 8)
     levels: int = 3
+    cell_start: bool = True
     steps: int = 150
     images: int = 8
     effort: Effort = field(default_factory=Effort)
@@ -107,8 +112,8 @@ def run(
 ) -> Outcome:
     """Fit from `maps` and `lamps` (the calibration where None); never returns a worse guess.
 
-    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of another
-    fit is an error. The file stays: whoever starts the fit removes it.
+    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
+    data or options is replaced. The file stays: whoever starts the fit removes it.
     """
     options = options or Stage1Options()
     return _Fit(problem, maps, lamps, options, checkpoint, progress, seed).run()
@@ -163,13 +168,22 @@ class _Fit:
         return self._judged(state, gains, ended, spent + time.perf_counter() - begun)
 
     def _begun(self) -> State:
-        if self.checkpoint is not None and self.checkpoint.is_file():
-            return State.load(self.checkpoint, self._fingerprint())
-        raw = self._raw(self.start.resized(self._shape(0)))
+        saved = State.load(self.checkpoint, self._fingerprint())
+        if saved is not None:
+            return saved
+        raw = self._raw(self._first_maps())
         state = State(raw, {k: v.copy() for k, v in raw.items()})
         state.tables = {"taught": self.pairs.taught, "gains": Gains.sums_of(self.lamps.gain)}
         state.convergence.halvings = self.options.halvings
         return state
+
+    def _first_maps(self) -> HairMaps:
+        """The start in this row's volume, cells of one colour told apart by their own pictures."""
+        options, last = self.options, self._last_level
+        if not (self.spatial and self.options.cell_start and self.start.shape == (1, 1, 1)):
+            return self.start.resized(self._shape(self._level(0)))
+        even = self._raw(self.start.resized(self._shape(last)))
+        return cell_colours(self.problem, even, self.lamps.gain, options.effort, seed=self.seed)
 
     def _fingerprint(self) -> str:
         """Of everything that the course of a fit depends on."""
@@ -184,7 +198,7 @@ class _Fit:
         return total.hexdigest()
 
     def _raw(self, maps: HairMaps) -> Raw:
-        return raw_of(maps, self.lamps, self.problem.profile_of)
+        return self.problem.raw_of(maps, self.lamps)
 
     def _step(self, state: State, gains: Gains) -> str | None:
         """One step; why the fit must end, if it must."""
@@ -204,17 +218,18 @@ class _Fit:
             rng,
             loss=options.loss,
             lambdas=(options.lambda_sigma, options.lambda_r),
+            error=self.series[-1][2],
             repeatable=options.repeatable,
         )
         if not all(np.isfinite(g).all() for g in slope.gradient.values()):
             return f"step {state.step}: the gradient is not finite"
         self._pull_to_priors(state.raw, slope.gradient)
-        self.pairs.learn(batch, slope.rendered, slope.captured, slope.valid)
+        self.pairs.learn(batch, slope.seen)
         if self.solves_gains:
-            gains.learn(batch, slope.rendered, slope.captured, slope.valid)
+            gains.learn(batch, slope.seen)
         state.descent.step(state.raw, slope.gradient, state.convergence.pace)
         state.step += 1
-        share = max(0.1, 1 / (state.step - state.level_began))
+        share = max(_LATEST, 1 / (state.step - state.level_began))
         for name, value in state.raw.items():
             state.average[name] = state.average[name] + share * (value - state.average[name])
         return None
@@ -231,7 +246,9 @@ class _Fit:
         return self.options.levels - 1 if self.spatial else 0
 
     def _level(self, step: int) -> int:
-        """Coarse levels take a sixth of the steps each."""
+        """Coarse levels take a sixth of the steps each; cells that differ already are kept."""
+        if self.options.cell_start or self.start.shape != (1, 1, 1):
+            return self._last_level
         return min(step * 6 // self.options.steps, self._last_level)
 
     def _shape(self, level: int) -> Shape:

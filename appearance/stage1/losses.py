@@ -6,8 +6,9 @@ weights mean the same whatever the resolution of images and maps.
 
 The papers' L1 takes the sign of a noisy difference: with few samples a pixel it fits the median of
 the noise, which for path tracing lies far below its mean. "squares" is unbiased: squared
-differences, the picture's and the gradient's noise independent of each other, with fixed weights
-1/(captured + 0.1), under which a small error of a bright and of a dark pixel count as in L1.
+differences, the picture's and the gradient's noise independent of each other, with weights that
+make them differences of displayed (sRGB) values. Its square root is what is minimised: like L1 it
+is proportional to the difference, so that λ_σ and λ_R keep their meaning.
 """
 
 from __future__ import annotations
@@ -16,34 +17,50 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 Array = NDArray[np.float64]
-FLOOR = 0.1
-LAMBDA_SIGMA, LAMBDA_R = 0.5, 10.0
+FLOOR = 0.03
+LEAST_ERROR = 0.02
+"""Of the root of the squares: below it smoothness gets no more say."""
 
 
-def weights(captured: Array) -> Array:
-    """Weight of each squared difference; `captured` in exposure units."""
-    return 1.0 / (np.maximum(captured, 0) + FLOOR)
+def level(captured: Array) -> Array:
+    """Local mean of captured values `(L, P, 3)`, pixels in image order: what weights are made of.
 
-
-def slope(rendered: Array, captured: Array, valid: NDArray[np.bool_], kind: str) -> Array:
-    """Derivative of the mean image loss by the rendered values `(L, P, 3)`, in exposure units.
-
-    `valid (L, P)`. `kind` is "squares" or "l1".
+    Made of the pixel itself, a weight would be largest where noise made it dark.
     """
-    difference = rendered - captured
-    out = np.sign(difference) if kind == "l1" else difference * weights(captured)
+    return np.asarray(uniform_filter1d(np.maximum(captured, 0), 5, axis=1, mode="nearest"))
+
+
+def weights(level: Array) -> Array:
+    """Weight of a squared difference at a captured `level`, in exposure units.
+
+    The squared slope of the sRGB curve, with a floor below which darkness counts no more.
+    """
+    return 0.2 * (level + FLOOR) ** -1.17
+
+
+def slope(
+    difference: Array, level: Array, valid: NDArray[np.bool_], kind: str, error: float
+) -> Array:
+    """Derivative of the image loss by the rendered values `(L, P, 3)`, in exposure units.
+
+    `difference` is rendered less captured; `valid (L, P)`; `kind` "squares" or "l1"; `error` an
+    estimate of the mean of the squares, of which the root is taken.
+    """
+    root = max(error, LEAST_ERROR**2) ** 0.5
+    out = np.sign(difference) if kind == "l1" else difference * weights(level) / root
     used = max(int(valid.sum()), 1) * 3
     return np.where(valid[..., None], out, 0.0) / used
 
 
-def squares(one: Array, other: Array, captured: Array, valid: NDArray[np.bool_]) -> float:
-    """Weighted mean squared difference without the noise of two independent renderings.
+def squares(one: Array, other: Array, level: Array, valid: NDArray[np.bool_]) -> float:
+    """Weighted mean square of the differences `one` and `other`, of two independent renderings.
 
-    May be slightly negative where both agree with the captured image to their noise.
+    Without their noise: may be slightly negative where the renderings agree with the captured.
     """
-    product = (one - captured) * (other - captured) * weights(captured)
+    product = one * other * weights(level)
     return float(product[valid].mean()) if valid.any() else 0.0
 
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance.hair_maps import MappedStrands
+from appearance.hair_maps import HairMaps, MappedStrands
 from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat
 from appearance.render.olat import render_olat
 from appearance.stage1 import losses
-from appearance.stage1.batches import Batch, Pairs
-from appearance.stage1.unknowns import Raw, hair_values, maps_of
+from appearance.stage1.batches import Batch, Pairs, Seen
+from appearance.stage1.unknowns import Lamps, Raw, hair_values, maps_of, raw_of
 from reconstruction.lights import Light
 
 Array = NDArray[np.float64]
@@ -39,12 +39,10 @@ class Effort:
 
 @dataclass(frozen=True, eq=False)
 class Slope:
-    """A batch's gradient by each of the free numbers, and what was rendered `(k, P, 3)`."""
+    """A batch's gradient by each of the free numbers, and what it saw."""
 
     gradient: Raw
-    rendered: Array
-    captured: Array
-    valid: NDArray[np.bool_]
+    seen: Seen
 
 
 class Problem:
@@ -58,8 +56,15 @@ class Problem:
     ) -> None:
         self.mapped, self.views, self.scale, self.skin = mapped, tuple(views), scale, skin
         self.lights: tuple[Light, ...] = views[0].lights if views else ()
+        self._level = [
+            losses.level(o.radiance * np.float32(scale)).astype(np.float32) for o in self.views
+        ]
         profiles = list({id(x.profile): 0 for x in self.lights})
         self.profile_of = np.array([profiles.index(id(x.profile)) for x in self.lights], np.int64)
+
+    def raw_of(self, maps: HairMaps, lamps: Lamps) -> Raw:
+        """The unconstrained numbers of `maps` and `lamps`."""
+        return raw_of(maps, lamps, self.profile_of)
 
     def slope(
         self,
@@ -73,10 +78,12 @@ class Problem:
         *,
         loss: str = "squares",
         lambdas: tuple[float, float] = (0.0, 0.0),
+        error: float = 1.0,
         repeatable: bool = True,
     ) -> Slope:
         """The derivative of the loss of a batch; `seeds` are the picture's and the gradient's.
 
+        `error` is about what `error` says, for the root of squares.
         Threads add up a gradient in no fixed order: a `repeatable` one takes a single thread.
         """
         import drjit as dr
@@ -84,13 +91,12 @@ class Problem:
 
         o = self.views[batch.view]
         few = np.sort(rng.permutation(len(o.pixels))[: effort.pixels])
-        captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
-        valid = o.valid[batch.lights][:, few]
         leaves = {k: mi.TensorXf(v.astype(np.float32)) for k, v in raw.items()}
         for name in free:
             dr.enable_grad(leaves[name])
-        rendered = self.render(raw, gain, batch, few, effort, seeds[0])
-        weight = losses.slope(rendered, captured, valid, loss)
+        seen = self.seen(batch, few, self.render(raw, gain, batch, few, effort, seeds[0]))
+        difference = seen.rendered - seen.captured
+        weight = losses.slope(difference, seen.level, seen.valid, loss, error)
         # a pair's loss is its mean over pixels; slope() took the mean over pairs too
         weight *= batch.share[:, None, None] * len(batch.lights) * self.scale
         op = self._op(raw, gain, batch, few, effort)
@@ -106,7 +112,7 @@ class Problem:
             total = total + dr.sum(found[name] * values[name], axis=None)
         dr.backward(total)
         gradient = {k: np.array(dr.grad(leaves[k]), float) for k in free}
-        return Slope(gradient, rendered, captured, valid)
+        return Slope(gradient, seen)
 
     def error(
         self,
@@ -124,10 +130,19 @@ class Problem:
             one, other = (
                 self.render(raw, gain, batch, few, effort, seed + k) for k in (0, 1 << 20)
             )
-            captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
-            total += losses.squares(one, other, captured, o.valid[batch.lights][:, few])
+            a, b = (self.seen(batch, few, x) for x in (one, other))
+            total += losses.squares(
+                a.rendered - a.captured, b.rendered - b.captured, a.level, a.valid
+            )
             count += 1
         return total / max(count, 1)
+
+    def seen(self, batch: Batch, few: NDArray[np.int64], rendered: Array) -> Seen:
+        """`rendered (k, P, 3)` beside what was captured of a view's pixels number `few`."""
+        o = self.views[batch.view]
+        captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
+        level = self._level[batch.view][batch.lights][:, few].astype(float)
+        return Seen(rendered, captured, level, o.valid[batch.lights][:, few])
 
     def render(
         self,
@@ -155,8 +170,6 @@ class Problem:
 
     def lamps_at(self, raw: Raw, gain: Array) -> list[Light]:
         """All lights as `raw` has them."""
-        from appearance.stage1.unknowns import Lamps
-
         profile = np.exp(raw["profile"])[self.profile_of]
         return Lamps(raw["position"], raw["turn"], gain, profile).of(self.lights)
 

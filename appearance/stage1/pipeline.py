@@ -1,0 +1,249 @@
+"""Stage 1 on a capture: from the model folder's strands and masks to maps and lamps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.fitted import FittedAppearance
+from appearance.hair_maps import HairMaps, MappedStrands, scalp_coordinates
+from appearance.metrics import LPIPS_UNAVAILABLE, psnr, relative_error, ssim
+from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
+from appearance.render.bounces import bounce_limit
+from appearance.render.olat import render_olat
+from appearance.scene import build_scene
+from appearance.stage1.loop import Outcome, Stage1Options, run
+from appearance.stage1.problem import Effort, Problem
+from appearance.stage1.unknowns import Lamps
+from reconstruction.capture import Capture
+from reconstruction.report import Progress, Report, Series, Stage, silent
+from reconstruction.strand_files import read_strands
+
+Array = NDArray[np.float64]
+MAPS, LAMPS = "hair_maps.npz", "lamps.json"
+
+
+@dataclass(frozen=True)
+class Stage1Request:
+    """What a job may ask for.
+
+    `hair_pixels` a camera are fitted; `first_steps` fit one colour before the volume. `fit` are
+    fields of `Stage1Options`, of which `effort` holds fields of `Effort`. Held-out images are
+    judged on at most `judged_images`, with `judged_spp` paths a pixel.
+    """
+
+    hair_pixels: int = 4000
+    first_steps: int = 40
+    judged_images: int = 6
+    judged_spp: int = 48
+    fit: dict[str, Any] = field(default_factory=dict)
+
+    def options(self, max_depth: int) -> Stage1Options:
+        """The fit's own options; `TypeError` for fields that are unknown."""
+        given = dict(self.fit)
+        effort = Effort(**{"max_depth": max_depth, **given.pop("effort", {})})
+        shape = tuple(given.pop("shape", Stage1Options.shape))
+        return Stage1Options(effort=effort, shape=shape, **given)
+
+
+def fit_stage1(
+    capture: Capture,
+    model: Path,
+    *,
+    held_out: HeldOut | None = None,
+    request: Stage1Request | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Fit maps and lamps, from the `appearance.json` of Sun's fit, and judge them.
+
+    Reads `strands.npz`, `masks/` and `appearance.json` of the folder `model`. Writes
+    `hair_maps.npz`, `lamps.json` and the stage "stage1" of `report.json`; a fit that was killed
+    goes on from its checkpoint, which stays in the folder until the fit is done. Returns
+    `{"ended", "steps", "error", "start_error", "held_out": {"start" | "stage1": {"psnr", "ssim",
+    "relative_error"}}}`, the latter where images are held out. Raises `CaptureError`,
+    `FileNotFoundError` or `ValueError` naming what is missing.
+    """
+    held_out, request = held_out or HeldOut(), request or Stage1Request()
+    held_out.check(capture)
+    fitted = FittedAppearance.load(model)
+    strands = read_strands(model / "strands.npz")
+    report = Report.load(model / "report.json")
+    with report.stage("stage1") as stage:
+        progress("reading hair pixels", 0.0)
+        views = _views(capture, model, held_out, request, seed)
+        scene = build_scene(strands, capture.head, hair=fitted.hair, skin=fitted.skin)
+        mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, capture.head))
+        depth = bounce_limit(scene, views[0].camera, 0.01, pixels=views[0].pixels, seed=seed).depth
+        options = request.options(min(depth, 16))
+        problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
+        start = HairMaps.of(fitted.hair)
+        first = replace(options, row="original", steps=request.first_steps)
+        outcome = _run(problem, start, None, first, model, _part(progress, 0.05, 0.3), seed, stage)
+        outcome = _run(
+            problem,
+            outcome.maps,
+            outcome.lamps,
+            options,
+            model,
+            _part(progress, 0.3, 0.9),
+            seed,
+            stage,
+        )
+        outcome.maps.save(model / MAPS, mapped.root_uv)
+        _write_lamps(model / LAMPS, outcome.lamps, problem)
+        progress("judging held-out images", 0.92)
+        result = {
+            "ended": outcome.ended,
+            "steps": outcome.steps,
+            "start_error": outcome.start_error,
+            "error": outcome.error,
+        }
+        judged = _held_out_images(capture, model, held_out, request.judged_images, seed)
+        if judged:
+            result["held_out"] = {
+                name: _scores(mapped, maps, judged, fitted, options, request, seed)
+                for name, maps in (("start", start), ("stage1", outcome.maps))
+            }
+            result["lpips"] = LPIPS_UNAVAILABLE
+        stage.figures |= {**result, "options": asdict(options), "depth": depth}
+    report.save(model / "report.json")
+    for row in ("original", options.row):
+        _checkpoint(model, row).unlink(missing_ok=True)
+    progress("stage 1 done", 1.0)
+    return result
+
+
+def _run(
+    problem: Problem,
+    maps: HairMaps,
+    lamps: Lamps | None,
+    options: Stage1Options,
+    model: Path,
+    progress: Progress,
+    seed: int,
+    stage: Stage,
+) -> Outcome:
+    outcome = run(
+        problem,
+        maps,
+        lamps,
+        options=options,
+        checkpoint=_checkpoint(model, options.row),
+        progress=progress,
+        seed=seed,
+    )
+    series = Series(f"stage 1, {options.row}", "weighted mean squared difference, noise taken off")
+    series.points = [(seconds, error) for seconds, _, error in outcome.history]
+    stage.series.append(series)
+    if outcome.steps < options.steps and outcome.ended != "converged":
+        stage.warn(f"{options.row}: {outcome.ended}")
+    return outcome
+
+
+def _checkpoint(model: Path, row: str) -> Path:
+    return model / f"stage1-{row}.checkpoint.npz"
+
+
+def _part(progress: Progress, begin: float, end: float) -> Progress:
+    return lambda what, share: progress(what, begin + (end - begin) * share)
+
+
+def _views(
+    capture: Capture, model: Path, held_out: HeldOut, request: Stage1Request, seed: int
+) -> list[Observed]:
+    rng = np.random.default_rng(seed)
+    lights = held_out.training_lights(capture)
+    views = []
+    for name in held_out.training_cameras(capture):
+        pixels = chosen(model_mask(model, name, "hair", capture), request.hair_pixels, rng)
+        if len(pixels):
+            views.append(observe(capture, name, lights, pixels))
+    if not views:
+        raise ValueError(f"{model}: the hair masks of the training cameras are all empty")
+    return views
+
+
+def _held_out_images(
+    capture: Capture, model: Path, held_out: HeldOut, most: int, seed: int
+) -> list[Observed]:
+    """Held-out cameras under held-out lights; where one of them is missing, under all others."""
+    cameras = held_out.cameras or tuple(c.name for c in capture.rig.cameras)
+    lights = held_out.lights or tuple(capture.olat_lights())
+    if not (held_out.cameras or held_out.lights):
+        return []
+    out = []
+    for name in cameras[:2]:
+        there = [x for x in lights if capture.has_light(x, name)]
+        some = there[:: max(1, -(-len(there) // max(1, most // min(2, len(cameras)))))]
+        pixels = np.flatnonzero(model_mask(model, name, "hair", capture))
+        if len(pixels) and some:
+            out.append(observe(capture, name, some, pixels))
+    return out
+
+
+def _scores(
+    mapped: MappedStrands,
+    maps: HairMaps,
+    images: list[Observed],
+    fitted: FittedAppearance,
+    options: Stage1Options,
+    request: Stage1Request,
+    seed: int,
+) -> dict[str, float]:
+    scene = mapped.painted(maps).with_skin(fitted.skin)
+    values = []
+    for k, o in enumerate(images):
+        rendered = render_olat(
+            scene,
+            o.camera,
+            o.lights,
+            spp=request.judged_spp,
+            max_depth=options.effort.max_depth,
+            pixels=o.pixels,
+            seed=(seed << 8) + 91 + k,
+        )
+        mask = np.zeros((o.camera.height, o.camera.width), bool)
+        mask.reshape(-1)[o.pixels] = True
+        for i in range(len(o.lights)):
+            ours, true = (_image(x[i], mask) for x in (rendered, o.radiance))
+            if true[mask].max() > 0:
+                shown, wanted = fitted.exposure(ours), fitted.exposure(true)
+                values.append(
+                    (
+                        psnr(shown, wanted, mask),
+                        ssim(shown, wanted, mask),
+                        relative_error(ours, true, mask),
+                    )
+                )
+    mean = np.mean(values, axis=0)
+    return dict(zip(("psnr", "ssim", "relative_error"), map(float, mean), strict=True))
+
+
+def _image(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> Array:
+    out = np.zeros((*mask.shape, 3))
+    out[mask] = values
+    return out
+
+
+def _write_lamps(path: Path, lamps: Lamps, problem: Problem) -> None:
+    """The lamps as found: position and intensity, and how they differ from their calibration."""
+    found = lamps.of(problem.lights)
+    rows = [
+        {
+            **light.to_dict(),
+            "moved_m": lamps.position[i].tolist(),
+            "turned_rad": lamps.turn[i].tolist(),
+            "gain": float(lamps.gain[i]),
+            "profile_scale": float(lamps.profile[i]),
+        }
+        for i, light in enumerate(found)
+    ]
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+    part.replace(path)
