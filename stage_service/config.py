@@ -87,6 +87,10 @@ class _LightBank(Strict):
         """Whether it has a sequence table, which the trigger box's gate steps."""
         return False
 
+    def level_steps(self, by_table: bool = False) -> int:
+        """How many levels above 0 it tells apart; 1: lamps are always at full level."""
+        return 1
+
 
 class _ModbusConfig(_LightBank):
     registers: LightRegisters = LightRegisters()
@@ -96,6 +100,11 @@ class _ModbusConfig(_LightBank):
         """Whether it has a sequence table, which the trigger box's gate steps."""
         r = self.registers
         return None not in (r.sequence, r.table, r.position)
+
+    def level_steps(self, by_table: bool = False) -> int:
+        """How many levels above 0 it tells apart; entries of its table have their own."""
+        r = self.registers
+        return 1 if r.levels is None and not by_table else r.level_full
 
 
 class ModbusTcpConfig(_ModbusConfig):
@@ -128,6 +137,10 @@ class DmxConfig(_LightBank):
     kind: Literal["dmx_enttec"]
     port: str = Field(min_length=1)
     first_channel: int = Field(default=1, ge=1, le=512)
+
+    def level_steps(self, by_table: bool = False) -> int:
+        """DMX has 8 bits."""
+        return 255
 
 
 def _modbus_tcp_by_default(table: Any) -> Any:

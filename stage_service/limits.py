@@ -1,4 +1,4 @@
-"""What `[safety]` lets the lamps do, checked in a plan before anything is lit."""
+"""What `[safety]` lets the lamps do, and what they can: checked before anything is lit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from reconstruction.rig import Rig
-from stage_service.config import SafetyLimits
+from stage_service.config import LightBankConfig, SafetyLimits
+from stage_service.stepping import Run
 from stage_service.timeline import Lit
 
 
@@ -41,6 +42,27 @@ def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[
     if limits.max_duty < 1:
         problems += _check_duty(steps, rig, limits)
     return problems
+
+
+def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
+    """One sentence for each kind of step whose level the light bank would make another."""
+    problems = {}
+    for part in parts:
+        steps = bank.level_steps(by_table=part.stepping == "hardware")
+        for step in part.steps:
+            if step.kind not in ("olat", "all_on"):
+                continue
+            what = f"level.{step.kind}: the light bank of [devices.lights]"
+            if steps == 1 and step.level != 1:
+                problems[step.kind] = (
+                    f"{what} has no levels, its lamps are at 1; {step.level:g} was asked for"
+                )
+            elif round(step.level * steps) == 0:
+                problems[step.kind] = (
+                    f"{what} has {steps} levels above 0, so that {step.level:g} would be dark: use "
+                    f"one above {0.5 / steps:.3g} and a shorter exposure"
+                )
+    return list(problems.values())
 
 
 def _check_duty(steps: Sequence[Lit], rig: Rig, limits: SafetyLimits) -> list[str]:

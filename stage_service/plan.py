@@ -19,7 +19,7 @@ from stage_service.config import (
     RigFile,
 )
 from stage_service.flash import FlashRate, flash_rate
-from stage_service.limits import check_limits
+from stage_service.limits import check_levels, check_limits
 from stage_service.stepping import LATENCY_S, Run, limited_by, runs, seconds_by_cause
 from stage_service.timeline import timeline
 
@@ -164,6 +164,7 @@ class CapturePlan(_Model):
             parts, _ = self.runs(rig_file, self.steps(rig_file))
             lights = timeline(parts, rig_file, rate_hz=self.rate_hz)
             problems += check_limits(lights, rig, rig_file.safety)
+            problems += check_levels(parts, devices.lights) if devices is not None else []
         if problems:
             raise PlanError(problems)
 

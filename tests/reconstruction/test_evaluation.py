@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -215,3 +218,35 @@ def test_the_head_hides_and_the_image_ends(front: Camera) -> None:
     assert not seen[below].any()
     assert seen[points[:, 2] > 1.5e-3].all()
     assert not Visibility([front], behind)(points + np.float32(0.2)).any()
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_strands_are_scored_in_half_a_gigabyte() -> None:
+    """20 million points on both sides: docs/evaluation.md tells the figures."""
+    code = """
+import resource, time
+import subprocess
+import sys
+
+import numpy as np
+from reconstruction.evaluation import compare_strands
+from reconstruction.strands import Strands
+
+def hair(seed):
+    rng = np.random.default_rng(seed)
+    out = rng.normal(size=(100_000, 1, 3))
+    out /= np.linalg.norm(out, axis=2, keepdims=True)
+    s = np.linspace(0, 0.2, 20)[:, None]
+    points = (0.09 + s) * out - np.array([0, 0, 3.0]) * s**2
+    return Strands(points.reshape(-1, 3), 20 * np.arange(100_001))
+
+pred, true = hair(1), hair(2)
+start = time.process_time()
+f = compare_strands(pred, true)["all"]["1mm_10deg"]["f"]
+print(f, time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    f, seconds, kilobytes = map(float, done.stdout.split())
+    print(f"F {f:.3f}, {seconds:.0f} s of processor time, {kilobytes / 1e6:.2f} GB")
+    assert 0.3 < f < 1
+    assert kilobytes < 512_000

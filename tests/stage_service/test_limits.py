@@ -11,8 +11,16 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 
-from stage_service.config import RigFile, SafetyLimits, load_rig_file
+from stage_service.config import (
+    LightBankConfig,
+    LightRegisters,
+    ModbusTcpConfig,
+    RigFile,
+    SafetyLimits,
+    load_rig_file,
+)
 from stage_service.devices.errors import DeviceTimeout, SafetyRefusal
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
 from stage_service.devices.lights.limited import LimitedLightBank
@@ -243,6 +251,56 @@ def test_a_plan_that_exceeds_a_limit_is_refused_with_numbers(demo, limits, plan,
     with pytest.raises(PlanError) as error:
         CapturePlan(projectors=(), **plan).cost(rig_file)
     assert problem in str(error.value)
+
+
+DMX = {"kind": "dmx_enttec", "port": "p", "accept_unverified_blackout": True}
+COILS = {
+    "kind": "modbus_rtu",
+    "port": "p",
+    "registers": {"levels": "none", "sequence": "none", "selector": "none"},
+}
+
+
+@pytest.mark.parametrize(
+    ("bank", "level", "problem"),
+    [
+        (DMX, {"olat": 0.5 / 255}, "level.olat: the light bank of [devices.lights] has 255 levels"),
+        (DMX, {"olat": 0.5 / 255 + 1e-9, "all_on": 0.5 / 255 + 1e-9}, None),
+        (DMX, {"all_on": 1e-4}, "that 0.0001 would be dark: use one above 0.00196 and a shorter"),
+        ({"kind": "modbus_tcp"}, {"all_on": 1e-4}, None),
+        ({"kind": "modbus_tcp"}, {"all_on": 5e-6}, "has 65535 levels above 0, so that 5e-06 would"),
+        (
+            COILS,
+            {"olat": 1, "all_on": 0.5},
+            "level.all_on: the light bank of [devices.lights] has no",
+        ),
+        (COILS, {"olat": 1, "all_on": 1}, None),
+    ],
+)
+def test_a_level_that_the_bank_does_not_have_is_refused_in_the_plan(demo, bank, level, problem):
+    lights = TypeAdapter(LightBankConfig).validate_python(bank)
+    assert demo.devices is not None
+    rig_file = replace(demo, devices=demo.devices.model_copy(update={"lights": lights}))
+    plan = CapturePlan(projectors=(), stepping="software", level=level)
+    if problem is None:
+        plan.check(rig_file)
+        return
+    with pytest.raises(PlanError) as error:
+        plan.check(rig_file)
+    assert len(error.value.problems) == 1
+    assert problem in error.value.problems[0]
+
+
+def test_entries_of_a_table_have_levels_where_the_lamps_have_none(demo):
+    without = LightRegisters(levels=None)
+    lights = ModbusTcpConfig(registers=without, accept_unverified_blackout=True)
+    devices = demo.devices.model_copy(update={"lights": lights, "hardware_stepping": True})
+    rig_file = replace(demo, devices=devices)
+    plan = CapturePlan(projectors=(), sentinels=False, level={"olat": 0.5}, stepping="hardware")
+    plan.check(rig_file)
+    assert plan.cost(rig_file).stepping["software"] == 0
+    with pytest.raises(PlanError, match="has no levels"):
+        plan.model_copy(update={"stepping": "software"}).check(rig_file)
 
 
 def test_a_plan_within_its_limits_passes(demo):

@@ -5,6 +5,10 @@ nothing comes back from the lamps. After each frame the widget is asked for its 
 answer says that the frame has reached the widget, not that a lamp followed, and how long it takes
 until the frame is out, which every command waits for. No other request is
 ever sent: the widget stops its output for all but these two.
+
+Answers carry no number, but as many bytes of user configuration as were asked for: each request
+asks for another number, and only that many is its answer. Widgets of other makers ignore the
+number; with them what comes late is waited for and dropped.
 """
 
 from __future__ import annotations
@@ -14,21 +18,24 @@ import struct
 import termios
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import serial
 
 from reconstruction.rig import RigError
 from stage_service.config import DmxConfig
-from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
+from stage_service.devices.errors import DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
-from stage_service.devices.lights.limits import cannot, refuse_unverified_blackout
+from stage_service.devices.lights.limits import (
+    cannot,
+    refuse_lost_level,
+    refuse_unverified_blackout,
+)
 
 CHANNELS, FEWEST_CHANNELS = 512, 24
-FULL = 255
 GET_PARAMETERS, SEND_DMX = 3, 6
 _START, _END, _START_CODE = 0x7E, 0xE7, 0
-_NO_USER_DATA = b"\0\0"
+_MOST_USER_DATA = 32
 SLOWEST_FRAME_S = 0.023
 """A frame of 512 channels at full speed (ANSI E1.11)."""
 _PARAMETERS = struct.Struct("<HBBB")  # firmware, break, mark after break, frames a second
@@ -55,6 +62,9 @@ class DmxLightBank:
         self._lamps = lamps
         self._level = 1.0
         self._on: range = range(0)
+        self._asked = 0  # bytes of user configuration, by the newest request
+        self._bare = False  # whether the widget answers without any
+        self._late = False  # whether an answer is missing
         self._port: serial.Serial | None = None
         self._lock = threading.RLock()
 
@@ -99,14 +109,7 @@ class DmxLightBank:
         if not 0 <= level <= 1:
             raise ValueError(f"{self.name}: a level is 0 to 1, got {level}")
         doing = f"setting the level to {level:g}"
-        if level > 0 and round(level * FULL) == 0:
-            raise DeviceError(
-                self.name,
-                doing,
-                expected=f"0, or at least {0.5 / FULL:.4f}",
-                received=f"{level:g}",
-                todo="DMX has 256 levels: use a longer exposure instead of a lower level.",
-            )
+        refuse_lost_level(self.name, doing, level, self.config.level_steps())
         with self._lock:
             if self._on and level != self._level:
                 self._show(self._on, level, doing)
@@ -135,7 +138,9 @@ class DmxLightBank:
     def _show(self, on: range, level: float, doing: str) -> None:
         channels = bytearray(max(FEWEST_CHANNELS, self.config.first_channel - 1 + self._lamps))
         for lamp in on:
-            channels[self.config.first_channel - 1 + lamp] = round(level * FULL)
+            channels[self.config.first_channel - 1 + lamp] = round(
+                level * self.config.level_steps()
+            )
         with self._lock:
             self._open()
             self._send(SEND_DMX, bytes([_START_CODE]) + channels, doing)
@@ -167,11 +172,15 @@ class DmxLightBank:
         """Wait until the widget has taken all that was sent to it; returns its frames a second, 0
         for as many as it can."""
         assert self._port is not None
-        self._send(GET_PARAMETERS, _NO_USER_DATA, doing)
+        if self._late and self._bare:
+            self._drain()
+        self._asked = self._asked % _MOST_USER_DATA + 1
+        self._late = True
+        self._send(GET_PARAMETERS, struct.pack("<H", self._asked), doing)
         deadline = time.monotonic() + self.config.timeout_s
         came = b""
         try:
-            while (rate := _frames_per_second(came)) is None:
+            while (rate := self._frames_per_second(came)) is None:
                 wait = deadline - time.monotonic()
                 if wait <= 0 or not select.select([self._port], [], [], wait)[0]:
                     self.close()
@@ -187,7 +196,23 @@ class DmxLightBank:
                 came += self._port.read(max(1, self._port.in_waiting))
         except OSError as error:
             raise self._lost(doing, error) from error
+        self._late = False
         return rate
+
+    def _frames_per_second(self, data: bytes) -> int | None:
+        """What the answer to the newest request says, where it is in `data`."""
+        for user_data, rate in _answers(data):
+            if user_data in (0, self._asked):
+                self._bare = user_data == 0
+                return rate
+        return None
+
+    def _drain(self) -> None:
+        """Drop what comes until nothing has come for as long as an answer may take."""
+        assert self._port is not None
+        quiet = self.config.timeout_s
+        while select.select([self._port], [], [], quiet)[0]:
+            self._port.read(max(1, self._port.in_waiting))
 
     def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
         self.close()
@@ -202,12 +227,12 @@ class DmxLightBank:
         )
 
 
-def _frames_per_second(data: bytes) -> int | None:
-    """What a whole answer to `GET_PARAMETERS` in `data`, among whatever else came, says."""
+def _answers(data: bytes) -> Iterator[tuple[int, int]]:
+    """Bytes of user configuration and frames a second, of each whole answer to `GET_PARAMETERS` in
+    `data`, among whatever else came."""
     for start in range(len(data) - 4):
         first, label, size = struct.unpack_from("<BBH", data, start)
         end = start + 4 + size
         whole = end < len(data) and data[end] == _END
         if (first, label) == (_START, GET_PARAMETERS) and size >= _PARAMETERS.size and whole:
-            return int(_PARAMETERS.unpack_from(data, start + 4)[3])
-    return None
+            yield size - _PARAMETERS.size, int(_PARAMETERS.unpack_from(data, start + 4)[3])

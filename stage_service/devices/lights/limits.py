@@ -27,6 +27,18 @@ def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool
         )
 
 
+def refuse_lost_level(name: str, doing: str, level: float, steps: int) -> None:
+    """Raise `DeviceError` for a level above 0 that a bank of `steps` levels above 0 makes 0."""
+    if level > 0 and round(level * steps) == 0:
+        raise DeviceError(
+            name,
+            doing,
+            expected=f"0, or more than {0.5 / steps:.3g}: it has {steps} levels above 0",
+            received=f"{level:g}",
+            todo="Use a shorter exposure at a higher level.",
+        )
+
+
 def cannot(name: str, doing: str, lacks: str) -> DeviceError:
     """The error of a call that the capabilities exclude."""
     return DeviceError(

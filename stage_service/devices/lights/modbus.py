@@ -11,7 +11,11 @@ from pymodbus import ModbusException
 from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
-from stage_service.devices.lights.limits import cannot, refuse_unverified_blackout
+from stage_service.devices.lights.limits import (
+    cannot,
+    refuse_lost_level,
+    refuse_unverified_blackout,
+)
 from stage_service.devices.lights.modbus_answers import CODES, expected, received, unusable
 from stage_service.devices.lights.modbus_links import ModbusLink, open_link
 
@@ -112,7 +116,7 @@ class ModbusLightBank:
         if self._map.levels is None and level == 1.0:
             return
         first = self._required(self._map.levels, doing, "level registers")
-        value = self._level_word(level)
+        value = self._level_word(level, doing)
         with self._lock:
             if value == self._level:
                 return
@@ -191,11 +195,12 @@ class ModbusLightBank:
         if isinstance(what, int) and not 0 <= what < self._lamps:
             raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {what}")
         selector = {"all": ALL_ON, "none": ALL_OFF}.get(what) if isinstance(what, str) else what + 1
-        return selector or 0, self._level_word(level)
+        return selector or 0, self._level_word(level, "loading a sequence")
 
-    def _level_word(self, level: float) -> int:
+    def _level_word(self, level: float, doing: str) -> int:
         if not 0 <= level <= 1:
             raise ValueError(f"{self.name}: a level is 0 to 1, got {level}")
+        refuse_lost_level(self.name, doing, level, self._map.level_full)
         return round(level * self._map.level_full)
 
     def _command(self, selector: int, lit: int, doing: str) -> None:

@@ -244,5 +244,5 @@ def test_dmx_levels_are_rounded_to_8_bits_and_none_vanishes(bench):
     for level, word in ((0.5, 128), (0.02, 5), (0.002, 1), (0.0, 0)):
         one.driver.set_level(level)
         assert set(one.powers()) == {word / 255}
-    with pytest.raises(DeviceError, match="DMX has 256 levels"):
+    with pytest.raises(DeviceError, match=r"more than 0\.00196: it has 255 levels above 0"):
         one.driver.set_level(0.0019)

@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from simulators.dmx_widget import DmxWidget
 from simulators.faults import Fault
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 
@@ -223,6 +224,30 @@ def test_dmx_faults_are_told(bench, kind):
     assert one.lit() == []
     one.driver.select(7)
     assert one.lit() == [7]
+
+
+@pytest.mark.parametrize("widget", ["by Enttec", "that ignores what user data it is asked for"])
+def test_a_late_dmx_answer_is_not_taken_for_the_next_one_s(bench, widget, monkeypatch):
+    carry_out = DmxWidget._carry_out
+    if widget != "by Enttec":
+        monkeypatch.setattr(
+            DmxWidget,
+            "_carry_out",
+            lambda self, label, data: carry_out(self, label, b"\0\0" if label == 3 else data),
+        )
+    late = Fault("lights", "late", 1, request="3", seconds=LATE_S)
+    never = Fault("lights", "silent", 1, request="3")
+    one = bench(DMX, late, never)
+    one.driver.select(5)
+    one.pulses = 1
+    with pytest.raises(DeviceTimeout, match="putting lamp 6 on"):
+        one.driver.select(6)
+    with pytest.raises(DeviceTimeout, match="putting lamp 7 on"):
+        one.driver.select(7)  # within its deadline comes the answer to the one before
+    for lamp in range(8, 50):
+        one.driver.select(lamp)
+        assert one.lit() == [lamp]
+    assert one.seen.count("3") == 46  # one of them when it connected
 
 
 def test_noise_before_a_widgets_answer_is_skipped(bench):
