@@ -2,8 +2,8 @@
 
 Hair is wherever the user's mask says so, or else the user's network, of what is lit. Without one,
 a pixel whose triangulated point stands off the head, or that shows the subject where the head is
-not, is hair. On the head, and without a head mesh everywhere, the light decides: a matte surface
-answers half of the lamps by `albedo n·l`, fibres mirror a few lamps and hide from the others.
+not, is hair. On the head, the light
+decides. Without a head mesh, the light and the fineness of the lines do (`hair_features`).
 """
 
 from __future__ import annotations
@@ -19,16 +19,22 @@ from scipy.spatial import cKDTree
 
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
+from reconstruction.hair_features import (
+    FAINTEST_LINES,
+    light_contrast,
+    line_strength,
+    otsu,
+    tell_apart,
+)
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.mesh import Mesh
 from reconstruction.segmentation import Network
-from reconstruction.silhouettes import NoSilhouette, lit_rgb, silhouette
+from reconstruction.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
 
 Mask = NDArray[np.bool_]
-Source = Literal["user", "network", "geometry", "photometry", "silhouette"]
+Source = Literal["user", "network", "geometry", "light and lines", "lines", "silhouette"]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
-MATTE_CONTRAST = 1.29  # sqrt(1/6 - 1/16) / (1/4): cosine over all directions, deviation over mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +69,7 @@ def hair_masks(
     off = None
     if head is not None and points is not None and len(points):
         off = distance_to(head, points.points)
-    masks = {}
+    masks, unknown = {}, {}
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
         try:
@@ -79,9 +85,39 @@ def hair_masks(
             masks[camera.name] = HairMask(subject, hair, subject & ~hair, "network", 1.0)
         elif not subject.any():
             masks[camera.name] = HairMask(subject, subject, subject, "silhouette", 0.0)
-        else:
+        elif head is not None:
             masks[camera.name] = _decide(capture, camera, subject, points, head, off, stands_off)
-    return masks
+        else:
+            unknown[camera.name] = subject
+    return masks | _by_looks(capture, unknown)
+
+
+def _by_looks(capture: Capture, subjects: dict[str, Mask]) -> dict[str, HairMask]:
+    """Masks from light and lines alone; where these show one class, all of it may be hair."""
+    features = {}
+    for name, subject in subjects.items():
+        contrast = light_contrast(capture, name, subject)
+        lines = line_strength(lit_image(capture, name), subject)
+        features[name] = lines[None] if contrast is None else np.stack([contrast, lines])
+    out = {}
+    for count in {len(f) for f in features.values()}:
+        group = {name: f for name, f in features.items() if len(f) == count}
+        scores = tell_apart(group, subjects)
+        if scores is not None and count == 1:
+            hairs = [f[0][subjects[n] & (scores[n] > 0)] for n, f in group.items()]
+            if np.median(np.concatenate(hairs)) < FAINTEST_LINES:
+                scores = None  # what stands out is an outline, or noise
+        for name in group:
+            subject = subjects[name]
+            if scores is None:
+                nothing = np.zeros_like(subject)
+                out[name] = HairMask(subject, subject, nothing, "silhouette", 0.0)
+                continue
+            hair = subject & (scores[name] > 0)
+            hair = _fill(subject, hair, subject & ~hair)
+            source: Source = "light and lines" if count == 2 else "lines"
+            out[name] = HairMask(subject, hair, subject & ~hair, source, 1.0)
+    return out
 
 
 def _decide(
@@ -89,38 +125,31 @@ def _decide(
     camera: Camera,
     subject: Mask,
     points: PointCloud | None,
-    head: Mesh | None,
+    head: Mesh,
     off: NDArray[np.float64] | None,
     stands_off: float,
 ) -> HairMask:
-    hair, skin = np.zeros_like(subject), np.zeros_like(subject)
-    source: Source = "silhouette"
+    """A mask from where points lie on the head, and from the light where they lie on it."""
     contrast = light_contrast(capture, camera.name, subject)
-    if head is not None:
-        source = "geometry"
-        covered = head_coverage(head, camera)
-        hair |= subject & ~ndimage.binary_dilation(covered)
-        if points is not None and off is not None:
-            standing, lying = _votes(points, camera, off, stands_off)
-            hair |= subject & (standing > lying)
-            skin |= subject & covered & (lying > standing) & ~hair
-        if contrast is not None:
-            # a point on the head may be hair that lies flat, and one may be missing: ask the light
-            level = _threshold(contrast, subject, hair, skin)
-            asked = (skin | (subject & covered)) & ~hair
-            hair |= asked & (contrast > level)
-            skin |= asked & ~hair
-            skin &= ~hair
-    elif contrast is not None:
-        source = "photometry"
-        level = _otsu(contrast[subject])
-        hair, skin = subject & (contrast > level), subject & (contrast <= level)
+    covered = head_coverage(head, camera)
+    hair, skin = subject & ~ndimage.binary_dilation(covered), np.zeros_like(subject)
+    if points is not None and off is not None:
+        standing, lying = _votes(points, camera, off, stands_off)
+        hair |= subject & (standing > lying)
+        skin |= subject & covered & (lying > standing) & ~hair
+    if contrast is not None:
+        # a point on the head may be hair that lies flat, and one may be missing: ask the light
+        level = _threshold(contrast, subject, hair, skin)
+        asked = (skin | (subject & covered)) & ~hair
+        hair |= asked & (contrast > level)
+        skin |= asked & ~hair
+        skin &= ~hair
     decided = float((hair | skin).sum() / subject.sum())
     if not (hair | skin).any():
         # nothing told them apart: all of the subject may be hair
-        return HairMask(subject, subject, np.zeros_like(subject), source, 0.0)
+        return HairMask(subject, subject, np.zeros_like(subject), "geometry", 0.0)
     hair = _fill(subject, hair, skin)
-    return HairMask(subject, hair, subject & ~hair, source, decided)
+    return HairMask(subject, hair, subject & ~hair, "geometry", decided)
 
 
 def _votes(
@@ -188,30 +217,6 @@ def head_coverage(head: Mesh, camera: Camera) -> Mask:
     return np.asarray(image > 0)
 
 
-def light_contrast(
-    capture: Capture, camera: str, subject: Mask, lights: int = 96
-) -> NDArray[np.float64] | None:
-    """How unlike a matte surface each pixel answers single lamps: log ratio `(H, W)`, 0 for matte.
-
-    The deviation over the mean of the answers to a dome of lamps is 1.29 for a matte surface in the
-    open, up to 2 with half of the lamps in its own shadow; fibres mirror few and reach 3 to 7.
-    Smoothed over 3×3 pixels. None where under eight lamps were shot.
-    """
-    names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
-    if len(names) < 8:
-        return None
-    names = names[:: max(1, len(names) // lights)]
-    lamps = [capture.rig.light(n).intensity_towards(np.zeros(3)) for n in names]
-    power = np.array([max(intensity.mean(), 1e-12) for intensity in lamps])
-    values = capture.olat(camera, names).mean(axis=-1) / power[:, None, None]
-    mean = np.maximum(values.mean(axis=0), 0)
-    ratio = np.divide(values.std(axis=0), mean, out=np.ones_like(mean), where=mean > 0)
-    logs = np.where(subject, np.log(np.maximum(ratio, 0.1) / MATTE_CONTRAST), 0.0)
-    near = ndimage.uniform_filter(subject.astype(np.float64), 3)
-    smooth = ndimage.uniform_filter(logs, 3) / np.where(near > 0, near, 1.0)
-    return np.asarray(np.where(subject, smooth, 0.0))
-
-
 def _threshold(contrast: NDArray[np.float64], subject: Mask, hair: Mask, skin: Mask) -> float:
     """The contrast above which a pixel is hair: between what sure hair and likely skin have.
 
@@ -220,24 +225,12 @@ def _threshold(contrast: NDArray[np.float64], subject: Mask, hair: Mask, skin: M
     equals it is hair, too. Else the light cannot tell: infinite, so that none is hair.
     """
     if not hair.any() or not skin.any():
-        return _otsu(contrast[subject])
+        return otsu(contrast[subject])[0]
     third = np.log(4 / 3)
     sure, likely = float(np.median(contrast[hair])), float(np.median(contrast[skin]))
     if sure > likely + third:
         return 0.5 * (sure + likely)
     return sure - third if sure > 2 * third else np.inf
-
-
-def _otsu(values: NDArray[np.float64]) -> float:
-    """The threshold that splits `values (N,)` into the two tightest classes (Otsu 1979)."""
-    order = np.sort(values)
-    n = len(order)
-    if n < 2:
-        return np.inf
-    k = np.arange(1, n)
-    total = np.cumsum(order)
-    low, high = total[:-1] / k, (total[-1] - total[:-1]) / (n - k)
-    return float(order[np.argmax(k * (n - k) * (high - low) ** 2)])
 
 
 def _fill(subject: Mask, hair: Mask, skin: Mask) -> Mask:

@@ -7,9 +7,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture
+from reconstruction.hair_features import light_contrast, line_strength, otsu, tell_apart
 from reconstruction.light_planes import PointCloud, triangulate
 from reconstruction.lights import Light, dome_positions
 from reconstruction.masks import (
@@ -17,7 +19,6 @@ from reconstruction.masks import (
     distance_to,
     hair_masks,
     head_coverage,
-    light_contrast,
 )
 from reconstruction.mesh import Mesh
 from reconstruction.silhouettes import NoSilhouette, background_noise, silhouette
@@ -94,11 +95,11 @@ def test_background_noise_is_measured_below_zero() -> None:
     assert background_noise(np.ones(4)) == 0
 
 
-def test_the_light_tells_fibres_from_skin(hairy_capture: Capture) -> None:
+def test_light_and_lines_tell_fibres_from_skin(hairy_capture: Capture) -> None:
     masks = hair_masks(hairy_capture)
     for device in hairy_capture.rig.cameras:
         mask = masks[device.name]
-        assert mask.source == "photometry"
+        assert mask.source == "light and lines"
         assert iou(mask.hair, upper(device)[1]) > 0.9
         assert not (mask.hair & mask.skin).any()
         assert np.array_equal(mask.hair | mask.skin, mask.subject)
@@ -182,3 +183,57 @@ def test_hair_that_lies_flat_on_the_head_is_hair_where_the_light_says_so():
     np.testing.assert_array_equal((contrast > level)[0], [True, True, True, True, False])
     # nothing is far from matte: the points' word, that it lies on the head, stands
     assert _threshold(0.2 * contrast, subject, hair, flat) == np.inf
+
+
+def fur(shape: tuple[int, int], hair: np.ndarray, seed: int, noise: float = 0.01) -> np.ndarray:
+    """A lit picture: smooth shading with a nose's edge, and lines two pixels wide where hair is."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    skin = 1 + 0.5 * np.sin(x / 20) + 0.3 * (y > 70)
+    lines = ndimage.gaussian_filter(rng.normal(size=shape), (6.0, 0.8))
+    lines = 1 + 0.4 * lines / lines.std()
+    return np.where(hair, 0.4 * np.maximum(lines, 0), skin) + noise * rng.normal(size=shape)
+
+
+def test_lines_alone_tell_hair_in_views_of_the_face_and_of_the_back() -> None:
+    subject = np.zeros((120, 120), bool)
+    subject[8:112, 8:112] = True
+    y, _ = np.mgrid[:120, :120]
+    truth = {"face": y < 50, "back": y < 200, "nape": y < 100}
+    subjects = dict.fromkeys(truth, subject)
+    features = {
+        name: line_strength(fur((120, 120), hair, k), subject)[None]
+        for k, (name, hair) in enumerate(truth.items())
+    }
+    scores = tell_apart(features, subjects)
+    assert scores is not None
+    for name, hair in truth.items():
+        assert iou(subject & (scores[name] > 0), subject & hair) > 0.8  # edges answer, too
+        assert not scores[name][~subject].any()
+
+
+def test_a_feature_that_says_nothing_does_not_count() -> None:
+    rng = np.random.default_rng(0)
+    hair = np.arange(6400).reshape(80, 80) < 4000
+    good = np.where(hair, 1.0, 0.0) + 0.1 * rng.normal(size=hair.shape)
+    whole = {"c": np.ones_like(hair)}
+    for other in (0.1 * rng.normal(size=hair.shape), np.zeros(hair.shape)):
+        scores = tell_apart({"c": np.stack([good, other])}, whole)
+        assert scores is not None
+        assert iou(scores["c"] > 0, hair) > 0.98
+
+
+def test_one_class_is_not_split() -> None:
+    rng = np.random.default_rng(1)
+    whole = {"c": np.ones((90, 90), bool)}
+    assert tell_apart({"c": rng.normal(size=(2, 90, 90))}, whole) is None
+    assert tell_apart({"c": np.zeros((2, 90, 90))}, whole) is None
+    assert tell_apart({"c": np.zeros((2, 90, 90))}, {"c": np.zeros((90, 90), bool)}) is None
+    values = rng.normal(size=10_000)
+    assert otsu(values)[0] == pytest.approx(0, abs=0.05)
+    assert otsu(values)[1] == pytest.approx(2.65, abs=0.05)
+    level, apart = otsu(np.r_[values, 8 + values])
+    assert 2 < level < 5
+    assert apart == pytest.approx(8, abs=0.2)
+    assert otsu(np.r_[np.zeros(50), np.ones(50)])[0] == 0
+    assert otsu(np.ones(5)) == (np.inf, 0.0)
