@@ -67,6 +67,24 @@ def test_perpendicular_lightings_cancel() -> None:
     assert np.median(found.confidence[20:44, 20:44]) < 0.1
 
 
+@pytest.mark.parametrize("degrees", [0.0, 17.3, 133.7])
+def test_lines_under_noise_add_up_over_lightings(degrees: float) -> None:
+    """48 noisy pictures of one grating: their summed answers tell it, their winners less so."""
+    rng = np.random.default_rng(5)
+    line = grating(np.radians(degrees), 64, 5.0)
+    pictures = 1 + 0.3 * (line - 1) + 0.5 * rng.normal(size=(48, 64, 64))
+    mask = np.ones((64, 64), bool)
+    bank = LogGaborBank(count=32, spread=1.0, wavelength=5.0)
+    errors = [
+        difference(orientations(pictures, mask, bank, merge).angle, np.radians(degrees))
+        for merge in ("responses", "angles")
+    ]
+    assert np.median(errors[0][16:48, 16:48]) < 2
+    assert np.mean(errors[0]) < np.mean(errors[1])
+    dark = orientations(0 * pictures, mask, bank, "responses")
+    assert dark.confidence.max() == 0
+
+
 def test_magnitude_does_not_depend_on_phase() -> None:
     bank = LogGaborBank(count=8, spread=1.0)
     a, b = (bank.responses(grating(0.0, phase=p))[0, 20:44, 20:44] for p in (0.0, np.pi / 2))
