@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -147,13 +148,31 @@ def depth_map(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float6
 
 
 def mesh_depth(camera: Camera, mesh: Mesh) -> NDArray[np.float64]:
-    """Depth `(H, W)` along z of the mesh's nearest surface, infinite where it is not seen."""
-    focal = max(camera.K[0, 0], camera.K[1, 1])
-    nearest = max(float(camera.project(mesh.vertices)[1].min()), 1e-3)
-    points = surface_samples(mesh, 0.5 * nearest / focal)[0]
-    pixels, depth = camera.project(points)
-    ok = (depth > 0) & camera.inside(pixels)
-    x, y = np.rint(pixels[ok]).astype(int).T
-    out = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(out, (y, x), depth[ok])
+    """Depth `(H, W)` along z of the mesh's nearest surface, infinite where it is not seen.
+
+    Faces are painted from far to near, each pixel takes its face's plane: right where faces are
+    small against the distances between surfaces that hide each other. Faces that reach behind the
+    camera are left out.
+    """
+    pixels, depth = camera.project(mesh.vertices)
+    corners = depth[mesh.faces]
+    limit = 30.0 * max(camera.width, camera.height)  # keeps the fixed-point numbers in range
+    usable = (corners > 1e-3).all(axis=1) & (np.abs(pixels[mesh.faces]) < limit).all(axis=(1, 2))
+    order = np.flatnonzero(usable)
+    order = order[np.argsort(-corners[order].mean(axis=1), kind="stable")]
+    painted = np.full((camera.height, camera.width), -1, np.int32)
+    shift = 4  # OpenCV's fixed-point bits below the pixel
+    triangles = np.rint(pixels[mesh.faces[order]] * (1 << shift)).astype(np.int32)
+    for face, triangle in zip(order.tolist(), triangles, strict=True):
+        cv2.fillConvexPoly(painted, triangle, face, lineType=cv2.LINE_8, shift=shift)
+    out = np.full(painted.shape, np.inf)
+    y, x = np.nonzero(painted >= 0)
+    face = painted[y, x]
+    rays = camera.rays(np.stack([x, y], axis=1))
+    normals, base = mesh.face_normals()[face], mesh.vertices[mesh.faces[face, 0]]
+    slope = np.einsum("nk,nk->n", normals, rays)
+    reach = np.einsum("nk,nk->n", normals, base - camera.center)
+    along = reach / np.where(np.abs(slope) > 1e-9, slope, np.inf) * (rays @ camera.R[2])
+    low, high = corners[face].min(axis=1), corners[face].max(axis=1)
+    out[y, x] = np.clip(along, low, high)  # an edge's pixel may lie just beside its face
     return out

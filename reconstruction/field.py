@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.laplace import conjugate_gradients, explicit_diffusion, grid_laplacian
@@ -90,6 +90,15 @@ class OrientationField:
     def valid(self) -> Bools:
         """Voxels `(M,)` with an orientation."""
         return np.asarray(~(self.empty | self.degenerate))
+
+    def near_measured(self, reach: float) -> Bools:
+        """Voxels `(M,)` within `reach` metres, centre to centre, of a measured one."""
+        measured = np.zeros(self.grid.inside.shape, bool)
+        measured[self.grid.inside] = self.measured
+        if not measured.any():
+            return np.zeros(len(self.directions), bool)
+        away = ndimage.distance_transform_edt(~measured, sampling=self.grid.spacing)
+        return np.asarray(away[self.grid.inside] <= reach)
 
     def voxel(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         """The number `(N,)` of the envelope voxel that holds each point, -1 outside."""

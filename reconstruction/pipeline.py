@@ -46,6 +46,9 @@ from reconstruction.visual_hull import VoxelGrid, visual_hull
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_BARE = 2e-3
+"""Metres behind the head's surface up to which a pixel of skin rules hair out."""
+
 HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
@@ -270,25 +273,28 @@ def build_envelope(
     """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels.
 
     The visual hull of everything that is not background, less the head's inside, less what a
-    camera saw through: voxels in front of a triangulated hair pixel, or of the head where the
-    pixel shows skin. Without a sweep, hair pixels carve nothing, and their depth is where the
-    ray enters the envelope.
+    camera saw through: voxels in front of a triangulated hair pixel, or on the head and in front of
+    it where the pixel shows skin. A pixel has one depth and may look past a thin wisp: where
+    triangulated points of hair stand, there is hair. Without a sweep, hair pixels carve nothing,
+    and their depth is where the ray enters the envelope.
     """
     cameras = [c for c in capture.rig.cameras if c.name in masks]
     bounds = _bounds(cloud, head)
     hull = visual_hull(
         cameras, {k: m.subject for k, m in masks.items()}, spacing=options.grid, bounds=bounds
     )
-    surfaces, depths = {}, {}
+    surfaces, depths, hairs = {}, {}, []
     for camera in cameras:
         mask = masks[camera.name]
-        skin = mesh_depth(camera, head)
+        bare = mesh_depth(camera, head) + _BARE + options.margin
         own = cloud.of_camera(camera.name).points if len(cloud) else cloud.points
         depth = np.where(mask.hair, depth_map(camera, own), 0.0)
-        first = np.where(mask.hair, depth, np.where(np.isfinite(skin), skin, 0.0))
+        first = np.where(mask.hair, depth, np.where(np.isfinite(bare), bare, 0.0))
         surfaces[camera.name], depths[camera.name] = first, depth
+        hairs.append(own[_on(mask.hair, camera, own)])
     carved = carve(hull, cameras, surfaces, options.margin)
-    inside = carved.inside & ~inside_mesh(hull, head)
+    held = hull.inside & _holding(hull, np.concatenate(hairs))
+    inside = (carved.inside | held) & ~inside_mesh(hull, head)
     envelope = replace(carved, inside=inside)
     for camera in cameras:
         depth = depths[camera.name]
@@ -312,6 +318,23 @@ def build_envelope(
             f"{capture.path}: no volume is left for hair: check masks, head.obj and poses"
         )
     return envelope, depths
+
+
+def _on(mask: Bools, camera: Camera, points: Array) -> Bools:
+    """Which of `points (N, 3)` fall on `mask (H, W)`."""
+    pixels, depth = camera.project(points)
+    seen = (depth > 0) & camera.inside(pixels)
+    x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+    return np.asarray(seen & mask[y, x])
+
+
+def _holding(grid: VoxelGrid, points: Array) -> Bools:
+    """Voxels `grid.inside.shape` with at least two of `points (N, 3)`."""
+    index = grid.index(points)
+    index = index[((index >= 0) & (index < grid.inside.shape)).all(axis=1)]
+    flat = np.ravel_multi_index(tuple(index.T), grid.inside.shape)
+    counts = np.bincount(flat, minlength=grid.inside.size)
+    return np.asarray(counts.reshape(grid.inside.shape) >= 2)
 
 
 def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:

@@ -147,6 +147,16 @@ def test_gaps_are_filled_and_reproducibly() -> None:
     assert all(np.ptp(p[:, 2]) > 0.028 for p in first)
 
 
+def test_no_gap_is_filled_that_no_strand_leads_to_from_what_was_measured() -> None:
+    whole = analytic(up, (31, 15, 31))
+    near = whole.grid.centers()[:, 0] < 0
+    field = dataclasses.replace(whole, measured=near)
+    strands = fill_gaps(field, Coverage(field), seed=4, within=2e-3)
+    assert strands
+    assert max(float(s[:, 0].max()) for s in strands) < 3e-3
+    assert not fill_gaps(dataclasses.replace(whole, measured=near & False), Coverage(field), seed=4)
+
+
 def flat_scalp() -> Scalp:
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.02, 0.02, 21)] * 2))
     mesh = Mesh(
