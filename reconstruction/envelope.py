@@ -163,8 +163,8 @@ def mesh_depth(camera: Camera, mesh: Mesh) -> NDArray[np.float64]:
     painted = np.full((camera.height, camera.width), -1, np.int32)
     shift = 4  # OpenCV's fixed-point bits below the pixel
     triangles = np.rint(pixels[mesh.faces[order]] * (1 << shift)).astype(np.int32)
-    for face, triangle in zip(order.tolist(), triangles, strict=True):
-        cv2.fillConvexPoly(painted, triangle, face, lineType=cv2.LINE_8, shift=shift)
+    for number, triangle in zip(order.tolist(), triangles, strict=True):
+        cv2.fillConvexPoly(painted, triangle, number, lineType=cv2.LINE_8, shift=shift)
     out = np.full(painted.shape, np.inf)
     y, x = np.nonzero(painted >= 0)
     face = painted[y, x]
