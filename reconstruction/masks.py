@@ -8,6 +8,7 @@ decides. Without a head mesh, the light and the fineness of the lines do (`hair_
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
+from reconstruction.capture import Capture, CaptureError
 from reconstruction.hair_features import (
     FAINTEST_LINES,
     light_contrast,
@@ -28,6 +29,7 @@ from reconstruction.hair_features import (
 )
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.mesh import Mesh
+from reconstruction.report import Stage
 from reconstruction.segmentation import Network
 from reconstruction.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
 
@@ -90,6 +92,27 @@ def hair_masks(
         else:
             unknown[camera.name] = subject
     return masks | _by_looks(capture, unknown)
+
+
+def usable_masks(
+    capture: Capture, masks: Mapping[str, HairMask], stage: Stage
+) -> dict[str, HairMask]:
+    """The masks of the cameras of `capture` that see the subject at all; the others are warned of.
+
+    Raises `CaptureError` where fewer than two are left or none of them has hair.
+    """
+    mine = {c.name: masks[c.name] for c in capture.rig.cameras if c.name in masks}
+    out = {name: mask for name, mask in mine.items() if mask.subject.any()}
+    if blind := [c.name for c in capture.rig.cameras if c.name not in out]:
+        stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
+    if not any(mask.hair.any() for mask in out.values()):
+        raise CaptureError(
+            f"{capture.path}: no pixel of any camera is hair: check the lamps, the cameras' poses "
+            "and, where given, the hair masks"
+        )
+    if len(out) < 2:
+        raise CaptureError(f"{capture.path}: only {', '.join(out)} sees the subject, not two")
+    return out
 
 
 def _by_looks(capture: Capture, subjects: dict[str, Mask]) -> dict[str, HairMask]:

@@ -142,14 +142,15 @@ def texture(image: Images, mask: Bools, scale: float = 4.0) -> NDArray[np.float3
     """The image's relative detail `(H, W)`: over its mean near by in the mask, less 1.
 
     The mean is a Gaussian one of `scale` pixels. Detail is 0 outside the mask, so the hair's
-    outline and slow shading do not answer as lines.
+    outline and slow shading do not answer as lines, and where there is no light.
     """
     inside = mask.astype(np.float32)
     weight = ndimage.gaussian_filter(inside, scale)
     mean = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), scale)
     floor = 1e-6 * float(np.abs(image[mask]).max(initial=0.0)) + 1e-30
     ratio = image * weight / np.maximum(mean, floor) - 1
-    return np.where(mask, np.clip(ratio, -1.0, 3.0), 0.0).astype(np.float32)
+    lit = mask & (mean > floor)
+    return np.where(lit, np.clip(ratio, -1.0, 3.0), 0.0).astype(np.float32)
 
 
 Merge = Literal["angles", "responses"]

@@ -10,7 +10,7 @@ from pathlib import Path
 _RESET, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
 
-@dataclass
+@dataclass(eq=False)
 class Peak:
     """`gb`: resident memory of the whole process at its peak, GB; None where it is not known."""
 

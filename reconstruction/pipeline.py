@@ -28,7 +28,7 @@ from reconstruction.light_planes import (
     sweep_peaks,
     triangulate,
 )
-from reconstruction.masks import HairMask, hair_masks
+from reconstruction.masks import HairMask, hair_masks, usable_masks
 from reconstruction.measure import Measured, MeasureOptions, measure_tangents
 from reconstruction.mesh import Mesh
 from reconstruction.methods import METHODS, Method
@@ -133,7 +133,7 @@ def reconstruct(
             for kind, pixels in (("hair", mask.hair), ("skin", mask.skin)):
                 image = as_shot(whole, name, pixels).astype(np.uint8) * 255
                 cv2.imwrite(str(model / "masks" / f"{name}_{kind}.png"), image)
-        masks = {k: m for k, m in every.items() if k not in options.held_out}
+        masks = usable_masks(capture, every, stage)
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
         stage.figures["source"] = {k: m.source for k, m in masks.items()}
     if method in ("photometric", "lmvs"):

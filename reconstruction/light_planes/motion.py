@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +24,8 @@ class Motion:
                           tracking frames
     still                 nothing moved by more than the noise of the measurement
     determined            directions of motion, of 6, that the cameras determine (the least)
+    lost (L,)             `Step.index` of tracking frames whose pose could not be found: nothing is
+                          known from the tracking frame before each to the one after it
     """
 
     steps: NDArray[np.int64]
@@ -32,6 +34,7 @@ class Motion:
     between: Between = "interpolate"
     still: bool = False
     determined: int = 6
+    lost: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         t = len(self.steps)
@@ -64,6 +67,19 @@ class Motion:
         columns = [np.interp(time, knots, self.translations[:, k]) for k in range(3)]
         return np.asarray(rotations), np.stack(columns, axis=1)
 
+    def known(self, steps: ArrayLike) -> NDArray[np.bool_]:
+        """Whether the pose at the steps `(N,)` is known: no lost tracking frame has a say in it."""
+        index = np.asarray(steps, np.int64).reshape(-1)
+        if not len(self.lost):
+            return np.ones(len(index), bool)
+        frames = np.sort(np.concatenate([self.steps, self.lost]))
+        lost = np.isin(frames, self.lost)
+        before = np.clip(np.searchsorted(frames, index, side="right") - 1, 0, len(frames) - 1)
+        unknown = lost[before]
+        if self.between == "interpolate":
+            unknown |= lost[np.minimum(before + 1, len(frames) - 1)] & (index > frames[before])
+        return ~unknown
+
     def undo(
         self, steps: ArrayLike, points: Array, view: Array, covariance: Array
     ) -> tuple[Array, Array, Array]:
@@ -83,4 +99,5 @@ class Motion:
             "between": self.between,
             "still": self.still,
             "determined": self.determined,
+            "lost": self.lost.tolist(),
         }

@@ -8,8 +8,7 @@ it starts from the registered motion and uses every pixel instead of three numbe
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -30,11 +29,26 @@ from reconstruction.light_planes.registration import (
     smooth,
     spline,
 )
+from reconstruction.light_planes.rigid_fit import (
+    Determination,
+    Pose,
+    flow,
+    gauss_newton,
+    numeric,
+)
 from reconstruction.report import Progress, Stage, silent
 from reconstruction.silhouettes import dark_frame
 
 Array = NDArray[np.float64]
-LEVER = 0.1  # metres: rotations count by what they move at this distance, so that units agree
+
+SIGMA = 1.5
+"""Pixels of the Gaussian under which pictures are compared."""
+
+ALIKE = 0.6
+"""Likeness under which a tracking frame does not show what the reference shows."""
+
+
+STILL: Pose = (np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -64,6 +78,11 @@ class _View:
     pixels: Array
 
     @cached_property
+    def reference(self) -> Array:
+        """The smoothed reference picture at the points' pixels `(N,)`."""
+        return sample(spline(smooth(self.template.raw, SIGMA)), *self.pixels.T)
+
+    @cached_property
     def offsets(self) -> Array:
         """The points' pixels from their mean `(N, 2)`."""
         return self.pixels - self.pixels.mean(axis=0)
@@ -86,7 +105,9 @@ def solve_motion(
 
     `points` is a cloud made without compensation. A capture without tracking frames, or a subject
     that kept still, gives `Motion.still`, said in `stage`; where the cameras do not determine all
-    six directions, the rest of the motion stays zero, and the stage has a warning.
+    six directions, the rest of the motion stays zero, and the stage has a warning that names it. A
+    frame that looks like the reference in no pose that was found (the subject moved further than
+    the search follows, or was hidden) is lost: the motion says so, and there is a warning.
     """
     options, stage = options or MotionOptions(), stage or Stage("motion")
     steps = [
@@ -99,14 +120,16 @@ def solve_motion(
     if not views:
         stage.warn("no camera could be registered: the subject is taken to have kept still")
         return Motion.none([s.index for s in steps])
-    screened = [
-        [v.template.register(_picture(capture, s, v.camera.name), iterations=1) for v in views
-         if capture.has(s, v.camera.name)]
-        for s in steps[1:]
-    ]  # fmt: skip
-    largest = max(r.largest() for frame in screened for r in frame)
+    largest, moved = 0.0, False
+    for step in steps[1:]:
+        present, images = _present(capture, step, views)
+        quick = [v.template.register(images[v.camera.name], iterations=1) for v in present]
+        largest = max([largest, *(r.largest() for r in quick)])
+        moved |= _moved(quick, options.still_px)
+        # what moved far is registered with so large a residual that it passes for noise
+        moved |= bool(present) and likeness(present, images, STILL) < ALIKE
     stage.figures["largest_2d_motion_px"] = largest
-    if not any(_moved(frame, options.still_px) for frame in screened):
+    if not moved:
         stage.leave_out(
             "motion solve",
             f"nothing moved: at most {largest:.3f} px in {len(steps)} tracking frames",
@@ -124,29 +147,41 @@ def _solve_all(
     progress: Progress,
     stage: Stage,
 ) -> Motion:
-    pose = (np.eye(3), np.zeros(3))
-    poses, residuals, ranks, pairs = [pose], [], [], 0
+    poses, residuals, found_of, pairs = [STILL], [], [], 0
+    kept, lost = [steps[0].index], []
     for i, step in enumerate(steps[1:]):
         progress("motion", i / (len(steps) - 1))
-        images = {
-            v.camera.name: _picture(capture, step, v.camera.name)
-            for v in views
-            if capture.has(step, v.camera.name)
-        }
-        present = [v for v in views if v.camera.name in images]
+        present, images = _present(capture, step, views)
+        if not present:
+            continue
         found = [(v, v.template.register(images[v.camera.name], iterations=15)) for v in present]
         pairs += len(found)
-        pose, rank, residual = from_registrations(found, options.weakest)
+        pose, determined, residual = from_registrations(found, options.weakest)
         if options.method == "direct":
-            pose, rank = align(present, images, pose, options.weakest)
+            pose, determined = align(present, images, pose, options.weakest)
+        if likeness(present, images, pose) < ALIKE:
+            lost.append(step.index)
+            continue
+        kept.append(step.index)
         poses.append(pose)
-        ranks.append(rank)
+        found_of.append(determined)
         residuals.append(residual)
-    rank = min(ranks)
+    if lost:
+        stage.warn(
+            f"{len(lost)} of {len(steps)} tracking frames (the first is step {lost[0]}) look like "
+            "the reference in no pose that was found: the subject moved further than the search "
+            "follows, or was hidden. The stripes between them and their neighbours are left out"
+        )
+        stage.figures["lost_frames"] = len(lost)
+    if not found_of:
+        return replace(Motion.none(kept), lost=np.array(lost), still=False)
+    least = min(found_of, key=lambda d: (d.rank, d.strength[0]))
+    rank = least.rank
     if rank < 6:
         stage.warn(
             f"{len(views)} cameras determine {rank} of 6 directions of motion; the other "
-            f"{6 - rank} are taken as zero. More cameras around the subject would determine them"
+            f"{6 - rank} are taken as zero: {'; '.join(least.missing)}. More cameras around the "
+            "subject would determine them"
         )
     distance = [float(np.linalg.norm(t)) for _, t in poses]
     turn = [float(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())) for R, _ in poses]
@@ -158,142 +193,101 @@ def _solve_all(
         "largest_rotation_deg": float(np.degrees(max(turn))),
         "registration_residual_px": float(np.median(residuals)),
         "determined_directions": rank,
+        "weakest_direction": least.named(1)[0],
+        "weakest_strength": float(least.strength[0]),
     }
     progress("motion", 1.0)
     return Motion(
-        np.array([s.index for s in steps]),
+        np.array(kept),
         np.stack([R for R, _ in poses]),
         np.stack([t for _, t in poses]),
         between=options.between,
         determined=rank,
+        lost=np.array(lost, np.int64),
     )
 
 
 def from_registrations(
     found: list[tuple[_View, Registration]], weakest: float
-) -> tuple[tuple[Array, Array], int, float]:
+) -> tuple[Pose, Determination, float]:
     """The motion that best explains 2D registrations (Photobooth Eq. 2), robustly.
 
     Three equations a camera: the mean shift of its points in its picture, and their turn at the
-    points' rms distance. Returns the pose, how many directions are determined, and the rms residual
-    in pixels.
+    points' rms distance. Returns the pose, how well it is determined, and the rms residual in
+    pixels.
     """
     target = np.concatenate(
         [[*_rigid_at(r, v.pixels.mean(axis=0)), r.angle * v.spread] for v, r in found]
     )
 
-    def residual(pose: tuple[Array, Array]) -> Array:
-        flow = []
+    def residual(pose: Pose) -> Array:
+        shifts = []
         for view, _ in found:
             moved, _ = view.camera.project(view.points @ pose[0].T + pose[1])
             x, y = view.offsets.T
             # offsets about their mean: the moved pixels' own mean drops out of both sums
             angle = np.arctan2(x @ moved[:, 1] - y @ moved[:, 0], x @ moved[:, 0] + y @ moved[:, 1])
             shift = (moved - view.pixels).mean(axis=0)
-            flow.append([*shift, angle * view.spread])
-        return np.concatenate(flow) - target
+            shifts.append([*shift, angle * view.spread])
+        return np.concatenate(shifts) - target
 
-    pose, rank = _gauss_newton(lambda p: (residual(p), _numeric(residual, p)), weakest, 12)
-    return pose, rank, float(np.sqrt(np.mean(residual(pose) ** 2)))
+    pose, determined = gauss_newton(lambda p: (residual(p), numeric(residual, p)), weakest, 12)
+    return pose, determined, float(np.sqrt(np.mean(residual(pose) ** 2)))
 
 
 def align(
     views: list[_View],
     images: dict[str, Array],
-    start: tuple[Array, Array],
+    start: Pose,
     weakest: float,
-    sigmas: tuple[float, ...] = (1.5,),
-) -> tuple[tuple[Array, Array], int]:
+) -> tuple[Pose, Determination]:
     """The motion under which every camera's picture at the moved points equals its reference.
 
-    `images[camera] (H, W)`; over Gaussians of `sigmas` pixels, in this order. Returns the pose and
-    how many directions are determined.
+    `images[camera] (H, W)`. Returns the pose and how well it is determined.
     """
-    pose, rank = start, 0
-    for sigma in sigmas:
-        prepared = []
-        for view in views:
-            picture = smooth(images[view.camera.name], sigma)
-            reference = spline(smooth(view.template.raw, sigma))
-            value = sample(reference, *view.pixels.T)
-            gx, gy = gradients(picture)
-            prepared.append((view, spline(picture), (spline(gx), spline(gy)), value))
+    prepared = []
+    for view in views:
+        picture = smooth(images[view.camera.name], SIGMA)
+        gx, gy = gradients(picture)
+        prepared.append((view, spline(picture), spline(gx), spline(gy)))
 
-        def system(
-            pose: tuple[Array, Array],
-            prepared: list[tuple[_View, Array, tuple[Array, Array], Array]] = prepared,
-        ) -> tuple[Array, Array]:
-            errors, rows = [], []
-            for view, picture, (gx, gy), value in prepared:
-                moved = view.points @ pose[0].T + pose[1]
-                pixels, depth = view.camera.project(moved)
-                u, v = pixels.T
-                now = sample(picture, u, v)
-                gain = float(now @ value) / max(float(value @ value), np.finfo(float).tiny)
-                scale = 1.0 / max(float(np.sqrt(np.mean(value**2))), np.finfo(float).tiny)
-                slope = np.stack([sample(gx, u, v), sample(gy, u, v)], axis=1) * scale
-                inside = view.camera.inside(pixels) & (depth > 0)
-                errors.append((now - gain * value) * scale * inside)
-                rows.append(_flow(slope, view.camera, moved, depth) * inside[:, None])
-            return np.concatenate(errors), np.concatenate(rows)
+    def system(pose: Pose) -> tuple[Array, Array]:
+        errors, rows = [], []
+        for view, picture, gx, gy in prepared:
+            moved, value = view.points @ pose[0].T + pose[1], view.reference
+            pixels, depth = view.camera.project(moved)
+            u, v = pixels.T
+            now = sample(picture, u, v)
+            gain = float(now @ value) / max(float(value @ value), np.finfo(float).tiny)
+            scale = 1.0 / max(float(np.sqrt(np.mean(value**2))), np.finfo(float).tiny)
+            slope = np.stack([sample(gx, u, v), sample(gy, u, v)], axis=1) * scale
+            inside = view.camera.inside(pixels) & (depth > 0)
+            errors.append((now - gain * value) * scale * inside)
+            rows.append(flow(slope, view.camera, moved, depth) * inside[:, None])
+        return np.concatenate(errors), np.concatenate(rows)
 
-        pose, rank = _gauss_newton(system, weakest, 10, pose)
-    return pose, rank
+    return gauss_newton(system, weakest, 10, start)
 
 
-def _gauss_newton(
-    system: Callable[[tuple[Array, Array]], tuple[Array, Array]],
-    weakest: float,
-    iterations: int,
-    start: tuple[Array, Array] | None = None,
-) -> tuple[tuple[Array, Array], int]:
-    """Minimise Huber's loss over rigid motions; directions that are not determined stay put.
+def likeness(views: list[_View], images: dict[str, Array], pose: Pose) -> float:
+    """How alike the pictures at the moved points and the reference are: correlation, at most 1.
 
-    `system(pose)` gives the residuals (M,) and their derivatives (M, 6) by a turn times `LEVER` and
-    a shift, both applied after the pose.
+    The median over the cameras; what left a picture counts as unlike.
     """
-    rotation, translation = start if start is not None else (np.eye(3), np.zeros(3))
-    rank = 0
-    for _ in range(iterations):
-        error, rows = system((rotation, translation))
-        scale = 1.4826 * float(np.median(np.abs(error)))
-        size = np.maximum(np.abs(error), np.finfo(float).tiny)
-        weight = np.minimum(1.0, 1.345 * scale / size) if scale > 0 else np.ones_like(error)
-        values, vectors = np.linalg.eigh(rows.T @ (rows * weight[:, None]))
-        strong = values > weakest**2 * max(float(values[-1]), np.finfo(float).tiny)
-        rank = int(strong.sum())
-        basis = vectors[:, strong]
-        step = -basis @ ((basis.T @ (rows.T @ (weight * error))) / values[strong])
-        turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
-        rotation, translation = turn @ rotation, turn @ translation + step[3:]
-        if np.abs(step).max() < 1e-6:  # metres: a thousandth of a pixel
-            break
-    return (rotation, translation), rank
-
-
-def _numeric(residual: Callable[[tuple[Array, Array]], Array], pose: tuple[Array, Array]) -> Array:
-    columns = []
-    for k in range(6):
-        both = []
-        for sign in (1.0, -1.0):
-            step = np.zeros(6)
-            step[k] = sign * 1e-5
-            turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
-            both.append(residual((turn @ pose[0], turn @ pose[1] + step[3:])))
-        columns.append((both[0] - both[1]) / 2e-5)
-    return np.stack(columns, axis=1)
-
-
-def _flow(slope: Array, camera: Camera, points: Array, depth: Array) -> Array:
-    """Derivatives `(N, 6)` of a picture with `slope (N, 2)` at `points (N, 3)` by a rigid step."""
-    local = points @ camera.R.T + camera.t
-    z = np.where(depth > 0, depth, 1.0)
-    x, y = local[:, 0] / z, local[:, 1] / z
-    a = slope[:, 0] * camera.K[0, 0]
-    b = slope[:, 0] * camera.K[0, 1] + slope[:, 1] * camera.K[1, 1]
-    by_point = np.stack([a / z, b / z, -(a * x + b * y) / z], axis=1) @ camera.R
-    # d(w x p) . g = w . (p x g)
-    return np.concatenate([np.cross(points, by_point) / LEVER, by_point], axis=1)
+    out = []
+    for view in views:
+        pixels, depth = view.camera.project(view.points @ pose[0].T + pose[1])
+        inside = view.camera.inside(pixels) & (depth > 0)
+        if inside.sum() < 10:
+            out.append(0.0)
+            continue
+        places = pixels[inside].T[::-1]
+        now = ndimage.map_coordinates(smooth(images[view.camera.name], SIGMA), places, order=1)
+        value = view.reference[inside]
+        now, value = now - now.mean(), value - value.mean()
+        size = float(np.sqrt((now @ now) * (value @ value)))
+        out.append(float(now @ value) / max(size, np.finfo(float).tiny) * float(inside.mean()))
+    return float(np.median(out))
 
 
 def _views(
@@ -334,6 +328,14 @@ def _picture(capture: Capture, step: Step, camera: str) -> Array:
     dark = dark_frame(capture, camera, step.exposure)
     image = capture.frame(step, camera).mean(axis=-1) - dark
     return np.asarray(np.sqrt(np.maximum(image, 0) / (step.level or 1.0)), np.float64)
+
+
+def _present(
+    capture: Capture, step: Step, views: list[_View]
+) -> tuple[list[_View], dict[str, Array]]:
+    """The views that have a picture of this step, and the pictures."""
+    present = [v for v in views if capture.has(step, v.camera.name)]
+    return present, {v.camera.name: _picture(capture, step, v.camera.name) for v in present}
 
 
 def _moved(frame: list[Registration], still_px: float) -> bool:

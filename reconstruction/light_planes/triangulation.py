@@ -79,7 +79,8 @@ def triangulate(
 ) -> PointCloud:
     """Points of all cameras and projectors in the reference pose.
 
-    `motion` undoes the subject's motion step by step (None: it did not move); `peaks` are those of
+    `motion` undoes the subject's motion step by step (None: it did not move), and stripes of steps
+    whose pose is not known are left out; `peaks` are those of
     `sweep_peaks` where they are already known. Figures and warnings go into `stage`. Raises
     `CaptureError` for a capture without a sweep; a sweep that lit nothing gives an empty cloud.
     """
@@ -160,6 +161,8 @@ def intersect(
     covariance = (along**2)[:, None, None] * outer
     covariance += (across**2)[:, None, None] * (np.eye(3) - outer)
     view = -rays
+    if motion is not None:
+        usable &= motion.known(peaks.step)
     if motion is not None and not motion.still:
         points, view, covariance = motion.undo(peaks.step, points, view, covariance)
     n = int(usable.sum())

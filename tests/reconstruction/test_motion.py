@@ -163,7 +163,19 @@ def test_one_camera_determines_a_part_and_says_so(
         capture, triangulate(capture), options=MotionOptions(method="registered"), stage=stage
     )
     assert motion.determined == 3
-    assert any("3 of 6 directions" in w for w in stage.warnings)
+    (warning,) = [w for w in stage.warnings if "3 of 6 directions" in w]
+    missing = warning.split("zero: ")[1].split(". More")[0].split("; ")
+    assert len(missing) == 3
+    assert all("shift along" in m and "turn about" in m for m in missing)
+    assert stage.figures["weakest_strength"] < 0.02
+    # every pixel on its own tells more: the distance to the camera is what it tells worst
+    stage = Stage("motion")
+    assert solve_motion(capture, triangulate(capture), stage=stage).determined == 6
+    assert stage.figures["weakest_strength"] < 0.1
+    words = stage.figures["weakest_direction"]
+    assert words.startswith("shift along (")
+    axis = np.array([float(x) for x in words[13:-1].split(", ")])
+    assert abs(axis @ capture.rig.cameras[0].R[2]) > 0.9
     assert np.isfinite(motion.translations).all()
     # what the camera sees is explained all the same
     device = capture.rig.cameras[0]

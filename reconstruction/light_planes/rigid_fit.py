@@ -1,0 +1,111 @@
+"""Rigid motions by Gauss-Newton steps: robust, and still where nothing determines them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from reconstruction.cameras import Camera
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+LEVER = 0.1  # metres: rotations count by what they move at this distance, so that units agree
+
+
+@dataclass(frozen=True, eq=False)
+class Determination:
+    """How well a solve determined its six directions of motion.
+
+    `strength (6,)` are the singular values of its derivatives over the largest, smallest first, and
+    `directions (6, 6)` their columns: a turn about the world's origin times `LEVER`, then a shift.
+    Directions weaker than `weakest` were left as they were.
+    """
+
+    strength: Array
+    directions: Array
+    weakest: float
+
+    @property
+    def rank(self) -> int:
+        """How many directions are determined."""
+        return int((self.strength > self.weakest).sum())
+
+    def named(self, count: int) -> list[str]:
+        """The `count` weakest directions in words."""
+        return [_in_words(d) for d in self.directions.T[:count]]
+
+    @property
+    def missing(self) -> list[str]:
+        """The directions that are not determined, in words."""
+        return self.named(6 - self.rank)
+
+
+def _in_words(direction: Array) -> str:
+    parts = []
+    for what, part in (("turn about", direction[:3]), ("shift along", direction[3:])):
+        size = float(np.linalg.norm(part))
+        if size > 0.3:
+            x, y, z = np.round(part / size, 1) + 0.0  # no minus zero
+            parts.append(f"{what} ({x:g}, {y:g}, {z:g})")
+    return " with ".join(parts)
+
+
+def gauss_newton(
+    system: Callable[[Pose], tuple[Array, Array]],
+    weakest: float,
+    iterations: int,
+    start: Pose | None = None,
+) -> tuple[Pose, Determination]:
+    """Minimise Huber's loss over rigid motions; directions that are not determined stay put.
+
+    `system(pose)` gives the residuals (M,) and their derivatives (M, 6) by a turn times `LEVER` and
+    a shift, both applied after the pose.
+    """
+    rotation, translation = start if start is not None else (np.eye(3), np.zeros(3))
+    found = Determination(np.zeros(6), np.eye(6), weakest)
+    for _ in range(iterations):
+        error, rows = system((rotation, translation))
+        scale = 1.4826 * float(np.median(np.abs(error)))
+        size = np.maximum(np.abs(error), np.finfo(float).tiny)
+        weight = np.minimum(1.0, 1.345 * scale / size) if scale > 0 else np.ones_like(error)
+        values, vectors = np.linalg.eigh(rows.T @ (rows * weight[:, None]))
+        relative = np.maximum(values, 0) / max(float(values[-1]), np.finfo(float).tiny)
+        found = Determination(np.sqrt(relative), vectors, weakest)
+        strong = found.strength > weakest
+        basis = vectors[:, strong]
+        step = -basis @ ((basis.T @ (rows.T @ (weight * error))) / values[strong])
+        turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
+        rotation, translation = turn @ rotation, turn @ translation + step[3:]
+        if np.abs(step).max() < 1e-6:  # metres: a thousandth of a pixel
+            break
+    return (rotation, translation), found
+
+
+def numeric(residual: Callable[[Pose], Array], pose: Pose) -> Array:
+    """Derivatives `(M, 6)` of residuals by central differences."""
+    columns = []
+    for k in range(6):
+        both = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(6)
+            step[k] = sign * 1e-5
+            turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()
+            both.append(residual((turn @ pose[0], turn @ pose[1] + step[3:])))
+        columns.append((both[0] - both[1]) / 2e-5)
+    return np.stack(columns, axis=1)
+
+
+def flow(slope: Array, camera: Camera, points: Array, depth: Array) -> Array:
+    """Derivatives `(N, 6)` of a picture with `slope (N, 2)` at `points (N, 3)` by a rigid step."""
+    local = points @ camera.R.T + camera.t
+    z = np.where(depth > 0, depth, 1.0)
+    x, y = local[:, 0] / z, local[:, 1] / z
+    a = slope[:, 0] * camera.K[0, 0]
+    b = slope[:, 0] * camera.K[0, 1] + slope[:, 1] * camera.K[1, 1]
+    by_point = np.stack([a / z, b / z, -(a * x + b * y) / z], axis=1) @ camera.R
+    # d(w x p) . g = w . (p x g)
+    return np.concatenate([np.cross(points, by_point) / LEVER, by_point], axis=1)
