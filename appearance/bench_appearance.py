@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.fit import FitOptions
+from appearance.hair_appearance import HairAppearance
 from appearance.hair_maps import HairMaps, MappedStrands
 from appearance.metrics import LPIPS_UNAVAILABLE, psnr, ssim
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.stage1.loop import ROWS, Stage1Options, run
-from appearance.stage1.problem import Problem
+from appearance.stage1.problem import Effort, Problem
 from appearance.stage1.start import hair_inverse
-from appearance.stage1.subjects import Captured
+from appearance.stage1.subjects import SUBJECTS, Captured, Rig, subject
 from appearance.stage1.unknowns import Lamps
 from reconstruction.lights import Light
+from reconstruction.mesh import Mesh
 from reconstruction.report import Progress, Stage, silent
+from reconstruction.strands import Strands
 
 Array = NDArray[np.float64]
 GROUPS = ("train views", "held-out views")
 BASELINES = ("mean colour", "three nearest", "HairInverse")
 TRUTH = "truth, fresh numbers"
 """The true parameters on the true strands: how far a PSNR can go with this much noise."""
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """A method's pictures against the captured ones, and the parameters behind them."""
-
-    figures: dict[str, Any]
-    seconds: float
 
 
 class Table:
@@ -82,7 +77,7 @@ class Table:
             captured.mapped.scene, self.training, options=quick, stage=stage, seed=self.seed
         )
         maps = HairMaps.of(hair)
-        self._maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
+        self.score_maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
         self.rows["HairInverse"]["warnings"] = stage.warnings
         lamps = None
         problem = Problem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
@@ -98,14 +93,14 @@ class Table:
                 progress=lambda what, share, row=row: self.progress(f"{row}: {what}", share),
             )
             maps, lamps = found.maps, found.lamps
-            self._maps(row, maps, captured.mapped, time.perf_counter() - begun)
+            self.score_maps(row, maps, captured.mapped, time.perf_counter() - begun)
             self.rows[row] |= {
                 "ended": found.ended,
                 "steps": found.steps,
                 "gain_spread": float(found.lamps.gain.std()),
                 "history": found.history,
             }
-        self._maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
+        self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
         self.found = maps, lamps or Lamps.calibrated(len(self.training[0].lights))
         return self.rows
 
@@ -113,7 +108,8 @@ class Table:
         """Numbers of the views and of the held-out lights that are compared."""
         return [(k, i) for k in range(len(self.captured.views)) for i in self.captured.held_lights]
 
-    def _maps(self, row: str, maps: HairMaps, mapped: MappedStrands, seconds: float) -> None:
+    def score_maps(self, row: str, maps: HairMaps, mapped: MappedStrands, seconds: float) -> None:
+        """Render `maps` on `mapped` with fresh random numbers and score them as `row`."""
         scene = mapped.painted(maps).with_skin(self.captured.skin)
         held = list(self.captured.held_lights)
         pictures: list[tuple[Array, Array]] = []
@@ -193,7 +189,146 @@ def _image(values: Array, pixels: NDArray[np.int64], size: tuple[int, int]) -> A
     return out.reshape(*size, 3)
 
 
-def write(out: Path, result: dict[str, Any]) -> None:
-    """Leave `appearance.json` and a table, `appearance.md`, in `out`."""
+QUICK = Stage1Options(
+    steps=30,
+    check_every=15,
+    watched_views=2,
+    shape=(6, 12, 12),
+    effort=Effort(pixels=250, spp=24, gradient_spp=8, max_depth=8),
+)
+STAGE = Rig(size=36, cameras=5, lights=12, spp=160)
+PLAIN_STEPS = 4
+"""Of the plain version that are run; the rest of its curve is extrapolated and marked."""
+
+
+def run_bench(
+    out: Path,
+    strands: Strands,
+    head: Mesh | None,
+    hair: HairAppearance,
+    skin: Array,
+    *,
+    names: Sequence[str] = SUBJECTS,
+    seeds: int = 1,
+    options: Stage1Options = QUICK,
+    rig: Rig = STAGE,
+    plain: bool = True,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The table of every subject, further `seeds` of (b) only, and error against run time on (b).
+
+    Writes `appearance.json` and `appearance.md` into `out` and returns the former.
+    """
+    result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
+    for name in names:
+        captured = subject(name, strands, head, hair, skin, rig, seed)
+        table = Table(captured, options, progress=_named(progress, name), seed=seed)
+        result["subjects"][name] = table.run()
+        if name == "b":
+            result["seeds"] = [
+                _final(Table(captured, options, seed=seed + k).run()) for k in range(1, seeds)
+            ]
+            if plain:
+                result["time"] = error_against_time(captured, options, progress, seed)
     out.mkdir(parents=True, exist_ok=True)
     (out / "appearance.json").write_text(json.dumps(result, indent=1) + "\n")
+    (out / "appearance.md").write_text(markdown(result))
+    return result
+
+
+def error_against_time(
+    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+) -> dict[str, list[dict[str, float]]]:
+    """Held-out PSNR of "spatial" against CPU seconds: ours, and ours with one choice undone.
+
+    "plain" draws pairs evenly, renders whole frames one at a time to a fixed number of bounces, and
+    starts from one colour; of its steps only the first are run. Watching is not counted.
+    """
+    training = captured.training()
+    scale, skin = captured.exposure.scale, captured.skin
+    ours = replace(options, row="spatial", check_every=max(2, options.steps // 3))
+    even = replace(ours, residual_weighted=False, cell_start=False, shared_paths=False)
+    frame = captured.views[0].camera.width * captured.views[0].camera.height
+    versions = {
+        "ours": ours,
+        "one colour first": replace(ours, cell_start=False),
+        "common numbers": replace(ours, common_numbers=True),
+        "even batches": replace(ours, residual_weighted=False),
+        "plain": replace(
+            even,
+            effort=replace(options.effort, pixels=frame, rr_depth=options.effort.max_depth),
+            check_every=1,
+            levels=1,
+            steps=PLAIN_STEPS,
+        ),
+    }
+    start = HairMaps.of(replace(captured.truth.mean(), sigma_a=(0.3, 0.3, 0.3), beta_m=0.4))
+    curves = {}
+    for name, version in versions.items():
+        progress(f"time: {name}", 0.0)
+        views = [_framed(o) for o in training] if name == "plain" else training
+        points: list[tuple[float, HairMaps]] = []
+        problem = Problem(captured.mapped, views, scale, skin)
+        found = run(
+            problem,
+            start,
+            options=version,
+            snapshot=lambda s, m, points=points: points.append((s, m)),
+            seed=seed,
+        )
+        del found
+        table = Table(captured, options, seed=seed)
+        curve = []
+        for seconds, maps in points:
+            table.scorescore_maps("now", maps, captured.mapped, seconds)
+            psnr_clean = table.rows["now"][GROUPS[1]]["psnr_clean"]
+            curve.append({"cpu_seconds": seconds, "psnr_clean": psnr_clean})
+        curves[name] = curve
+    return curves
+
+
+def _framed(o: Observed) -> Observed:
+    """All pixels of the camera, of which those beside the hair do not count."""
+    pixels = np.arange(o.camera.width * o.camera.height)
+    radiance = np.zeros((len(o.lights), len(pixels), 3), np.float32)
+    valid = np.zeros(radiance.shape[:2], bool)
+    radiance[:, o.pixels], valid[:, o.pixels] = o.radiance, o.valid
+    return Observed(o.camera, o.lights, pixels, radiance, valid)
+
+
+def _named(progress: Progress, name: str) -> Progress:
+    return lambda what, share: progress(f"({name}) {what}", share)
+
+
+def _final(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
+    return {name: row[GROUPS[1]]["psnr_clean"] for name, row in rows.items()}
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The tables, for people."""
+    lines = []
+    for name, rows in result["subjects"].items():
+        lines += [
+            f"## Subject ({name})",
+            "",
+            "| row | held-out views, lights: PSNR without noise | PSNR | SSIM | training views, "
+            "held-out lights: PSNR without noise | β_M off | mean σ off | s |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+        for row, figures in rows.items():
+            held, train = figures[GROUPS[1]], figures[GROUPS[0]]
+            off = [
+                f"{100 * figures[k]:+.1f} %" if k in figures else ""
+                for k in ("beta_m_error", "sigma_a_error")
+            ]
+            lines.append(
+                f"| {row} | {held['psnr_clean']:.2f} | {held['psnr']:.2f} | {held['ssim']:.3f} | "
+                f"{train['psnr_clean']:.2f} | {off[0]} | {off[1]} | "
+                f"{figures.get('seconds', 0):.0f} |"
+            )
+        lines.append("")
+    for name, curve in result.get("time", {}).items():
+        points = ", ".join(f"{p['cpu_seconds']:.0f} s: {p['psnr_clean']:.2f}" for p in curve)
+        lines.append(f"- {name}: {points}")
+    return "\n".join(lines) + "\n"

@@ -210,6 +210,9 @@ class SunFit:
                 "the highlight is the same from all of them",
                 f"{1 - len(views) / len(self.hair):.0%} of the renderings",
             )
+        views = [(o, f) for o, f in views if len(o.lights)]
+        if not views:
+            raise ValueError("no light lies near a mirror direction of any hair pixel")
         mean = sum(o.radiance.mean((0, 1)) for o, _ in views)
         channel = int(np.argmin(mean))
         plain, printed, count = self._read(views, channel)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from appearance.hair_appearance import HairAppearance
+from appearance.render.paths import opaque
 from appearance.scene import HairScene
 from reconstruction.mesh import Mesh
 from reconstruction.scalp_map import ScalpMap, sphere_center
@@ -144,6 +145,23 @@ class MappedStrands:
             }
         )
         return replace(self.scene, hair=maps.mean(), hair_bsdf=bsdf)
+
+    def repainted(self, scene: HairScene, maps: HairMaps) -> HairScene:
+        """`scene`, which `painted` made, with other maps on the same BSDF: `scene` changes too."""
+        import mitsuba as mi
+
+        values = mi.traverse(scene.hair_bsdf)
+        values["sigma_a"] = mi.TensorXf(maps.sigma_a.astype(np.float32))
+        values["rotation"] = mi.TensorXf(maps.rotation.astype(np.float32))
+        for name, value in (
+            ("longitudinal_roughness", maps.beta_m),
+            ("azimuthal_roughness", maps.beta_n),
+            ("scale_tilt", -maps.tilt_deg),
+            ("eta", maps.eta),
+        ):
+            values[name] = opaque([value])[0]
+        values.update()
+        return replace(scene, hair=maps.mean())
 
 
 def scalp_coordinates(strands: Strands, head: Mesh | None) -> Array:

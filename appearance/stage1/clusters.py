@@ -28,7 +28,7 @@ _WIDE = 0.02
 
 
 def cell_colours(
-    problem: Problem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 3, seed: int = 0
+    problem: Problem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 6, seed: int = 0
 ) -> HairMaps:
     """The maps of `raw` with each cell's absorption scaled to its captured colour.
 

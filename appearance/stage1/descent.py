@@ -13,18 +13,18 @@ from appearance.stage1.unknowns import Raw
 Array = NDArray[np.float64]
 
 STEP = {
-    "sigma_a": 0.12,
+    "sigma_a": 0.06,
     "rotation": 0.01,
-    "beta_m": 0.12,
-    "beta_n": 0.12,
-    "eta": 0.05,
+    "beta_m": 0.06,
+    "beta_n": 0.06,
+    "eta": 0.03,
     "tilt_deg": 0.2,
     "position": 3e-4,
     "turn": 2e-3,
     "profile": 3e-3,
 }
 """In the unconstrained numbers' units; about a fiftieth of what each may be off at the start."""
-_OF_CELLS = 0.3
+_OF_CELLS = 0.5
 """A cell is told little by a step, and mostly noise: it moves less."""
 _FIRST, _SECOND, _TINY = 0.9, 0.98, 1e-12
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.hair_maps import HairMaps
-from appearance.stage1.batches import Pairs
+from appearance.stage1.batches import Batch, Pairs
 from appearance.stage1.checkpoint import State
 from appearance.stage1.clusters import cell_colours
 from appearance.stage1.gains import Gains
@@ -45,7 +47,8 @@ class Stage1Options:
 
     `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
     reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. There are
-    at most `steps`, of `images` pairs each. `common_numbers` repeats the same random numbers for a
+    at most `steps`, of `images` pairs each: lights of one view on shared paths, or pairs drawn one
+    by one and rendered alone. `common_numbers` repeats the same random numbers for a
     view in every step. `repeatable` gives the same bytes for the same seed, with gradients in a
     single thread. The watched error is that of `watched_views`
     views, every `check_every` steps; after `halvings` of the pace it has converged.
@@ -63,6 +66,7 @@ class Stage1Options:
     lambda_sigma: float = 0.5
     lambda_r: float = 10.0
     residual_weighted: bool = True
+    shared_paths: bool = True
     common_numbers: bool = False
     repeatable: bool = True
     check_every: int = 10
@@ -108,15 +112,20 @@ def run(
     options: Stage1Options | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
+    snapshot: Callable[[float, HairMaps], None] | None = None,
     seed: int = 0,
 ) -> Outcome:
     """Fit from `maps` and `lamps` (the calibration where None); never returns a worse guess.
 
     With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
-    data or options is replaced. The file stays: whoever starts the fit removes it.
+    data or options is replaced. The file stays: whoever starts the fit removes it. `snapshot` is
+    told the CPU seconds that steps have taken and the maps, whenever the error is watched.
     """
     options = options or Stage1Options()
-    return _Fit(problem, maps, lamps, options, checkpoint, progress, seed).run()
+    fit = _Fit(problem, maps, lamps, options, checkpoint, progress, seed)
+    if snapshot is not None:
+        fit.snapshot = snapshot
+    return fit.run()
 
 
 class _Fit:
@@ -139,9 +148,10 @@ class _Fit:
         self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
         self.watched = problem.watched(self.pairs, options.watched_views, options.images)
         self.series: list[tuple[float, int, float]] = []
+        self.snapshot: Callable[[float, HairMaps], None] = lambda seconds, maps: None
 
     def run(self) -> Outcome:
-        begun = time.perf_counter()
+        begun, worked = time.perf_counter(), time.process_time()
         if not self.pairs.used.any():
             return self._unchanged("no pair of camera and light shows lit hair")
         state = self._begun()
@@ -152,8 +162,10 @@ class _Fit:
         spent = self.series[-1][0] if self.series else 0.0
         while state.step < self.options.steps:
             if state.step % self.options.check_every == 0:
+                self.snapshot(time.process_time() - worked, maps_of(state.average))
+                paused = time.process_time()
                 state.history = [list(p) for p in self.series]
-                state.save(self.checkpoint, self._fingerprint())
+                state.save(self.checkpoint, self._fingerprint)
                 error = self._watch(state.average, gains.value, self.seed)
                 self.series.append((spent + time.perf_counter() - begun, state.step, error))
                 share = state.step / self.options.steps
@@ -161,6 +173,7 @@ class _Fit:
                 if state.convergence.tell(error) and self._level(state.step) == self._last_level:
                     ended = "converged"
                     break
+                worked += time.process_time() - paused
             reason = self._step(state, gains)
             if reason:
                 ended = reason
@@ -168,7 +181,7 @@ class _Fit:
         return self._judged(state, gains, ended, spent + time.perf_counter() - begun)
 
     def _begun(self) -> State:
-        saved = State.load(self.checkpoint, self._fingerprint())
+        saved = State.load(self.checkpoint, self._fingerprint)
         if saved is not None:
             return saved
         raw = self._raw(self._first_maps())
@@ -185,6 +198,7 @@ class _Fit:
         even = self._raw(self.start.resized(self._shape(last)))
         return cell_colours(self.problem, even, self.lamps.gain, options.effort, seed=self.seed)
 
+    @cached_property
     def _fingerprint(self) -> str:
         """Of everything that the course of a fit depends on."""
         total = hashlib.sha256(repr((self.options, self.seed, self.problem.scale)).encode())
@@ -205,34 +219,44 @@ class _Fit:
         options = self.options
         rng = np.random.default_rng([self.seed, state.step])
         self._refine(state)
-        batch = self.pairs.draw(options.images, rng)
-        numbers = batch.view if options.common_numbers else state.step
-        first = (self.seed << 16) + 2 * numbers
-        slope = self.problem.slope(
-            state.raw,
-            gains.value,
-            self.free,
-            batch,
-            options.effort,
-            (first, first + 1),
-            rng,
-            loss=options.loss,
-            lambdas=(options.lambda_sigma, options.lambda_r),
-            error=self.series[-1][2],
-            repeatable=options.repeatable,
-        )
-        if not all(np.isfinite(g).all() for g in slope.gradient.values()):
-            return f"step {state.step}: the gradient is not finite"
-        self._pull_to_priors(state.raw, slope.gradient)
-        self.pairs.learn(batch, slope.seen)
-        if self.solves_gains:
-            gains.learn(batch, slope.seen)
-        state.descent.step(state.raw, slope.gradient, state.convergence.pace)
+        total: Raw = {}
+        for k, batch in enumerate(self._batches(rng)):
+            numbers = batch.view if options.common_numbers else state.step * options.images + k
+            first = (self.seed << 20) + 2 * numbers
+            slope = self.problem.slope(
+                state.raw,
+                gains.value,
+                self.free,
+                batch,
+                options.effort,
+                (first, first + 1),
+                rng,
+                loss=options.loss,
+                lambdas=(options.lambda_sigma, options.lambda_r) if k == 0 else (0.0, 0.0),
+                error=self.series[-1][2],
+                repeatable=options.repeatable,
+            )
+            if not all(np.isfinite(g).all() for g in slope.gradient.values()):
+                return f"step {state.step}: the gradient is not finite"
+            self.pairs.learn(batch, slope.seen)
+            if self.solves_gains:
+                gains.learn(batch, slope.seen)
+            for name, value in slope.gradient.items():
+                total[name] = total.get(name, 0.0) + value
+        self._pull_to_priors(state.raw, total)
+        state.descent.step(state.raw, total, state.convergence.pace)
         state.step += 1
         share = max(_LATEST, 1 / (state.step - state.level_began))
         for name, value in state.raw.items():
             state.average[name] = state.average[name] + share * (value - state.average[name])
         return None
+
+    def _batches(self, rng: np.random.Generator) -> list[Batch]:
+        images = self.options.images
+        if self.options.shared_paths:
+            return [self.pairs.draw(images, rng)]
+        alone = [self.pairs.draw(1, rng) for _ in range(images)]
+        return [replace(b, share=b.share / images) for b in alone]
 
     def _pull_to_priors(self, raw: Raw, gradient: Raw) -> None:
         for name, spread in PRIORS.items():

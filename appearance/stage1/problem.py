@@ -14,6 +14,7 @@ from appearance.hair_maps import HairMaps, MappedStrands
 from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat
 from appearance.render.olat import render_olat
+from appearance.scene import HairScene
 from appearance.stage1 import losses
 from appearance.stage1.batches import Batch, Pairs, Seen
 from appearance.stage1.unknowns import Lamps, Raw, hair_values, maps_of, raw_of
@@ -31,8 +32,8 @@ class Effort:
     """
 
     pixels: int = 600
-    spp: int = 16
-    gradient_spp: int = 4
+    spp: int = 24
+    gradient_spp: int = 8
     max_depth: int = 8
     rr_depth: int = 3
 
@@ -56,6 +57,7 @@ class Problem:
     ) -> None:
         self.mapped, self.views, self.scale, self.skin = mapped, tuple(views), scale, skin
         self.lights: tuple[Light, ...] = views[0].lights if views else ()
+        self._painted: HairScene | None = None
         self._level = [
             losses.level(o.radiance * np.float32(scale)).astype(np.float32) for o in self.views
         ]
@@ -157,7 +159,7 @@ class Problem:
         moved = self.lamps_at(raw, gain)
         o = self.views[batch.view]
         radiance = render_olat(
-            self.mapped.painted(maps_of(raw)).with_skin(self.skin),
+            self._scene(raw),
             o.camera,
             [moved[i] for i in batch.lights],
             spp=effort.spp,
@@ -183,10 +185,18 @@ class Problem:
             out.append(Batch(int(view), lights, np.ones(len(lights))))
         return out
 
+    def _scene(self, raw: Raw) -> HairScene:
+        """The one scene of this problem, as `raw` has it."""
+        maps = maps_of(raw)
+        if self._painted is None:
+            self._painted = self.mapped.painted(maps).with_skin(self.skin)
+        self._painted = self.mapped.repainted(self._painted, maps)
+        return self._painted
+
     def _op(
         self, raw: Raw, gain: Array, batch: Batch, few: NDArray[np.int64], effort: Effort
     ) -> DifferentiableOlat:
-        scene = self.mapped.painted(maps_of(raw)).with_skin(self.skin)
+        scene = self._scene(raw)
         moved = self.lamps_at(raw, gain)
         o = self.views[batch.view]
         return DifferentiableOlat(

@@ -111,6 +111,12 @@ def write_usd(path: Path, strands: Strands) -> None:
     replace_durably(temporary, path)
 
 
+def open_curves(path: Path) -> tuple[Any, Any]:
+    """The stage of a file that `write_usd` wrote and its curves, to add primvars to."""
+    stage = Usd.Stage.Open(str(path))
+    return stage, UsdGeom.BasisCurves(stage.GetDefaultPrim())
+
+
 def _first_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else type(error).__name__

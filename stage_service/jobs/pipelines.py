@@ -6,6 +6,7 @@ PIPELINES: dict[str, tuple[str, ...]] = {
     "light_planes": ("compress", "reconstruct", "fit", "assess", "evaluate", "results"),
     "reconstruct": ("reconstruct", "evaluate", "results"),
     "fit": ("fit", "assess", "results"),
+    "appearance": ("fit", "stage1", "results"),
 }
 """Each step is a checkpoint: after a crash the job goes on at the step that was under way."""
 

@@ -17,9 +17,10 @@ class JobOptions(BaseModel):
 
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may look at:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
-    against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`. `reconstruct`, `fit` and
-    `assess` go to the step of that name: fields of `reconstruction.pipeline.ReconstructOptions`,
-    `appearance.fit.FitOptions` and `appearance.assess.AssessOptions`.
+    against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`. `reconstruct`, `fit`,
+    `stage1` and `assess` go to the step of that name: fields of
+    `reconstruction.pipeline.ReconstructOptions`, `appearance.fit.FitOptions`,
+    `appearance.stage1.pipeline.Stage1Request` and `appearance.assess.AssessOptions`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -33,6 +34,7 @@ class JobOptions(BaseModel):
     seed: int = Field(default=0, ge=0)
     reconstruct: dict[str, Any] = Field(default_factory=dict)
     fit: dict[str, Any] = Field(default_factory=dict)
+    stage1: dict[str, Any] = Field(default_factory=dict)
     assess: dict[str, Any] = Field(default_factory=dict)
 
 

@@ -75,6 +75,25 @@ def fit(context: StepContext) -> Figures:
     return {"appearance": "appearance.json"}
 
 
+def stage1(context: StepContext) -> Figures:
+    """The hair's maps and the lamps by inverse rendering: `hair_maps.npz`, `lamps.json`.
+
+    The message of its progress holds the current error. Killed, it goes on from its checkpoint.
+    """
+    from appearance.observations import HeldOut
+    from appearance.stage1.pipeline import Stage1Request, fit_stage1
+
+    found = fit_stage1(
+        Capture(context.capture),
+        context.model,
+        held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
+        request=_options(Stage1Request, "stage1", context.options.stage1),
+        progress=context.progress,
+        seed=context.options.seed,
+    )
+    return {"maps": "hair_maps.npz", "lamps": "lamps.json", **found}
+
+
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
     from appearance.assess import AssessOptions
@@ -119,6 +138,8 @@ def results(context: StepContext) -> Figures:
     figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
     if "assess" in done:
         figures["images"] = done["assess"]
+    if "stage1" in done:
+        figures["stage1"] = done["stage1"]
     if "visible" in done.get("evaluate", {}):
         figures["geometry"] = {k: done["evaluate"][k] for k in ("visible", "all")}
         figures["controls"] = done["evaluate"]["controls"]
@@ -141,6 +162,7 @@ STEPS: dict[str, Callable[[StepContext], Figures]] = {
     "compress": compress,
     "reconstruct": reconstruct,
     "fit": fit,
+    "stage1": stage1,
     "assess": assess,
     "evaluate": evaluate,
     "results": results,
