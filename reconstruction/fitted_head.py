@@ -24,6 +24,7 @@ from reconstruction.report import Stage
 from reconstruction.scalp_map import ScalpMap
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 FEWEST_SKIN = 300
 """Cells with a point of skin under which a head is not guessed from them."""
@@ -31,19 +32,23 @@ FEWEST_SKIN = 300
 _CELL = 3e-3
 _INSIDE = 4e-3
 _AMBIGUOUS = 0.2
+_CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
+"""Metres: a crown that shows where the head is; from hair to mouth or chin; half a head's depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeadPoints:
     """Points `(N, 3)` of a head, metres, outward unit `normals (N, 3)` where known.
 
-    `part` says whether they lie on the scalp alone or anywhere on the head, `source` who gave them.
+    `part` says whether they lie on the scalp alone or anywhere on the head, `source` who gave them,
+    `turn` the head's about z (radians, 0 faces −y) where that is known.
     """
 
     points: Array
     normals: Array | None
     part: Literal["head", "scalp"]
     source: str
+    turn: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +78,9 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
     """Reconstructed points that the mask of the camera that saw them calls skin.
 
     Points with a neighbour that some mask calls hair within a cell's size are left out: a fringe's
-    edge is no skin. Raises `CaptureError` where too few are left to fit a head to.
+    edge is no skin. So is what lies too low or too far out to be the face of the head that the
+    highest points are of: neck and shoulders. The head is taken to face the side of the bare skin.
+    Raises `CaptureError` where too few are left to fit a head to.
     """
     skin = np.zeros(len(cloud), bool)
     hair = np.zeros(len(cloud), bool)
@@ -90,6 +97,8 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
     if skin.any() and hair.any():
         near = cKDTree(cloud.points[hair]).query(cloud.points[skin])[0] < _CELL
         skin[np.flatnonzero(skin)[near]] = False
+    face, middle = _head_region(cloud.points)
+    skin &= face
     facing = surface_normals(cloud.points[skin], cloud.view[skin], 24)
     points, normals = _thinned(cloud.points[skin], facing)
     if len(points) < FEWEST_SKIN:
@@ -99,7 +108,8 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
             "strands need a scalp to be rooted on; give head.obj, or digitised scalp points as "
             "scalp.obj in the capture or by the option scalp_points"
         )
-    return HeadPoints(points, normals, "head", "reconstructed skin")
+    x, y = points[:, :2].mean(axis=0) - middle
+    return HeadPoints(points, normals, "head", "reconstructed skin", float(np.arctan2(x, -y)))
 
 
 def lay_head(
@@ -120,15 +130,19 @@ def lay_head(
     own = None if head_mesh is None else read_obj(head_mesh)
     try:
         shape = generic_head() if own is None else template(own, seed=seed)[0]
-        fit = fit_head(points.points, points.normals, shape, part=points.part, seed=seed)
+
+        def fitted(turn: float | None) -> HeadFit:
+            return fit_head(
+                points.points, points.normals, shape, part=points.part, turn=turn, seed=seed
+            )
+
+        fit = fitted(points.turn)
         if fit.pose.margin < _AMBIGUOUS:
             stage.warn(
                 "the points fit a head that faces another way nearly as well (its cost is "
                 f"{fit.pose.margin:.0%} higher): it is taken to face −y"
             )
-            fit = fit_head(
-                points.points, points.normals, shape, part=points.part, turn=0.0, seed=seed
-            )
+            fit = fitted(0.0)
     except HeadFitError as error:
         raise CaptureError(f"no head fits the points of {points.source}: {error}") from error
     _report(points, fit, "generic head" if own is None else Path(str(head_mesh)).name, stage)
@@ -167,6 +181,20 @@ def _report(points: HeadPoints, fit: HeadFit, name: str, stage: Stage) -> None:
         "used_share": 1 - float(fit.outliers.mean()),
         "fit": fit.figures(),
     }
+
+
+def _head_region(points: Array) -> tuple[Bools, Array]:
+    """Which of the points `(N, 3)`, hair and all, can be of the head that the highest are of.
+
+    Also its middle `(2,)` on the ground.
+    """
+    if not len(points):
+        return np.zeros(0, bool), np.zeros(2)
+    top = np.percentile(points[:, 2], 99.5)
+    upper = points[points[:, 2] > top - _CROWN][:, :2]
+    middle = np.percentile(upper, [2, 98], axis=0).mean(axis=0)
+    beside = np.linalg.norm(points[:, :2] - middle, axis=1)
+    return (points[:, 2] > top - _HEIGHT) & (beside < _RADIUS), middle
 
 
 def _thinned(points: Array, normals: Array | None) -> tuple[Array, Array | None]:

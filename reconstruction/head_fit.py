@@ -96,7 +96,7 @@ def fit_head(
     The points, with outward unit `normals (N, 3)` where known, lie on any part of the head, or of
     the scalp alone (`part`), and may have outliers, up to about two in five. `landmarks` are
     places `(L, 3)` on the template and the same places `(L, 3)` among the points, L at least 3;
-    without them all turns about z are tried, or `turn` (radians) alone. Points are in the
+    without them all turns about z are tried, or those about `turn` (radians). Points are in the
     template's unit, metres, unless `any_unit`. Raises `HeadFitError`.
     """
     template = generic_head() if template is None else template

@@ -20,6 +20,7 @@ MOTIONS = ("turn x", "turn y", "turn z", "scale", "shift x", "shift y", "shift z
 
 _YAWS = 12
 _COARSE = 300
+_ABOUT = np.radians([-30.0, 0.0, 30.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +108,11 @@ def find_pose(
 ) -> Pose:
     """The pose in which `surface` lies on `points (N, 3)`, both with z about upwards.
 
-    Without a `start`, twelve turns about z (or `turn` alone, radians) at each of `scales` are tried
-    on a few hundred points, the tops of both at one height. `scale_deviation` is what is known of
-    the scale beforehand, a standard deviation of its logarithm about the middle of `scales`, or
-    None. `size` is the head's radius in the points' unit, which distances are judged by.
+    Without a `start`, twelve turns about z (or `turn`, radians, and thirty degrees to either side)
+    at each of `scales` are tried on a few hundred points, the tops of both at one height.
+    `scale_deviation` is what is known of the scale beforehand, a standard deviation of its
+    logarithm about the middle of `scales`, or None. `size` is the head's radius in the points'
+    unit, which distances are judged by.
     """
     middle = float(np.exp(np.mean(np.log(scales))))
     known = None if scale_deviation is None else (middle, scale_deviation)
@@ -123,7 +125,7 @@ def find_pose(
         return points[few], None if normals is None else normals[few]
 
     coarse, facing = some(_COARSE)
-    yaws = np.arange(_YAWS) * 2 * np.pi / _YAWS if turn is None else np.array([turn])
+    yaws = np.arange(_YAWS) * 2 * np.pi / _YAWS if turn is None else turn + _ABOUT
     tries = []
     for scale in scales:
         for yaw in yaws:
@@ -145,7 +147,7 @@ def find_pose(
     p = min(ends, key=lambda end: end[0])[1]
     best = _refine(surface, points, normals, p.scale, p.rotation, p.translation, known, size, 60)
     others = [*(pose for _, pose in ends), *distinct[3:]]
-    others = [pose for pose in others if _apart(pose, best) > np.radians(10)]
+    others = [p for p in others if turn is None and _apart(p, best) > np.radians(10)]
     return replace(best, margin=_margin(surface, best, others, points, normals, size))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture, CaptureError
@@ -41,23 +42,30 @@ def capture(shoot: Callable[..., Capture], stage_camera: Callable[..., Camera]) 
     return shoot(cameras=cameras, projectors=[], samples=1)
 
 
-def the_head() -> Mesh:
-    """The subject's: the generic one, larger, longer and elsewhere."""
+def the_head(turn_deg: float = 0.0) -> Mesh:
+    """The subject's: the generic one, larger, longer, turned and elsewhere."""
     v = generic_head().vertices * [1.0, 1.0, 1.04]
-    return Mesh(SCALE * v + SHIFT, generic_head().faces, generic_head().scalp)
+    mesh = Mesh(SCALE * v, generic_head().faces, generic_head().scalp)
+    return mesh.transformed(Rotation.from_euler("z", turn_deg, degrees=True).as_matrix(), SHIFT)
 
 
-def off(mesh: Mesh) -> np.ndarray:
+def off(mesh: Mesh, turn_deg: float = 0.0) -> np.ndarray:
     """Millimetres from the true scalp's vertices to `mesh`."""
-    truth = the_head()
+    truth = the_head(turn_deg)
     return 1e3 * ClosestPoint(mesh, 8e-3)(truth.vertices[np.unique(truth.faces[truth.scalp])])[2]
 
 
-def cloud_of(capture: Capture) -> tuple[PointCloud, dict[str, HairMask]]:
-    """Points on skin, and on hair 1 cm above the scalp, as the cameras see them, with masks."""
-    truth, rng = the_head(), np.random.default_rng(0)
+def cloud_of(capture: Capture, turn_deg: float = 0.0) -> tuple[PointCloud, dict[str, HairMask]]:
+    """Points on skin, and on hair 1 cm above the scalp, as the cameras see them, with masks.
+
+    The skin goes on over the shoulders.
+    """
+    truth, rng = the_head(turn_deg), np.random.default_rng(0)
     p, n, face = surface_samples(truth, 3e-3)
     scalp = truth.scalp[face]
+    shoulders = rng.uniform([-0.12, -0.1, -0.16], [0.12, 0.1, -0.15], (4000, 3))
+    p, scalp = np.concatenate([p, shoulders]), np.concatenate([scalp, np.zeros(4000, bool)])
+    n = np.concatenate([n, np.tile([0, -0.4, 0.9], (4000, 1))])
     p = p + 0.01 * scalp[:, None] * n + 3e-4 * rng.standard_normal(p.shape)
     masks, columns = {}, []
     for k, camera in enumerate(capture.rig.cameras):
@@ -110,15 +118,19 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture, tmp_path:
     assert model_head(tmp_path / "other", capture) is None
 
 
-def test_a_head_is_laid_under_the_skin_that_was_seen(capture: Capture, tmp_path: Path) -> None:
-    cloud, masks = cloud_of(capture)
+@pytest.mark.parametrize("turn_deg", [0.0, 35.0])
+def test_a_head_is_laid_under_the_skin_that_was_seen(
+    capture: Capture, tmp_path: Path, turn_deg: float
+) -> None:
+    cloud, masks = cloud_of(capture, turn_deg)
     skin = skin_points(capture, cloud, masks)
-    apart = ClosestPoint(the_head(), 8e-3)(skin.points)[2]
-    assert np.percentile(apart, 99) < 2e-3
+    assert skin.turn == pytest.approx(np.radians(turn_deg), abs=np.radians(30))
+    apart = ClosestPoint(the_head(turn_deg), 8e-3)(skin.points)[2]
+    assert np.percentile(apart, 95) < 2e-3
     assert skin.normals is not None
     stage = Stage("head")
     fitted = lay_head(skin, None, tmp_path, stage, cloud=cloud)
-    assert np.median(off(fitted.mesh)) < 3.0
+    assert np.median(off(fitted.mesh, turn_deg)) < 3.0
     assert stage.figures["cloud_inside_share"] < 0.05
     assert stage.warnings == []
 
