@@ -160,7 +160,7 @@ class PropResponder:
         """See `Responder.lamps_together`."""
         response = self.lamps(camera)
         images = np.tensordot(power.astype(np.float32), response.images, 1)
-        return Response(response.pixels, images[None])
+        return Response(response.pixels, images[None].astype(np.float32))
 
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:
         """See `Responder.sweep`."""

@@ -37,6 +37,8 @@ def add(commands: Commands) -> None:
         "line, and how their cost grows. "
         "agreement: a capture that Blender Cycles rendered, from its true strands. "
         "acquisition: steps and bytes a second beside what wires and disk allow. "
+        "lightplanes: strands of three subjects, still and drifting, beside controls without a "
+        f"method; two of them, Sintel and a ponytail, come from ${_DATA}. "
         "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
     )
     bench.add_argument("name", choices=[*BENCHES, "all"])
@@ -45,6 +47,10 @@ def add(commands: Commands) -> None:
     bench.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
     bench.add_argument("--rig", type=Path, default=Path("deploy/rigs/demo.toml"))
     bench.add_argument("--capture", type=Path, help=f"for agreement; default: ${_DATA}/{_CAPTURE}")
+    bench.add_argument("--only", choices=("sintel", "ponytail", "curly"), help="for lightplanes")
+    bench.add_argument(
+        "--cache", type=Path, default=Path("runs/cache"), help="where simulated captures are kept"
+    )
     bench.add_argument("--seed", type=int, default=0)
 
 
@@ -134,10 +140,20 @@ def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
         return run(args.out, simulate, progress)
 
 
+def _lightplanes(args: argparse.Namespace) -> dict[str, Any]:
+    from stage_service.cli.bench_lightplanes import run
+
+    data = os.environ.get(_DATA)
+    with progress_bar("bench lightplanes") as progress:
+        out = args.out / "lightplanes"
+        return run(out, Path(data) if data else None, args.cache, args.only, progress)
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "light": _light,
     "agreement": _agreement,
     "acquisition": _acquisition,
+    "lightplanes": _lightplanes,
 }
 
 

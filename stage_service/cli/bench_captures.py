@@ -8,6 +8,7 @@ import json
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from reconstruction.capture_compression import compress
 from reconstruction.report import Progress, silent
@@ -72,7 +73,7 @@ class SimulatedCapture:
             serve += ["--root", str(folder), "--port", "0"]
             service = children.start("service", serve, answers=True)
             with Service(children.first_line("service", service, 60)["url"]) as client:
-                body = {"plan": {}}
+                body: dict[str, Any] = {"plan": {}}
                 if (truth / "head.obj").is_file():
                     body["head"] = str(truth / "head.obj")
                 capture = client.post("/captures", body)
