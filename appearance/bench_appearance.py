@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,7 @@ class Table:
                 lamps,
                 options=replace(self.options, row=row),
                 seed=self.seed,
-                progress=lambda what, share, row=row: self.progress(f"{row}: {what}", share),
+                progress=_named(self.progress, row),
             )
             maps, lamps = found.maps, found.lamps
             self.score_maps(row, maps, captured.mapped, time.perf_counter() - begun)
@@ -270,18 +270,17 @@ def error_against_time(
         views = [_framed(o) for o in training] if name == "plain" else training
         points: list[tuple[float, HairMaps]] = []
         problem = Problem(captured.mapped, views, scale, skin)
-        found = run(
+        run(
             problem,
             start,
             options=version,
-            snapshot=lambda s, m, points=points: points.append((s, m)),
+            snapshot=_into(points),
             seed=seed,
         )
-        del found
         table = Table(captured, options, seed=seed)
         curve = []
         for seconds, maps in points:
-            table.scorescore_maps("now", maps, captured.mapped, seconds)
+            table.score_maps("now", maps, captured.mapped, seconds)
             psnr_clean = table.rows["now"][GROUPS[1]]["psnr_clean"]
             curve.append({"cpu_seconds": seconds, "psnr_clean": psnr_clean})
         curves[name] = curve
@@ -295,6 +294,10 @@ def _framed(o: Observed) -> Observed:
     valid = np.zeros(radiance.shape[:2], bool)
     radiance[:, o.pixels], valid[:, o.pixels] = o.radiance, o.valid
     return Observed(o.camera, o.lights, pixels, radiance, valid)
+
+
+def _into(points: list[tuple[float, HairMaps]]) -> Callable[[float, HairMaps], None]:
+    return lambda seconds, maps: points.append((seconds, maps))
 
 
 def _named(progress: Progress, name: str) -> Progress:

@@ -36,10 +36,10 @@ HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = Stage1Options(
     row="original",
-    steps=60,
-    check_every=15,
+    steps=40,
+    check_every=10,
     watched_views=2,
-    effort=Effort(pixels=400, spp=12, gradient_spp=3, max_depth=12),
+    effort=Effort(pixels=300, spp=48, gradient_spp=8, max_depth=12),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -167,10 +168,12 @@ class MappedStrands:
 def scalp_coordinates(strands: Strands, head: Mesh | None) -> Array:
     """(u, v) `(S, 2)` of the strands' roots in [0, 1]: on the head's marked scalp where it has one.
 
-    Without a marked scalp, Lambert's equal-area map about the middle of the roots themselves.
+    Without a marked scalp, or where its map would fold, Lambert's equal-area map about the middle
+    of the roots themselves.
     """
     if head is not None and head.scalp is not None and head.scalp.any():
-        return ScalpMap.of(head)(strands.roots.astype(float))[0]
+        with suppress(ValueError):
+            return ScalpMap.of(head)(strands.roots.astype(float))[0]
     d = root_normals(strands)
     pole = d.mean(axis=0)
     pole /= max(float(np.linalg.norm(pole)), 1e-12)

@@ -26,7 +26,7 @@ STEP = {
 """In the unconstrained numbers' units; about a fiftieth of what each may be off at the start."""
 _OF_CELLS = 0.5
 """A cell is told little by a step, and mostly noise: it moves less."""
-_FIRST, _SECOND, _TINY = 0.9, 0.98, 1e-12
+_FIRST, _SECOND, _TINY = 0.9, 0.999, 1e-12
 
 
 @dataclass
@@ -34,7 +34,9 @@ class Adam:
     """Adam (Kingma & Ba 2015), whose second moment is at least that of a table's mean cell.
 
     With each cell's own alone, a cell that hardly any ray meets would walk about at full speed on
-    noise; this way it moves in proportion to what it is told.
+    noise; this way it moves in proportion to what it is told. The second moment forgets slowly: a
+    gradient of path tracing is small most of the time and rarely large the other way, and a short
+    memory scales the rare ones down, so that the numbers drift where the mean gradient is zero.
     """
 
     count: int = 0

@@ -23,6 +23,7 @@ from appearance.stage1.unknowns import Lamps
 from reconstruction.capture import Capture
 from reconstruction.report import Progress, Report, Series, Stage, silent
 from reconstruction.strand_files import read_strands
+from reconstruction.strands import Strands
 
 Array = NDArray[np.float64]
 MAPS, LAMPS = "hair_maps.npz", "lamps.json"
@@ -78,7 +79,7 @@ def fit_stage1(
         progress("reading hair pixels", 0.0)
         views = _views(capture, model, held_out, request, seed)
         scene = build_scene(strands, capture.head, hair=fitted.hair, skin=fitted.skin)
-        mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, capture.head))
+        mapped = MappedStrands.of(scene, strands, _root_uv(model, strands, capture))
         depth = bounce_limit(scene, views[0].camera, 0.01, pixels=views[0].pixels, seed=seed).depth
         options = request.options(min(depth, 16))
         problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
@@ -144,6 +145,17 @@ def _run(
     if outcome.steps < options.steps and outcome.ended != "converged":
         stage.warn(f"{options.row}: {outcome.ended}")
     return outcome
+
+
+def _root_uv(model: Path, strands: Strands, capture: Capture) -> Array:
+    """The roots' places on the scalp, of `scalp_map.npz` where reconstruction left one."""
+    file = model / "scalp_map.npz"
+    if file.is_file():
+        with np.load(file) as data:
+            roots = np.asarray(data["roots"], float)
+        if len(roots) == len(strands):
+            return np.clip(roots, 0, 1)
+    return scalp_coordinates(strands, capture.head)
 
 
 def _checkpoint(model: Path, row: str) -> Path:

@@ -59,7 +59,7 @@ class Problem:
         self.lights: tuple[Light, ...] = views[0].lights if views else ()
         self._painted: HairScene | None = None
         self._level = [
-            losses.level(o.radiance * np.float32(scale)).astype(np.float32) for o in self.views
+            losses.level(o.radiance.astype(float) * scale).astype(np.float32) for o in self.views
         ]
         profiles = list({id(x.profile): 0 for x in self.lights})
         self.profile_of = np.array([profiles.index(id(x.profile)) for x in self.lights], np.int64)
