@@ -36,6 +36,8 @@ def add(commands: Commands) -> None:
         "light: our renderers against Mitsuba's own path integrator, light by light and line by "
         "line, and how their cost grows. "
         "agreement: a capture that Blender Cycles rendered, from its true strands. "
+        "appearance: stage 1 and its ablations on subjects of known appearance, and on the capture "
+        "of agreement. "
         "acquisition: steps and bytes a second beside what wires and disk allow. "
         "lightplanes: strands of three subjects, still and drifting, beside controls without a "
         f"method; two of them, Sintel and a ponytail, come from ${_DATA}. "
@@ -52,6 +54,7 @@ def add(commands: Commands) -> None:
         "--cache", type=Path, default=Path("runs/cache"), help="where simulated captures are kept"
     )
     bench.add_argument("--seed", type=int, default=0)
+    bench.add_argument("--seeds", type=int, default=3, help="of appearance's subject (b)")
 
 
 def run_bench(args: argparse.Namespace, output: Output) -> int:
@@ -117,6 +120,35 @@ def _agreement(args: argparse.Namespace) -> dict[str, Any]:
         return agreement(args.out, folder, seed=args.seed, progress=progress)
 
 
+def _appearance(args: argparse.Namespace) -> dict[str, Any]:
+    import numpy as np
+
+    from appearance.bench_appearance import run_bench as run
+    from appearance.bench_cycles import fit_cycles
+    from appearance.hair_appearance import HairAppearance
+    from reconstruction.mesh import read_obj
+    from reconstruction.strand_files import read_strands
+
+    with tempfile.TemporaryDirectory() as folder, progress_bar("bench appearance") as progress:
+        truth = Path(folder)
+        _write_truth(args, truth)
+        appearance = json.loads((truth / "appearance.json").read_text())
+        result = run(
+            args.out,
+            read_strands(truth / "strands.npz"),
+            read_obj(truth / "head.obj") if (truth / "head.obj").is_file() else None,
+            HairAppearance.from_dict(appearance["hair"]),
+            np.array(appearance["skin"]),
+            seeds=args.seeds,
+            seed=args.seed,
+            progress=progress,
+        )
+        capture = args.capture or Path(os.environ.get(_DATA, ".")) / _CAPTURE
+        if capture.is_dir():
+            result["cycles"] = fit_cycles(args.out, capture, seed=args.seed, progress=progress)
+        return result
+
+
 def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
     from stage_service.bench_acquisition import run
     from stage_service.cli.children import Children
@@ -152,6 +184,7 @@ def _lightplanes(args: argparse.Namespace) -> dict[str, Any]:
 BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "light": _light,
     "agreement": _agreement,
+    "appearance": _appearance,
     "acquisition": _acquisition,
     "lightplanes": _lightplanes,
 }

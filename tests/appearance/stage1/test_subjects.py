@@ -1,0 +1,58 @@
+"""The benchmark's subjects are what they say, and its table has every row."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from appearance.bench_appearance import GROUPS, Table, markdown
+from appearance.hair_appearance import HairAppearance
+from appearance.hair_maps import scalp_coordinates
+from appearance.stage1.loop import Stage1Options
+from appearance.stage1.problem import Effort
+from appearance.stage1.subjects import Rig, bent, dyed, subject
+
+HAIR = HairAppearance((0.1, 0.2, 0.4), 0.28, 0.3)
+SKIN = np.full(3, 0.3)
+
+
+def test_bent_strands_turn_by_five_degrees_and_keep_their_roots(small):
+    strands = small.tuft(300).resampled(2e-3)
+    uv = scalp_coordinates(strands, None)
+    noisy = bent(strands, uv, 5.0, seed=0)
+    cosine = (noisy.tangents() * strands.tangents()).sum(axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.sqrt((angle**2).mean()) == pytest.approx(5.0, rel=0.2)
+    np.testing.assert_allclose(noisy.roots, strands.roots, atol=1e-7)
+    assert np.linalg.norm(noisy.points - strands.points, axis=1).max() < 6e-3
+
+
+def test_dyed_hair_is_lighter_at_the_tips_and_has_wisps_of_other_hues():
+    maps = dyed(HAIR, 0)
+    usual = np.median(maps.sigma_a, axis=(1, 2))
+    np.testing.assert_allclose(usual[0], HAIR.sigma_a)
+    np.testing.assert_allclose(usual[-1], 0.25 * np.array(HAIR.sigma_a))
+    assert (maps.sigma_a[0, ..., 0] > 1).any()
+    with pytest.raises(ValueError, match="no subject 'd'"):
+        subject("d", None, None, HAIR, SKIN)
+
+
+def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(small):
+    rig = Rig(size=14, cameras=3, lights=6, spp=64, max_depth=4)
+    captured = subject("a", small.tuft(150), None, HAIR, SKIN, rig)
+    assert captured.held_views == (0, 1)
+    assert captured.train_lights == (0, 2, 4)
+    assert len(captured.training()) == 1
+    effort = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4)
+    options = Stage1Options(steps=2, check_every=2, shape=(2, 2, 2), effort=effort)
+    rows = Table(captured, options).run(("original",))
+    assert list(rows) == [
+        "mean colour",
+        "three nearest",
+        "HairInverse",
+        "original",
+        "truth, fresh numbers",
+    ]
+    clean = {k: v[GROUPS[1]]["psnr_clean"] for k, v in rows.items()}
+    assert clean["truth, fresh numbers"] > max(clean["mean colour"], clean["three nearest"])
+    assert "| HairInverse |" in markdown({"subjects": {"a": rows}})
