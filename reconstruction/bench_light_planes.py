@@ -28,6 +28,7 @@ from reconstruction.light_planes import (
 )
 from reconstruction.masks import HairMask
 from reconstruction.measure import measure_tangents
+from reconstruction.model_pictures import picture_model, picture_motion
 from reconstruction.motion_errors import motion_errors, true_motion
 from reconstruction.pipeline import ReconstructOptions, build_envelope, reconstruct
 from reconstruction.report import Progress, Report, Stage, silent
@@ -101,6 +102,12 @@ def subject(
     truth = Truth(capture, case.still[1])
     rows: dict[str, Any] = {}
     rows["still"], report = _ours(capture, truth, out / "still", options, progress)
+    picture_model(
+        out / "still.png",
+        capture,
+        PointCloud.load(out / "still" / "points.npz"),
+        read_strands(out / "still" / "strands.npz"),
+    )
     for name, control in _controls(capture, out / "still").items():
         rows[name] = truth.score(control)
     result: dict[str, Any] = {
@@ -119,6 +126,9 @@ def subject(
             for name, motion in (("true motion", known), ("no motion", none)):
                 model = out / name.replace(" ", "_")
                 rows[name], _ = _ours(moving, truth, model, held, progress, motion)
+            models = {"no compensation": "no_motion", "compensated": "drifting", "still": "still"}
+            clouds = {k: PointCloud.load(out / v / "points.npz") for k, v in models.items()}
+            picture_motion(out / "motion.png", clouds)
         result["motion"] = motion_study(moving, truth.points[::50], known, progress)
     if studies:
         result["series"], result["growth"] = _studies(capture, out / "still", options, progress)

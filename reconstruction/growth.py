@@ -185,8 +185,9 @@ def fill_gaps(
     """Strands through the voxels that no strand passes, traced both ways from random ones.
 
     Only voxels within `within` metres of a measured one are set out from: Photobooth §3.4 deletes
-    strands that meet nothing measured, and the volume between hair and face has no hair. Each round starts from at most `batch` of the remaining gaps, so that strands of one round
-    cover the seeds of the next. Paths shorter than `shortest` metres are not kept.
+    strands that meet nothing measured, and the volume between hair and face has no hair. Each round
+    starts from at most `batch` of the remaining gaps, so that strands of one round cover the seeds
+    of the next. Paths shorter than `shortest` metres are not kept.
     """
     rng = np.random.default_rng(seed)
     out: list[NDArray[np.float32]] = []
