@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.capture import Capture, CaptureError
 from reconstruction.generic_head import generic_head
-from reconstruction.head_fit import HeadFit, HeadFitError, fit_head
+from reconstruction.head_fit import HeadFit, HeadFitError, Part, fit_head
 from reconstruction.head_template import template
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.masks import HairMask, distance_to
@@ -32,6 +31,8 @@ FEWEST_SKIN = 300
 _CELL = 3e-3
 _INSIDE = 4e-3
 _AMBIGUOUS = 0.2
+_HAIR = 0.015
+"""Metres of hair over the scalp, roughly."""
 _CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
 """Metres: a crown that shows where the head is; from hair to mouth or chin; half a head's depth."""
 
@@ -40,15 +41,16 @@ _CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
 class HeadPoints:
     """Points `(N, 3)` of a head, metres, outward unit `normals (N, 3)` where known.
 
-    `part` says whether they lie on the scalp alone or anywhere on the head, `source` who gave them,
-    `turn` the head's about z (radians, 0 faces −y) where that is known.
+    `part` says where on the head they lie, `source` who gave them, `turn` is the head's about z
+    (radians, 0 faces −y) where that is known, and `guides` see `fit_head`.
     """
 
     points: Array
     normals: Array | None
-    part: Literal["head", "scalp"]
+    part: Part
     source: str
     turn: float | None = None
+    guides: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +81,9 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
 
     Points with a neighbour that some mask calls hair within a cell's size are left out: a fringe's
     edge is no skin. So is what lies too low or too far out to be the face of the head that the
-    highest points are of: neck and shoulders. The head is taken to face the side of the bare skin.
-    Raises `CaptureError` where too few are left to fit a head to.
+    highest points are of: neck and shoulders. The head is taken to face the side of the bare skin,
+    and to lie some way under the hair of its crown: skin alone leaves its size open. Raises
+    `CaptureError` where too few are left to fit a head to.
     """
     skin = np.zeros(len(cloud), bool)
     hair = np.zeros(len(cloud), bool)
@@ -109,7 +112,9 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
             "scalp.obj in the capture or by the option scalp_points"
         )
     x, y = points[:, :2].mean(axis=0) - middle
-    return HeadPoints(points, normals, "head", "reconstructed skin", float(np.arctan2(x, -y)))
+    turn = float(np.arctan2(x, -y))
+    guides = _under_the_hair(cloud.subset(hair & face), len(points))
+    return HeadPoints(points, normals, "above chin", "reconstructed skin", turn, guides)
 
 
 def lay_head(
@@ -133,7 +138,13 @@ def lay_head(
 
         def fitted(turn: float | None) -> HeadFit:
             return fit_head(
-                points.points, points.normals, shape, part=points.part, turn=turn, seed=seed
+                points.points,
+                points.normals,
+                shape,
+                part=points.part,
+                turn=turn,
+                guides=points.guides,
+                seed=seed,
             )
 
         fit = fitted(points.turn)
@@ -197,8 +208,28 @@ def _head_region(points: Array) -> tuple[Bools, Array]:
     return (points[:, 2] > top - _HEIGHT) & (beside < _RADIUS), middle
 
 
+def _under_the_hair(hair: PointCloud, most: int) -> tuple[Array, Array] | None:
+    """About where the scalp is `(G, 3)` under points on the crown's hair, with its normals.
+
+    No more than `most`: they weigh no more than the skin.
+    """
+    if not len(hair):
+        return None
+    top = np.percentile(hair.points[:, 2], 99.5)
+    crown = hair.subset(hair.points[:, 2] > top - _CROWN)
+    crown = crown.subset(_one_a_cell(crown.points))
+    normals = surface_normals(crown.points, crown.view)
+    guides = crown.points - _HAIR * normals
+    few = np.random.default_rng(0).permutation(len(guides))[:most]
+    return guides[few], normals[few]
+
+
 def _thinned(points: Array, normals: Array | None) -> tuple[Array, Array | None]:
     """One of the points in each cell, so that dense places do not outweigh the others."""
-    cell = np.floor(points / _CELL).astype(np.int64)
-    first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
+    first = _one_a_cell(points)
     return points[first], None if normals is None else normals[first]
+
+
+def _one_a_cell(points: Array) -> NDArray[np.int64]:
+    cell = np.floor(points / _CELL).astype(np.int64)
+    return np.sort(np.unique(cell, axis=0, return_index=True)[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,9 @@ Bools = NDArray[np.bool_]
 FEWEST = 10
 """Points under which no head is fitted: a pose alone has seven unknowns."""
 
+Part = Literal["head", "above chin", "scalp"]
 _SCALES = (0.7, 1.4)
+_CROWN_TO_CHIN = 0.24
 _UNITS = {10: "decimetres", 39.37: "inches", 100: "centimetres", 1000: "millimetres"}
 
 
@@ -84,20 +86,23 @@ def fit_head(
     normals: NDArray[np.floating] | None = None,
     template: Mesh | None = None,
     *,
-    part: Literal["head", "scalp"] = "head",
+    part: Part = "head",
     landmarks: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
     turn: float | None = None,
+    guides: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
     any_unit: bool = False,
     shape: ShapeOptions = ShapeOptions(),  # noqa: B008  frozen
     seed: int = 0,
 ) -> HeadFit:
     """Fit `template` (the generic head where None) to `points (N, 3)`, both with z upwards.
 
-    The points, with outward unit `normals (N, 3)` where known, lie on any part of the head, or of
-    the scalp alone (`part`), and may have outliers, up to about two in five. `landmarks` are
-    places `(L, 3)` on the template and the same places `(L, 3)` among the points, L at least 3;
-    without them all turns about z are tried, or those about `turn` (radians). Points are in the
-    template's unit, metres, unless `any_unit`. Raises `HeadFitError`.
+    The points, with outward unit `normals (N, 3)` where known, lie on any part of the template, on
+    what is above its chin, or on its scalp alone (`part`), and may have outliers, up to about two
+    in five. `landmarks` are places `(L, 3)` on the template and the same places `(L, 3)` among the
+    points, L at least 3; without them all turns about z are tried, or those about `turn` (radians).
+    `guides` are further points and normals `(G, 3)` that only roughly lie on the head: they take
+    part in the pose, and the mesh is not bent onto them. Points are in the template's unit, metres,
+    unless `any_unit`. Raises `HeadFitError`.
     """
     template = generic_head() if template is None else template
     at: Array = np.asarray(points, np.float64).reshape(-1, 3)
@@ -121,8 +126,7 @@ def fit_head(
             raise HeadFitError(str(error)) from error
     pose = find_pose(
         surface,
-        at,
-        facing,
+        *_with(at, facing, guides),
         start=start,
         turn=turn,
         scales=(0.7 * middle, middle, 1.4 * middle) if any_unit else (1.0,),
@@ -163,8 +167,11 @@ def mark_scalp(mesh: Mesh, *, seed: int = 0) -> tuple[Mesh, HeadFit]:
 
 
 def _faces(template: Mesh, part: str) -> Bools:
-    if part not in ("head", "scalp"):
-        raise ValueError(f"part must be 'head' or 'scalp', got {part!r}")
+    if part not in get_args(Part):
+        raise ValueError(f"part must be one of {get_args(Part)}, got {part!r}")
+    if part == "above chin":
+        height = template.vertices[template.faces][:, :, 2].min(axis=1)
+        return np.asarray(height > template.vertices[:, 2].max() - _CROWN_TO_CHIN)
     if part == "head":
         return np.ones(len(template.faces), bool)
     if template.scalp is None or not template.scalp.any():
@@ -173,6 +180,19 @@ def _faces(template: Mesh, part: str) -> Bools:
             "fit the whole head, or let mark_scalp mark it"
         )
     return template.scalp
+
+
+def _with(
+    points: Array,
+    normals: Array | None,
+    guides: tuple[NDArray[np.floating], NDArray[np.floating]] | None,
+) -> tuple[Array, Array | None]:
+    if guides is None:
+        return points, normals
+    every = np.concatenate([points, np.asarray(guides[0], np.float64)])
+    if normals is None:
+        return every, None
+    return every, np.concatenate([normals, np.asarray(guides[1], np.float64)])
 
 
 def _spread(points: Array) -> float:
