@@ -17,6 +17,7 @@ from reconstruction.controls import control_hull, hull_smooth_field, hull_vertic
 from reconstruction.evaluation import compare_strands
 from reconstruction.field import field_system, solve_field
 from reconstruction.growth_study import compare_growth
+from reconstruction.hair_envelope import build_envelope
 from reconstruction.laplace import compare_solvers
 from reconstruction.light_planes import (
     Motion,
@@ -30,7 +31,7 @@ from reconstruction.masks import HairMask
 from reconstruction.measure import measure_tangents
 from reconstruction.model_pictures import picture_model, picture_motion
 from reconstruction.motion_errors import motion_errors, true_motion
-from reconstruction.pipeline import ReconstructOptions, build_envelope, reconstruct
+from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report import Progress, Report, Stage, silent
 from reconstruction.report_plots import plot_report
 from reconstruction.scalp import find_scalp, sample_roots
@@ -165,7 +166,9 @@ def _studies(
     cloud = PointCloud.load(model / "points.npz")
     masks = {c.name: _mask(model, c.name) for c in capture.rig.cameras}
     stage = Stage("study")
-    envelope, depths = build_envelope(capture, cloud, masks, head, options, stage)
+    envelope, depths = build_envelope(
+        capture, cloud, masks, head, grid=options.grid, margin=options.margin, stage=stage
+    )
     measured = measure_tangents(
         capture, cloud.points, masks, depths, envelope, options.measure, stage, progress
     )
