@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from reconstruction.capture import Capture, CaptureError
 from reconstruction.lights import Light
+from reconstruction.line_conditioning import condition_lines
 from reconstruction.masks import HairMask
 from reconstruction.orientation import LogGaborBank, texture
 from reconstruction.reflection import FEWEST_LIGHTS, reflection_scores
@@ -33,10 +34,11 @@ class MeasureOptions:
     """How tangents are measured.
 
     The `bank` answers to pictures under `light_groups` groups of neighbouring lights, which show
-    different fibres; `candidates` directions are scored at each point, averaged over `radius`
-    metres. Points closer than `thin` metres are merged first. `tolerance` (metres) is how far
-    behind a camera's own depth a point may lie and still count as seen. The scores of the
-    reflection under single lights count `reflection_weight` times those of the texture.
+    different fibres: 1 is the sum of all OLAT frames, the number of lights is each light alone.
+    `candidates` directions are scored at each point, averaged over `radius` metres. Points closer
+    than `thin` metres are merged first. `tolerance` (metres) is how far behind a camera's own depth
+    a point may lie and still count as seen. The scores of the reflection under single lights count
+    `reflection_weight` times those of the texture.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)  # noqa: RUF009
@@ -119,6 +121,7 @@ def measure_tangents(
     )
     seen = np.stack([seen_by(e, points, options.tolerance) for e in evidences], axis=1)
     points, seen = points[seen.any(axis=1)], seen[seen.any(axis=1)]
+    stage.figures["lines"] = condition_lines(evidences, points, seen).figures()
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
     candidates = half_sphere(options.candidates)

@@ -223,7 +223,7 @@ def _of_summed_responses(
 def _winner(
     responses: NDArray[np.float32],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Angle of the strongest answer, refined below a bin, confidence and strength; each `(H, W)`."""
+    """Angle of the strongest answer below a bin, its confidence and strength; each `(H, W)`."""
     count = len(responses)
     peak = responses[0].copy()
     best = np.zeros(peak.shape, np.int64)
