@@ -16,11 +16,13 @@ from appearance.stage1.unknowns import Raw
 class State:
     """Where a fit stands. `average` is the running mean of `raw` that is watched and returned.
 
-    `tables` are what batches have taught: `taught (V, L)` and the gains' `sums (3, L)`.
+    `first` is what the steps began with. `tables` are what batches have taught: `taught (V, L)` and
+    the gains' `sums (3, L)`.
     """
 
     raw: Raw
     average: Raw
+    first: Raw
     descent: Adam = field(default_factory=Adam)
     convergence: Convergence = field(default_factory=Convergence)
     step: int = 0
@@ -56,7 +58,7 @@ class State:
             numbers = json.loads(str(data["numbers"]))
             if numbers["fingerprint"] != fingerprint:
                 return None
-            state = cls({}, {}, Adam(numbers["count"]), Convergence(**numbers["convergence"]))
+            state = cls({}, {}, {}, Adam(numbers["count"]), Convergence(**numbers["convergence"]))
             for key in data.files:
                 kind, _, name = key.partition("/")
                 if name:
@@ -69,7 +71,8 @@ class State:
         return {
             "raw": self.raw,
             "average": self.average,
-            "first": self.descent.first,
-            "second": self.descent.second,
+            "first": self.first,
+            "first moment": self.descent.first,
+            "second moment": self.descent.second,
             "tables": self.tables,
         }

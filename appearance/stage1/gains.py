@@ -25,13 +25,7 @@ class Gains:
     """
 
     def __init__(self, sums: Array) -> None:
-        self.sums = sums
-
-    @staticmethod
-    def sums_of(gain: Array) -> Array:
-        """`sums (3, L)` (weight, log gain, its square) that say `gain (L,)`, not loudly."""
-        log = np.log(gain)
-        return np.stack([np.full_like(log, 1.0), log, log * log])
+        self.sums = sums  # (3, L): weight, log gain, its square; zeros at the start
 
     @property
     def value(self) -> Array:

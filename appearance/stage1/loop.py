@@ -36,7 +36,8 @@ ROWS: dict[str, tuple[tuple[str, ...], bool, bool]] = {
 PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation": 0.2}
 """Standard deviations about the calibration, and of correctives in radians."""
 _LATEST = 0.04
-"""Weight of the latest step in the running mean: noise of the steps averages out in it."""
+"""Least weight of the latest step in the running mean, in which the steps' noise averages out; the
+mean is over about the latest quarter of the steps before that (Shamir & Zhang 2013)."""
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared prior deviation, beside the image loss."""
 
@@ -166,7 +167,7 @@ class _Fit:
                 paused = time.process_time()
                 state.history = [list(p) for p in self.series]
                 state.save(self.checkpoint, self._fingerprint)
-                error = self._watch(state.average, gains.value, self.seed)
+                error = self._watch(state.average, self._gain(gains), self.seed)
                 self.series.append((spent + time.perf_counter() - begun, state.step, error))
                 share = state.step / self.options.steps
                 self.progress(f"step {state.step}: error {max(error, 0.0) ** 0.5:.4f}", share)
@@ -185,8 +186,8 @@ class _Fit:
         if saved is not None:
             return saved
         raw = self._raw(self._first_maps())
-        state = State(raw, {k: v.copy() for k, v in raw.items()})
-        state.tables = {"taught": self.pairs.taught, "gains": Gains.sums_of(self.lamps.gain)}
+        state = State(raw, _copied(raw), _copied(raw))
+        state.tables = {"taught": self.pairs.taught, "gains": np.zeros((3, len(self.lamps.gain)))}
         state.convergence.halvings = self.options.halvings
         return state
 
@@ -225,7 +226,7 @@ class _Fit:
             first = (self.seed << 20) + 2 * numbers
             slope = self.problem.slope(
                 state.raw,
-                gains.value,
+                self._gain(gains),
                 self.free,
                 batch,
                 options.effort,
@@ -246,7 +247,7 @@ class _Fit:
         self._pull_to_priors(state.raw, total)
         state.descent.step(state.raw, total, state.convergence.pace)
         state.step += 1
-        share = max(_LATEST, 1 / (state.step - state.level_began))
+        share = max(_LATEST, 4 / (state.step - state.level_began + 3))
         for name, value in state.raw.items():
             state.average[name] = state.average[name] + share * (value - state.average[name])
         return None
@@ -294,32 +295,40 @@ class _Fit:
             for name in ("sigma_a", "rotation"):
                 moments.pop(name, None)
         state.level_began = state.step
-        state.average = {k: v.copy() for k, v in state.raw.items()}
+        state.average = _copied(state.raw)
+
+    def _gain(self, gains: Gains) -> Array:
+        return gains.value if self.solves_gains else self.lamps.gain
 
     def _watch(self, raw: Raw, gain: Array, seed: int) -> float:
         return self.problem.error(raw, gain, self.watched, self.options.effort, seed << 16)
 
     def _judged(self, state: State, gains: Gains, ended: str, seconds: float) -> Outcome:
-        """The result, or the start where fresh random numbers say that it is better."""
+        """The best of the start, the first maps and the result, by fresh random numbers."""
         effort = replace(self.options.effort, spp=4 * self.options.effort.spp)
-        before = self._raw(self.start)
         seed = (self.seed << 16) + (1 << 24)
-        old, new = (
-            self.problem.error(raw, gain, self.watched, effort, seed)
-            for raw, gain in ((before, self.lamps.gain), (state.average, gains.value))
-        )
-        self.series.append((seconds, state.step, new))
-        if not new <= old:
-            reason = f"{ended}; kept the start, which is better ({old:.3g} against {new:.3g})"
-            return Outcome(self.start, self.lamps, reason, old, old, state.step, self.series)
-        raw = state.average
-        found = Lamps(
-            raw["position"],
-            raw["turn"],
-            gains.value if self.solves_gains else self.lamps.gain,
-            np.exp(raw["profile"])[self.problem.profile_of],
-        )
-        return Outcome(maps_of(raw), found, ended, old, new, state.step, self.series)
+        guesses = [
+            (state.average, self._gain(gains), ended),
+            (state.first, self.lamps.gain, f"{ended}; kept the first maps, which are better"),
+            (self._raw(self.start), self.lamps.gain, f"{ended}; kept the start, which is better"),
+        ]
+        errors = [
+            self.problem.error(raw, gain, self.watched, effort, seed) for raw, gain, _ in guesses
+        ]
+        best = int(np.argmin(errors))
+        raw, gain, how = guesses[best]
+        self.series.append((seconds, state.step, errors[best]))
+        if best == 2:
+            return Outcome(
+                self.start, self.lamps, how, errors[2], errors[2], state.step, self.series
+            )
+        profile = np.exp(raw["profile"])[self.problem.profile_of]
+        found = Lamps(raw["position"], raw["turn"], gain, profile)
+        return Outcome(maps_of(raw), found, how, errors[2], errors[best], state.step, self.series)
 
     def _unchanged(self, reason: str) -> Outcome:
         return Outcome(self.start, self.lamps, reason, 0.0, 0.0, 0)
+
+
+def _copied(raw: Raw) -> Raw:
+    return {k: v.copy() for k, v in raw.items()}
