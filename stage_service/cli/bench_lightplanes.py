@@ -23,7 +23,6 @@ from stage_service.cli.bench_captures import SimulatedCapture
 
 CAMERAS, PROJECTORS = 8, 3
 WIDTH, HEIGHT, ROWS, LIGHTS = 320, 400, 256, 120
-TRACKING_EVERY = 64
 DRIFT_MM = 4.0
 OPTIONS = ReconstructOptions(
     grid=1.5e-3,
@@ -46,21 +45,25 @@ _DISTANCE = 0.95
 
 @dataclass(frozen=True)
 class Framing:
-    """What a camera's picture holds, `width` metres across at the `target`; the longest hair."""
+    """What a camera's picture holds, `width` metres across at the `target`; the longest hair.
+
+    A drifting subject moves every `rows` scanlines, where a tracking frame is shot.
+    """
 
     target: tuple[float, float, float]
     width: float
     longest: float
+    rows: int = 128
 
 
 FRAMINGS = {
-    "sintel": Framing((0.0, 0.0, -0.025), 0.29, 0.25),
+    "sintel": Framing((0.0, 0.0, -0.025), 0.29, 0.25, 64),
     "ponytail": Framing((0.0, 0.06, -0.06), 0.36, 0.35),
     "curly": Framing((0.0, 0.01, 0.01), 0.31, 0.15),
 }
 
 
-def rig_text(framing: Framing) -> str:
+def rig_text(framing: Framing, tracking_every: int = 64) -> str:
     """A rig file: 8 cameras of 320×400 around, every other one raised, 3 projectors of 256 rows."""
     target = list(framing.target)
     fov_deg = math.degrees(2 * math.atan(framing.width / 2 / _DISTANCE))
@@ -99,7 +102,7 @@ def rig_text(framing: Framing) -> str:
     )
     exposure = ", ".join(f"{k} = 0.02" for k in ("dark", "all_on", "olat", "scanline", "tracking"))
     text.append(
-        f"[capture]\ntracking_every = {TRACKING_EVERY}\nretries = 2\nexposure = {{{exposure}}}\n"
+        f"[capture]\ntracking_every = {tracking_every}\nretries = 2\nexposure = {{{exposure}}}\n"
         "level = {all_on = 0.05, olat = 1.0, scanline = 1.0, tracking = 0.4}"
     )
     return "\n\n".join(text) + "\n"
@@ -134,7 +137,8 @@ def subject_capture(
                     file.replace(made / file.name)
         subject, head = (str(made / f) for f in ("ponytail.npz", "ponytail_head.obj"))
     label = f"{name}-{'still' if drift_mm == 0 else 'drifting'}"
-    rig = rig_text(FRAMINGS[name])
+    framing = FRAMINGS[name]
+    rig = rig_text(framing, framing.rows if drift_mm > 0 else 64)
     return SimulatedCapture(label, rig, subject, head, drift_mm, spp)
 
 
