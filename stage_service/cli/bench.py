@@ -145,7 +145,10 @@ def _appearance(args: argparse.Namespace) -> dict[str, Any]:
         )
         capture = args.capture or Path(os.environ.get(_DATA, ".")) / _CAPTURE
         if capture.is_dir():
-            result["cycles"] = fit_cycles(args.out, capture, seed=args.seed, progress=progress)
+            for name, afar in (("cycles", False), ("cycles_from_afar", True)):
+                result[name] = fit_cycles(
+                    args.out, capture, afar=afar, seed=args.seed, progress=progress
+                )
         return result
 
 
