@@ -59,6 +59,26 @@ def asked_bits(a: CodeMap, b: CodeMap) -> Words:
     return a.varying | b.varying
 
 
+LEAST_LIT = 0.1
+"""Of the median pixel's brightest light: what a shadow lets through is below."""
+
+
+def along_lines(
+    images: NDArray[np.float32], angle: NDArray[np.floating], half: int = 4
+) -> NDArray[np.float32]:
+    """Means of `images (L, H, W)` over `half` pixels to both sides along the line at each pixel.
+
+    Shadows run along strands for some millimetres, noise does not; across a strand they change.
+    """
+    y, x = np.mgrid[: angle.shape[0], : angle.shape[1]]
+    total = np.zeros_like(images)
+    for k in range(-half, half + 1):
+        column = np.clip(np.rint(x + k * np.cos(angle)).astype(int), 0, angle.shape[1] - 1)
+        row = np.clip(np.rint(y + k * np.sin(angle)).astype(int), 0, angle.shape[0] - 1)
+        total += images[:, row, column]
+    return total / np.float32(2 * half + 1)
+
+
 def code_map(
     responses: Images,
     mask: Bools,
@@ -70,13 +90,16 @@ def code_map(
 
     A pixel is lit where it exceeds the median over the mask `(H, W)` under light `furthest`, the
     one furthest from the camera, which shows what a shadow looks like; and three times `noise`,
-    the responses' standard deviation. `saturated (L, H, W)` pixels are lit whatever their value.
-    Raises `ValueError` where shapes disagree.
+    the responses' standard deviation; and `LEAST_LIT`, where the head itself stands before that
+    light and its median is next to nothing. `saturated (L, H, W)` pixels are lit whatever their
+    value. Raises `ValueError` where shapes disagree.
     """
     if responses.ndim != 3 or responses.shape[1:] != mask.shape:
         raise ValueError(f"expected responses (L, {mask.shape}), got {responses.shape}")
     shadow = float(np.median(responses[furthest][mask])) if mask.any() else 0.0
-    threshold = max(shadow, 3 * noise, 0.0)
+    brightest = responses.max(axis=0)[mask]
+    faint = LEAST_LIT * float(np.median(brightest)) if len(brightest) else 0.0
+    threshold = max(shadow, 3 * noise, faint, 0.0)
     lit = (responses > threshold) & mask
     if saturated is not None:
         lit |= saturated & mask

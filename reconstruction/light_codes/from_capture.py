@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reconstruction.cameras import Camera
 from reconstruction.capture import Capture, CaptureError
-from reconstruction.light_codes.codes import code_map
+from reconstruction.light_codes.codes import along_lines, code_map
 from reconstruction.light_codes.views import View, furthest_light, light_beside, line_vectors
 from reconstruction.lights import Light
 from reconstruction.orientation import LogGaborBank, orientations
@@ -100,7 +100,8 @@ def _view(
             )
         images[i] = (image.mean(axis=-1) - dark) / irradiance
         noise = max(noise, background_noise(images[i]))
-    codes = code_map(images, mask, furthest_light(camera, lights), noise, clipped)
-    found = orientations(images, mask, bank)
+    found = orientations(images, mask, bank, "responses")
+    smooth = along_lines(images, found.angle)
+    codes = code_map(smooth, mask, furthest_light(camera, lights), noise, clipped)
     lines = line_vectors(found.angle, found.confidence)
     return View(camera, mask, lines, codes, light_beside(camera, lights, at))

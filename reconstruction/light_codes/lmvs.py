@@ -7,6 +7,8 @@ multi-view stereo without visibility, the better half of the cameras counts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -15,17 +17,26 @@ from numpy.typing import NDArray
 
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import Pixels, line_through
-from reconstruction.light_codes.search import DepthSearch, Floats
+from reconstruction.light_codes.search import DEFAULTS, DepthSearch, Floats, SearchOptions
+from reconstruction.light_codes.views import View
 
-FAN = np.radians(np.linspace(-60, 60, 9))
+FAN = np.radians(np.linspace(-50, 50, 5))
 """Inclinations towards the camera at which a line is tried at every depth."""
 
-COARSE_SAMPLES, COARSE_NEIGHBOURS = 5, 8
+COARSE_SAMPLES, COARSE_NEIGHBOURS = 3, 6
 ROUNDS = 3
 
 
 class LmvsSearch(DepthSearch):
-    """Searches depth and inclination; same inputs and outputs as `DepthSearch`."""
+    """Searches depth and inclination; same inputs and outputs as `DepthSearch`.
+
+    Segments are not judged by the `misfit` of Eq. 4, which is not this method's.
+    """
+
+    def __init__(
+        self, views: Sequence[View], subject: Any, options: SearchOptions = DEFAULTS
+    ) -> None:
+        super().__init__(views, subject, replace(options, most_misfit=1.0))
 
     def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
         """All neighbours `(P, N)`: nothing says which of them see a pixel."""

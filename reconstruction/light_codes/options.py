@@ -17,17 +17,18 @@ class LightCodeOptions:
 
     `volume_grid` metres are the voxels in which depths are bounded, at most `deepest` metres behind
     where a ray enters the hair's volume. Segments count that at least `least_views` views found
-    alike, within `support_distance` metres and `support_angle_deg`. `thin` metres are the cells
-    that lines are averaged in before they are strung together. Segments count `field_weight` times
-    their confidence in an orientation field that both methods feed.
+    alike, their own and three neighbours, within `support_distance` metres and `support_angle_deg`.
+    Lines are averaged in cells of `crowd` metres before mean shift and of `thin` metres after it.
+    Segments count `field_weight` times their confidence in an orientation field that both feed.
     """
 
-    bank: LogGaborBank = LogGaborBank(count=32, spread=1.0)  # noqa: RUF009  frozen
+    bank: LogGaborBank = LogGaborBank(count=48, spread=1.0, wavelength=5.0)  # noqa: RUF009  frozen
     volume_grid: float = 4e-3
     deepest: float = 0.06
-    least_views: int = 3
+    least_views: int = 4
     support_distance: float = 1e-3
     support_angle_deg: float = 10.0
+    crowd: float = 2e-4
     thin: float = 3e-4
     field_weight: float = 4.0
     search: SearchOptions = SearchOptions()  # noqa: RUF009

@@ -37,7 +37,7 @@ def measure_segments(
     bounds: Array | None = None,
     progress: Progress = silent,
 ) -> tuple[list[View], Segments]:
-    """The views, and the segments that `least_views` of them agree on.
+    """The views, and the segments that `least_views` of them (all, if there are fewer) agree on.
 
     Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
     there are no two views of hair, or no segment is left.
@@ -93,7 +93,8 @@ def measure_segments(
             angle_deg=options.support_angle_deg,
         )
         supports = np.bincount(segments.supports, minlength=len(views) + 1)
-        kept = segments.subset(segments.supports >= options.least_views)
+        least = min(options.least_views, len(views))
+        kept = segments.subset(segments.supports >= least)
         stage.figures.update(
             found=len(segments),
             kept=len(kept),
@@ -102,7 +103,7 @@ def measure_segments(
         if not len(kept):
             raise CaptureError(
                 f"{capture.path}: no segment of {len(segments)} is found alike in "
-                f"{options.least_views} of {len(views)} views: more cameras with overlapping "
+                f"{least} of {len(views)} views: more cameras with overlapping "
                 "views, sharper or finer pictures, or a lower least_views may help"
             )
     return views, kept
@@ -116,10 +117,13 @@ def string_together(
 ) -> list[Array]:
     """Polylines `(n, 3)` through the segments, with what grows from their tips."""
     with report.stage("connection") as stage:
-        points, directions = mean_shift(
-            segments.points, segments.directions, segments.confidence, options.mean_shift
+        # of the segments that ten views agree on, three times as many are right as of those of four
+        weights = (segments.confidence * segments.supports) ** 2
+        points, directions, weights = thinned_lines(
+            segments.points, segments.directions, weights, options.crowd
         )
-        points, directions, _ = thinned_lines(points, directions, segments.confidence, options.thin)
+        points, directions = mean_shift(points, directions, weights, options.mean_shift)
+        points, directions, _ = thinned_lines(points, directions, weights, options.thin)
         found = chains(points, directions, options.chains)
         grown = extend(views, found, options.extension)
         stage.figures.update(

@@ -39,6 +39,7 @@ def add(commands: Commands) -> None:
         "appearance: stage 1 and its ablations on subjects of known appearance, and on the capture "
         "of agreement. "
         "acquisition: steps and bytes a second beside what wires and disk allow. "
+        "photometric: line stereo with and without lightcodes, and fused, on patches of two heads. "
         "lightplanes: strands of three subjects, still and drifting, beside controls without a "
         f"method; two of them, Sintel and a ponytail, come from ${_DATA}. "
         "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
@@ -49,7 +50,11 @@ def add(commands: Commands) -> None:
     bench.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
     bench.add_argument("--rig", type=Path, default=Path("deploy/rigs/demo.toml"))
     bench.add_argument("--capture", type=Path, help=f"for agreement; default: ${_DATA}/{_CAPTURE}")
-    bench.add_argument("--only", choices=("sintel", "ponytail", "curly"), help="for lightplanes")
+    bench.add_argument(
+        "--only",
+        choices=("sintel", "ponytail", "curly", "wavy"),
+        help="one subject, for lightplanes (not wavy) and photometric (sintel or wavy)",
+    )
     bench.add_argument(
         "--cache", type=Path, default=Path("runs/cache"), help="where simulated captures are kept"
     )
@@ -175,6 +180,15 @@ def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
         return run(args.out, simulate, progress)
 
 
+def _photometric(args: argparse.Namespace) -> dict[str, Any]:
+    from stage_service.cli.bench_photometric import run
+
+    data = os.environ.get(_DATA)
+    with progress_bar("bench photometric") as progress:
+        out = args.out / "photometric"
+        return run(out, Path(data) if data else None, args.cache, args.only, progress)
+
+
 def _lightplanes(args: argparse.Namespace) -> dict[str, Any]:
     from stage_service.cli.bench_lightplanes import run
 
@@ -190,6 +204,7 @@ BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "appearance": _appearance,
     "acquisition": _acquisition,
     "lightplanes": _lightplanes,
+    "photometric": _photometric,
 }
 
 

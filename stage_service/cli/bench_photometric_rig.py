@@ -54,7 +54,7 @@ def rig_text(target: tuple[float, float, float]) -> str:
         '[devices.lights]\nkind = "modbus_tcp"\nhost = "127.0.0.1"\nport = 15020\n'
         '[devices.trigger]\nkind = "serial"\nport = "trigger"\n'
         '[devices.cameras]\nkind = "link"\nhost = "127.0.0.1"\nport = 15021\n'
-        "timeout_s = 120.0\nbusy_s = 1800.0\n"
+        "timeout_s = 120.0\nbusy_s = 14400.0\n"
         "[safety]\nliving_subject = false"
     )
     exposure = ", ".join(f"{k} = 0.02" for k in ("dark", "all_on", "olat", "scanline", "tracking"))

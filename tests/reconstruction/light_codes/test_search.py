@@ -21,7 +21,7 @@ def error(stage: Any, view: int, found: DepthMap) -> Any:
 @pytest.mark.parametrize("method", [DepthSearch, LmvsSearch])
 def test_depths_are_true_below_a_pixel(fibres: Any, method: type[DepthSearch]) -> None:
     found = method(fibres.views, (0, 0, 0)).run(1, *fibres.range(1))
-    assert len(found.x) > 0.9 * fibres.views[1].mask.sum()
+    assert len(found.x) > 0.7 * fibres.views[1].mask.sum()
     pixel = 1e3 * fibres.depth(1).max() / fibres.cameras[1].K[0, 0]
     assert np.median(error(fibres, 1, found)) < pixel
     seen = fibres.drawn[1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reconstruction.evaluation import compare_strands
-from reconstruction.light_codes.chains import ChainOptions, chains
+from reconstruction.light_codes.chains import ChainOptions, chains, smoothed
 from reconstruction.light_codes.extension import ExtensionOptions, extend, fewest_views
 from reconstruction.light_codes.mean_shift import MeanShiftOptions, mean_shift, thinned_lines
 from reconstruction.light_codes.search import DepthSearch
@@ -61,7 +61,7 @@ def test_lines_in_any_order_are_strung_together() -> None:
     directions = np.concatenate([first[1], second[1]])
     directions *= rng.choice([-1, 1], len(points))[:, None]
     order = rng.permutation(len(points))
-    found = sorted(chains(points[order], directions[order]), key=len)
+    found = sorted(chains(points[order], directions[order], ChainOptions(smooth=0)), key=len)
     assert [len(f) for f in found] == [60, 80]
     for polyline, (truth, _) in zip(found, (second, first), strict=True):
         either = polyline if np.allclose(polyline[0], truth[0]) else polyline[::-1]
@@ -74,6 +74,17 @@ def test_a_ring_is_one_polyline_and_specks_are_none() -> None:
     assert [len(f) for f in found] == [200]
     assert chains(points[:3], directions[:3], ChainOptions(shortest=2e-3)) == []
     assert chains(points[:1], directions[:1]) == []
+
+
+def test_smoothing_keeps_the_ends_and_takes_the_jitter() -> None:
+    rng = np.random.default_rng(2)
+    points, _ = arc(100)
+    jitter = points + 1e-4 * rng.normal(size=points.shape)
+    found = smoothed(jitter, 1e-3)
+    off = np.hypot(np.linalg.norm(found[:, :2], axis=1) - 0.02, found[:, 2])
+    assert off[15:-15].mean() < 0.5e-4
+    np.testing.assert_allclose(found[[0, -1]], jitter[[0, -1]], atol=2e-4)
+    np.testing.assert_array_equal(smoothed(jitter[:2], 2e-3), jitter[:2])
 
 
 def test_how_many_views_must_agree() -> None:

@@ -1,0 +1,190 @@
+"""Line stereo on patches whose truth is known: quality, how it falls with cameras and lights."""
+
+from __future__ import annotations
+
+import copy
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.capture import Capture
+from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
+from reconstruction.evaluation import compare_strands
+from reconstruction.methods import Method
+from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.report import Progress, Report, silent
+from reconstruction.rig import Rig
+from reconstruction.strand_files import read_strands
+from reconstruction.strands import Strands
+from reconstruction.visibility import Visibility
+
+SUN = {
+    "Nam 2019, short hair": (6.56, 20.94, 37.32),
+    "Sun 2021, short hair": (22.42, 59.22, 79.35),
+    "Nam 2019, long hair": (6.87, 16.70, 27.95),
+    "Sun 2021, long hair": (28.22, 65.52, 80.60),
+}
+"""F in per cent of Sun's Table 1 at 1 mm/10°, 2 mm/20° and 3 mm/30°."""
+
+METHODS: tuple[Method, ...] = ("lmvs", "photometric", "fused")
+CAMERAS, LIGHTS = (12, 6), (18, 9)
+
+STEP = 5e-4
+"""Metres between the points at which strands are cut at the ball's surface."""
+
+
+def cut_to_ball(strands: Strands, center: ArrayLike, radius: float) -> Strands:
+    """The pieces of the strands that lie in a ball, resampled at half a millimetre."""
+    dense = strands.resampled(STEP)
+    inside = np.linalg.norm(dense.points - np.asarray(center), axis=1) < radius
+    owner = dense.strand_of_point
+    starts = inside & ~np.r_[False, inside[:-1] & (owner[1:] == owner[:-1])]
+    piece = np.cumsum(starts)[inside]
+    points = dense.points[inside]
+    count = np.bincount(piece)[1:] if len(piece) else np.zeros(0, np.int64)
+    keep = np.repeat(count >= 2, count)
+    offsets = np.concatenate([[0], np.cumsum(count[count >= 2])]).astype(np.int64)
+    return Strands(points[keep], offsets, float(np.mean(strands.radius)))
+
+
+class PatchTruth:
+    """True strands within a ball, and what the capture's cameras see of them."""
+
+    def __init__(
+        self, capture: Capture, folder: Path, center: ArrayLike, radius: float, samples: int
+    ) -> None:
+        whole = read_strands(folder / "strands.npz")
+        self.cameras, self.head = capture.rig.cameras, capture.head
+        self.center, self.radius, self.samples = center, radius, samples
+        self.strands = cut_to_ball(whole, center, radius)
+        self.visibility = Visibility(self.cameras, whole, self.head)
+
+    def score(self, strands: Strands) -> dict[str, Any]:
+        """`compare_strands` of what lies in the ball, over visible and all."""
+        return compare_strands(
+            cut_to_ball(strands, self.center, self.radius),
+            self.strands,
+            cameras=self.cameras,
+            head=self.head,
+            samples=self.samples,
+            visibility=self.visibility,
+        )
+
+
+def part_of(capture: Capture, cameras: int | None = None, lights: int | None = None) -> Capture:
+    """The capture with `cameras` and `lights` of it, evenly picked in the rig's order."""
+    out = copy.copy(capture)
+    rig = capture.rig
+    some = _every(rig.cameras, cameras)
+    lit = set(_every(capture.olat_lights(), lights))
+    out.rig = Rig(rig.name, tuple(some), rig.lights, rig.projectors)
+    out.steps = tuple(s for s in capture.steps if s.kind != "olat" or s.light in lit)
+    out.__dict__.pop("_of_light", None)  # cached for the steps that it had
+    return out
+
+
+def _every(items: Sequence[Any], count: int | None) -> list[Any]:
+    if count is None or count >= len(items):
+        return list(items)
+    return [items[int(i)] for i in np.linspace(0, len(items) - 1, count).round()]
+
+
+def run_patch(
+    out: Path,
+    capture_folder: Path,
+    truth_folder: Path,
+    center: ArrayLike,
+    radius: float,
+    *,
+    options: ReconstructOptions | None = None,
+    thinner: bool = True,
+    samples: int = 10_000,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """All methods and both controls in a ball about `center (3,)` of `radius` metres.
+
+    `thinner` also runs `photometric` with fewer cameras and with fewer lights. Models are left in
+    `OUT/<method>`, figures in `OUT/patch.json` as they come.
+    """
+    options = options or ReconstructOptions()
+    capture = Capture(capture_folder)
+    truth = PatchTruth(capture, truth_folder, center, radius, samples)
+    runs: list[tuple[str, Method, Capture]] = [(m, m, capture) for m in METHODS]
+    if thinner:
+        for n in CAMERAS:
+            runs.append((f"photometric, {n} cameras", "photometric", part_of(capture, cameras=n)))
+        for n in LIGHTS:
+            runs.append((f"photometric, {n} lights", "photometric", part_of(capture, lights=n)))
+    results: dict[str, Any] = {"rows": {}, "sun": SUN}
+    for k, (name, method, some) in enumerate(runs):
+        model = out / name.replace(", ", "_").replace(" ", "_")
+        begin = time.perf_counter(), time.process_time()
+        report = reconstruct(
+            some,
+            model,
+            method=method,
+            options=options,
+            progress=lambda what, share, k=k, n=name: progress(  # type: ignore[misc]
+                f"{n}: {what}", (k + share) / (len(runs) + 1)
+            ),
+        )
+        row = truth.score(read_strands(model / "strands.npz"))
+        results["rows"][name] = {
+            **row,
+            "seconds": time.perf_counter() - begin[0],
+            "cpu_seconds": time.process_time() - begin[1],
+            "stages": _stages(report),
+        }
+        _save(out / "patch.json", results)
+    progress("controls", len(runs) / (len(runs) + 1))
+    for name, strands in controls(capture, out / "photometric", options.grid).items():
+        results["rows"][name] = truth.score(strands)
+    _save(out / "patch.json", results)
+    return results
+
+
+def controls(capture: Capture, model: Path, spacing: float) -> dict[str, Strands]:
+    """The controls that use no method, in the masks that the reconstruction had."""
+    masks: dict[str, NDArray[np.bool_]] = {}
+    for camera in capture.rig.cameras:
+        file = model / "masks" / f"{camera.name}_hair.png"
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise FileNotFoundError(f"{file}: no mask that the reconstruction had")
+        masks[camera.name] = np.asarray(image > 127)
+    hull = control_hull(capture.rig.cameras, masks, capture.head, spacing=spacing)
+    return {
+        "hull_vertical": hull_vertical(hull),
+        "hull_smooth_field": hull_smooth_field(hull, capture.head),
+    }
+
+
+def quick(options: ReconstructOptions) -> ReconstructOptions:
+    """Without the parts of a report that cost time and tell nothing here."""
+    return replace(options, explicit_seconds=0.0)
+
+
+def _stages(report: Report) -> dict[str, float]:
+    return {s.name: s.seconds for s in report.stages}
+
+
+def _save(path: Path, results: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+    part.replace(path)
+
+
+def thresholds_met(row: dict[str, Any], sun: NDArray[np.floating]) -> dict[str, list[bool]]:
+    """For visible and all, at which thresholds F is above Sun's `(3,)` per cent."""
+    return {
+        over: [100 * s["f"] > f for s, f in zip(row[over].values(), sun, strict=True)]
+        for over in ("visible", "all")
+    }

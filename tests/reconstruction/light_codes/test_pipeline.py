@@ -1,0 +1,129 @@
+"""From captures of known fibres to strands, and captures that have too little of something."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.bench_light_codes import cut_to_ball, part_of
+from reconstruction.capture import Capture, CaptureError
+from reconstruction.evaluation import compare_strands
+from reconstruction.light_codes.options import LightCodeOptions
+from reconstruction.light_codes.search import SearchOptions
+from reconstruction.orientation import LogGaborBank
+from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.strand_files import read_strands
+from reconstruction.strands import Strands
+
+QUICK = ReconstructOptions(
+    light_codes=LightCodeOptions(
+        bank=LogGaborBank(count=16, spread=1.0, wavelength=5.0),
+        search=SearchOptions(candidates=8, samples=9, step=5e-4),
+        deepest=0.03,
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def shot(fibres: Any, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return fibres.shoot(tmp_path_factory.mktemp("fibres") / "capture")  # type: ignore[no-any-return]
+
+
+def run(capture: Capture, model: Path, method: str = "photometric") -> Any:
+    return reconstruct(capture, model, method=method, options=QUICK)  # type: ignore[arg-type]
+
+
+def test_photometric_finds_the_fibres_and_reports_what_it_saw(
+    shot: Capture, fibres: Any, tmp_path: Path
+) -> None:
+    report = run(shot, tmp_path)
+    strands = read_strands(tmp_path / "strands.npz")
+    figures = compare_strands(strands, fibres.strands, samples=None)["all"]
+    assert figures["2mm_20deg"]["f"] > 0.6
+    codes = report["lightcodes"].figures
+    assert codes["lights"] == 36
+    assert codes["cameras_with_a_light_beside"] == len(fibres.cameras)
+    assert report["depth"].figures["visible_neighbours"] > 2
+    assert "roots" in [x.what for x in report["strands"].left_out]
+    # upper ends first: nobody gave a head
+    assert (strands.roots[:, 2] >= strands.points[strands.offsets[1:] - 1][:, 2]).all()
+
+
+def test_the_baseline_runs_on_the_same_capture(shot: Capture, fibres: Any, tmp_path: Path) -> None:
+    run(shot, tmp_path, "lmvs")
+    figures = compare_strands(read_strands(tmp_path / "strands.npz"), fibres.strands, samples=None)
+    assert figures["all"]["3mm_30deg"]["f"] > 0.25
+
+
+def test_no_light_beside_a_camera_is_said(
+    make_fibres: Any, fibre_lamps: Any, tmp_path: Path
+) -> None:
+    stage = make_fibres()
+    lights = [replace(x, position=x.position * [1, 1, -1]) for x in fibre_lamps(20)]
+    report = run(make_fibres(lights=lights).shoot(tmp_path / "capture"), tmp_path / "model")
+    assert report["lightcodes"].figures["cameras_with_a_light_beside"] < len(stage.cameras)
+    assert any("no light stands beside" in w for w in report["lightcodes"].warnings)
+
+
+def test_one_light_is_enough_for_lines(shot: Capture, tmp_path: Path) -> None:
+    report = run(part_of(shot, lights=1), tmp_path)
+    assert report["lightcodes"].figures["lights"] == 1
+
+
+def test_saturated_views_end_in_a_sentence_or_strands(fibres: Any, tmp_path: Path) -> None:
+    capture = fibres.shoot(tmp_path / "capture", brightness=50.0, full_scale=1.0)
+    report = run(capture, tmp_path / "model")
+    assert len(read_strands(tmp_path / "model" / "strands.npz")) > 0
+    assert report["segments"].figures["kept"] > 0
+
+
+def test_what_cannot_be_done_without_is_named(fibres: Any, tmp_path: Path) -> None:
+    dark = fibres.shoot(tmp_path / "dark", brightness=0.0)
+    with pytest.raises(CaptureError, match=r"no hair pixel has a direction|is found alike"):
+        run(dark, tmp_path / "m")
+    for name in (c.name for c in fibres.cameras):
+        mask = tmp_path / "dark" / "masks" / f"{name}.png"
+        cv2.imwrite(str(mask), 0 * cv2.imread(str(mask)))
+    with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
+        run(Capture(dark.path), tmp_path / "m")
+    unlit = Capture(dark.path)
+    unlit.steps = tuple(s for s in unlit.steps if s.kind != "olat")
+    with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
+        run(unlit, tmp_path / "m")
+
+
+def test_cameras_that_look_away_leave_no_volume(
+    make_fibres: Any, fibre_cameras: Any, tmp_path: Path
+) -> None:
+    stage = make_fibres()
+    turned = [c.moved(np.eye(3), c.R[0] * 0.5) for c in fibre_cameras(4)]
+    capture = make_fibres(cameras=turned).shoot(tmp_path / "capture")
+    assert len(stage.cameras) == 8
+    for camera in turned:  # masks of what is not there: the cameras' rays do not meet
+        mask = np.full((camera.height, camera.width), 255, np.uint8)
+        cv2.imwrite(str(tmp_path / "capture" / "masks" / f"{camera.name}.png"), mask)
+    with pytest.raises(CaptureError):
+        run(Capture(capture.path), tmp_path / "m")
+
+
+def test_strands_are_cut_at_the_balls_surface() -> None:
+    line = np.stack([np.linspace(-0.05, 0.05, 11), np.zeros(11), np.zeros(11)], axis=1)
+    outside = line + np.array([0, 0.5, 0])
+    bent = np.array([[-0.05, 0, 0], [0, 0, 0], [0, 0.05, 0], [0.005, 0.05, 0], [0.005, 0, 0]])
+    found = cut_to_ball(Strands.from_list([line, outside, bent]), (0, 0, 0), 0.02)
+    assert len(found) == 3
+    assert np.linalg.norm(found.points, axis=1).max() < 0.02
+    np.testing.assert_allclose(found.lengths()[0], 0.04, atol=1.1e-3)
+    assert len(cut_to_ball(Strands.from_list([outside]), (0, 0, 0), 0.02)) == 0
+
+
+def test_part_of_a_capture_keeps_what_was_asked(shot: Capture) -> None:
+    some = part_of(shot, cameras=3, lights=5)
+    assert [c.name for c in some.rig.cameras] == ["c0", "c4", "c7"]
+    assert len(some.olat_lights()) == 5
+    assert len(shot.olat_lights()) == 36
