@@ -13,9 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from reconstruction.capture import Capture
 from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
+from reconstruction.envelope import mesh_depth
 from reconstruction.evaluation import compare_strands
 from reconstruction.methods import Method
 from reconstruction.pipeline import ReconstructOptions, reconstruct
@@ -78,6 +80,28 @@ class PatchTruth:
         )
 
 
+def write_hair_masks(capture: Capture, truth_folder: Path) -> None:
+    """Write the user's masks of a capture that has none, from its true strands.
+
+    Sun's come from a network trained for it; a patch has no background by which to tell hair.
+    """
+    strands = read_strands(truth_folder / "strands.npz")
+    points = strands.resampled(STEP).points
+    (capture.path / "masks").mkdir(exist_ok=True)
+    for camera in capture.rig.cameras:
+        file = capture.path / "masks" / f"{camera.name}.png"
+        if file.exists():
+            continue
+        pixels, depth = camera.project(points)
+        on = (depth > 0) & camera.inside(pixels)
+        x, y = np.rint(pixels[on]).astype(int).T
+        nearest = np.full((camera.height, camera.width), np.inf)
+        np.minimum.at(nearest, (y, x), depth[on])
+        nearest = ndimage.minimum_filter(nearest, 3)  # strands are two to three pixels wide
+        skin = np.inf if capture.head is None else mesh_depth(camera, capture.head)
+        cv2.imwrite(str(file), (nearest < skin).astype(np.uint8) * 255)
+
+
 def part_of(capture: Capture, cameras: int | None = None, lights: int | None = None) -> Capture:
     """The capture with `cameras` and `lights` of it, evenly picked in the rig's order."""
     out = copy.copy(capture)
@@ -115,6 +139,7 @@ def run_patch(
     """
     options = options or ReconstructOptions()
     capture = Capture(capture_folder)
+    write_hair_masks(capture, truth_folder)
     truth = PatchTruth(capture, truth_folder, center, radius, samples)
     runs: list[tuple[str, Method, Capture]] = [(m, m, capture) for m in METHODS]
     if thinner:
