@@ -178,20 +178,21 @@ def fill_gaps(
     step: float = 5e-4,
     max_length: float = 0.3,
     shortest: float = 0.01,
-    within: float = 3e-3,
+    within: float | None = None,
     batch: int = 1500,
     rounds: int = 120,
 ) -> list[NDArray[np.float32]]:
     """Strands through the voxels that no strand passes, traced both ways from random ones.
 
     Only voxels within `within` metres of a measured one are set out from: Photobooth §3.4 deletes
-    strands that meet nothing measured, and the volume between hair and face has no hair. Each round
+    strands that meet nothing measured, and the volume between hair and face has no hair. None takes
+    3 mm, or two voxels where those are more. Each round
     starts from at most `batch` of the remaining gaps, so that strands of one round cover the seeds
     of the next. Paths shorter than `shortest` metres are not kept.
     """
     rng = np.random.default_rng(seed)
     out: list[NDArray[np.float32]] = []
-    spent = ~field.near_measured(within)
+    spent = ~field.near_measured(max(3e-3, 2 * field.grid.spacing) if within is None else within)
     centers = field.grid.centers()
     for _ in range(rounds):
         gaps = coverage.gaps()

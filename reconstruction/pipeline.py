@@ -61,9 +61,10 @@ class ReconstructOptions:
     scalp to lay a head under, where the capture has no `head.obj` or a better one is wanted, and
     `head_mesh` (OBJ) the head to lay there instead of the generic one. `scalp_normals` holds the
     field to the scalp's normals as the paper does; hair that lies flat on the head is bent wrongly
-    by that. `to_measured` ends strands from the scalp at their last measured voxel. `radius` of the
-    strands in metres; None takes the one that keeps a head of hair's coverage. `explicit_seconds`
-    of explicit diffusion are run beside the solver for the report.
+    by that. `to_measured` ends strands from the scalp at their last measured voxel. Gaps are filled
+    `within` metres of what was measured (None: 3 mm, or two voxels): give more where pixels are
+    wider. `radius` of the strands in metres; None takes the one that keeps a head of hair's
+    coverage. `explicit_seconds` of explicit diffusion are run beside the solver for the report.
     """
 
     held_out: tuple[str, ...] = ()
@@ -78,6 +79,7 @@ class ReconstructOptions:
     head_mesh: str | None = None
     scalp_normals: bool = False
     to_measured: bool = False
+    within: float | None = None
     spacing: float = 2e-3
     radius: float | None = None
     seed: int = 0
@@ -329,7 +331,12 @@ def grow(
     share = float(coverage.covered[field.valid].mean())
     progress("filling gaps", 0.4)
     loose = fill_gaps(
-        field, coverage, seed=options.seed, step=options.step, max_length=options.max_length
+        field,
+        coverage,
+        seed=options.seed,
+        step=options.step,
+        max_length=options.max_length,
+        within=options.within,
     )
     filled = float(coverage.covered[field.valid].mean())
     progress("rooting strands", 0.7)

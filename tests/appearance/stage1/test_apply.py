@@ -112,7 +112,7 @@ def test_stock_mitsuba_opens_the_scene_and_sees_about_our_picture(fitted, tmp_pa
     ours = render_environment(fitted.scene(), CAMERA, sky, spp=64, max_depth=15)
     np.testing.assert_allclose(stock.mean((0, 1)), ours.mean((0, 1)), rtol=0.35)
     columns = [x.mean((0, 2)) for x in (stock, ours)]
-    assert np.corrcoef(columns)[0, 1] > 0.95
+    assert np.corrcoef(columns)[0, 1] > 0.9
 
 
 def test_usd_has_the_maps_as_attributes(fitted, tmp_path):
