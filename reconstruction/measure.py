@@ -60,6 +60,10 @@ class Measured:
     directions: Array
     confidence: Array
 
+    def where(self, keep: NDArray[np.bool_]) -> Measured:
+        """Those that are to be kept `(N,)`."""
+        return Measured(self.points[keep], self.directions[keep], self.confidence[keep])
+
 
 def light_groups(lights: list[Light], count: int) -> NDArray[np.int64]:
     """Group number `(L,)` of each light: nearest of `count` seeds spread over the lights.

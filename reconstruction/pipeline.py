@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +40,7 @@ from reconstruction.segmentation import Network
 from reconstruction.straightened import as_shot, straightened
 from reconstruction.strand_files import write_strands
 from reconstruction.strands import Strands
+from reconstruction.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.visual_hull import VoxelGrid
 
 Array = NDArray[np.float64]
@@ -61,10 +62,13 @@ class ReconstructOptions:
     scalp to lay a head under, where the capture has no `head.obj` or a better one is wanted, and
     `head_mesh` (OBJ) the head to lay there instead of the generic one. `scalp_normals` holds the
     field to the scalp's normals as the paper does; hair that lies flat on the head is bent wrongly
-    by that. `to_measured` ends strands from the scalp at their last measured voxel. Gaps are filled
-    `within` metres of what was measured (None: 3 mm, or two voxels): give more where pixels are
-    wider. `radius` of the strands in metres; None takes the one that keeps a head of hair's
-    coverage. `explicit_seconds` of explicit diffusion are run beside the solver for the report.
+    by that. `surface` says how strands are traced through the measured lines themselves before any
+    follow the field; its `apart` is taken from `measure`, its `longest` from `max_length`; None
+    leaves them out. `to_measured` ends strands from the scalp at their last measured voxel. Gaps
+    are filled `within` metres of what was measured (None: 3 mm, or two voxels): give more where
+    pixels are wider. `radius` of the strands in metres; None takes the one that keeps a head of
+    hair's coverage. `explicit_seconds` of explicit diffusion are run beside the solver for the
+    report.
     """
 
     held_out: tuple[str, ...] = ()
@@ -86,6 +90,7 @@ class ReconstructOptions:
     explicit_seconds: float = 1.0
     motion: MotionOptions = MotionOptions()  # noqa: RUF009  frozen
     measure: MeasureOptions = MeasureOptions()  # noqa: RUF009  frozen
+    surface: SurfaceOptions | None = SurfaceOptions()  # noqa: RUF009  frozen
     light_codes: LightCodeOptions = LightCodeOptions()  # noqa: RUF009
 
 
@@ -151,11 +156,12 @@ def reconstruct(
         measured = measure_tangents(
             capture, cloud.points, masks, depths, envelope, options.measure, stage, progress
         )
-    seen: list[Array] = []
+    seen = _surface(measured, cloud, options, report, progress)
     if method == "fused":
-        seen, segments = line_strands(
+        more, segments = line_strands(
             capture, masks, head, report, options=options.light_codes, progress=progress
         )
+        seen += more
         measured = both(measured, segments, options.light_codes.field_weight)
     with report.stage("field") as stage:
         scalp = find_scalp(head, envelope)
@@ -262,6 +268,32 @@ def _points(
     )
 
 
+def _surface(
+    measured: Measured,
+    cloud: PointCloud,
+    options: ReconstructOptions,
+    report: Report,
+    progress: Progress,
+) -> list[NDArray[np.floating]]:
+    """Polylines through the measured lines; none of them rooted."""
+    if options.surface is None:
+        return []
+    with report.stage("surface") as stage:
+        if not len(cloud):
+            stage.leave_out(
+                "strands through the measured lines themselves",
+                "without a sweep lines lie on the visual hull, millimetres off",
+                "this stage; strands follow the field alone",
+            )
+            return []
+        progress("tracing the surface", 0.0)
+        surface = replace(options.surface, apart=options.measure.thin, longest=options.max_length)
+        good = measured.where(measured.confidence >= options.least_confidence)
+        polylines = surface_strands(good, surface, seed=options.seed)
+        stage.figures.update(strands=len(polylines), options=asdict(surface))
+    return list(polylines)
+
+
 def _field(
     envelope: VoxelGrid,
     measured: Measured,
@@ -272,11 +304,12 @@ def _field(
     keep = measured.confidence >= options.least_confidence
     if not keep.any():
         raise CaptureError("no hair pixel has a direction: are the OLAT frames in focus and lit?")
+    kept = measured.where(keep)
     field, series = solve_field(
         envelope,
-        measured.points[keep],
-        measured.directions[keep],
-        measured.confidence[keep],
+        kept.points,
+        kept.directions,
+        kept.confidence,
         (scalp.points, scalp.normals) if options.scalp_normals else None,
         FieldOptions(explicit_seconds=options.explicit_seconds),
     )
@@ -307,7 +340,7 @@ def grow(
     options: ReconstructOptions,
     stage: Stage,
     progress: Progress = silent,
-    seen: Sequence[Array] = (),
+    seen: Sequence[NDArray[np.floating]] = (),
 ) -> Strands:
     """Strands from the scalp, then through the gaps that those leave, all of them rooted.
 

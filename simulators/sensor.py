@@ -29,8 +29,11 @@ class Sensor:
         """Counts of `radiance (H, W, 3)`, W/(sr m²), after `exposure` seconds.
 
         Poisson shot noise and Gaussian read noise in electrons, then rounding and clipping. The
-        same `seed` gives the same counts.
+        same `seed` gives the same counts. Raises `ValueError` for NaN.
         """
+        if np.isnan(radiance).any():
+            where = np.argwhere(np.isnan(radiance))[0].tolist()
+            raise ValueError(f"radiance is not a number at (row, column, channel) {where}")
         rng = np.random.default_rng(seed)
         mean = np.asarray(radiance, np.float64) * (exposure * self.gain * self.electrons_per_count)
         # Far beyond saturation the noise does not matter, and Poisson draws have a limit.

@@ -147,6 +147,7 @@ def light_from(
     value = throughput * surface.eval(si, wo, active) * (intensity / squared)
     brightest = dr.max(value)
     kept = dr.maximum(brightest, dim)
+    chance = dr.maximum(chance, 1e-9)  # at 0 a contribution of 1e-40 would count as infinitely many
     lit = active & (chance * kept < brightest)
     lit &= ~surface.scene.mi_scene.ray_test(si.spawn_ray_to(target), lit)
     return value * (kept / brightest), lit

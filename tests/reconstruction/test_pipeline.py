@@ -152,6 +152,7 @@ def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
         "masks",
         "envelope",
         "orientation",
+        "surface",
         "field",
         "strands",
     ]
