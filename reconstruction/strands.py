@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,3 +163,18 @@ class Resampling:
         if isinstance(radius, np.ndarray):
             radius = (radius[left] * (1 - w) + radius[left + 1] * w).astype(np.float32)
         return points, radius
+
+
+def smoothed(line: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """The polyline `(n, 3)` under a Gaussian of `sigma` metres along it, its ends where they were.
+
+    Points a third of a millimetre apart and a tenth aside turn by more than ten degrees from one
+    to the next: where they lie is well known, where they lead to is not, before this.
+    """
+    step = np.linalg.norm(np.diff(line, axis=0), axis=1).mean()
+    if len(line) < 3 or not sigma > 0 or not step > 0:
+        return line
+    width = sigma / step
+    reach = int(np.ceil(3 * width))
+    many = np.pad(line, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.asarray(ndimage.gaussian_filter1d(many, width, axis=0)[reach : reach + len(line)])

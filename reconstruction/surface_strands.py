@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from reconstruction.light_codes.chains import smoothed
 from reconstruction.measure import Measured
+from reconstruction.strands import smoothed
 
 Array = NDArray[np.float64]
 Polyline = NDArray[np.float32]

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import cKDTree
+
+from reconstruction.strands import smoothed
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,21 +53,6 @@ def chains(points: Array, directions: Array, options: ChainOptions = ChainOption
         ):
             out.append(smoothed(line, options.smooth))
     return out
-
-
-def smoothed(line: Array, sigma: float) -> Array:
-    """The polyline `(n, 3)` under a Gaussian of `sigma` metres along it, its ends where they were.
-
-    Points a third of a millimetre apart and a tenth aside turn by more than ten degrees from one
-    to the next: where they lie is well known, where they lead to is not, before this.
-    """
-    step = np.linalg.norm(np.diff(line, axis=0), axis=1).mean()
-    if len(line) < 3 or not sigma > 0 or not step > 0:
-        return line
-    width = sigma / step
-    reach = int(np.ceil(3 * width))
-    many = np.pad(line, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
-    return np.asarray(ndimage.gaussian_filter1d(many, width, axis=0)[reach : reach + len(line)])
 
 
 def _partners(points: Array, directions: Array, options: ChainOptions) -> Ints:

@@ -185,3 +185,12 @@ def test_shot_noise_grows_as_the_full_well_says():
     assert counts.mean() == pytest.approx(64 + signal, rel=1e-3)
     variance = signal / 2.48 + (4.0 / 2.48) ** 2 + 1 / 12
     assert counts.var() == pytest.approx(variance, rel=0.02)
+
+
+def test_light_that_is_not_a_number_is_said_where():
+    radiance = np.ones((4, 5, 3))
+    radiance[2, 3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"not a number at \(row, column, channel\) \[2, 3, 1\]"):
+        Sensor().expose(radiance, 0.02, (1,))
+    radiance[2, 3, 1] = np.inf
+    assert Sensor().expose(radiance, 0.02, (1,))[2, 3, 1] == 4095

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from reconstruction.evaluation import compare_strands
-from reconstruction.light_codes.chains import ChainOptions, chains, smoothed
+from reconstruction.light_codes.chains import ChainOptions, chains
 from reconstruction.light_codes.extension import ExtensionOptions, extend, fewest_views
 from reconstruction.light_codes.mean_shift import MeanShiftOptions, mean_shift, thinned_lines
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import count_supports, to_segments
-from reconstruction.strands import Strands
+from reconstruction.strands import Strands, smoothed
 
 
 def arc(count: int, turn: float = 1.5, radius: float = 0.02) -> Any:
