@@ -195,6 +195,30 @@ def test_loose_strands_join_a_rooted_neighbour_and_chains_follow() -> None:
     assert longest == pytest.approx(0.20)
 
 
+def test_a_strand_over_the_scalp_rises_from_under_it_and_runs_as_its_neighbour_does() -> None:
+    """A neighbour says which end is the root's, though the other one lies lower."""
+    rooted = [line((-0.02, 0, 0), (-0.02, 0, 0.02)), line((-0.015, 0, 0.02), (0.02, 0, 0.02))]
+    loose = [line((-5e-3, 1e-3, 0.021), (0.01, 1e-3, 0.018))]
+    result = root_all(rooted, [*loose, loose[0][::-1]], flat_scalp())
+    assert (result.to_scalp, result.joined, result.dropped) == (0, 2, 0)
+    for strand in result.strands[2:]:
+        assert strand[0, 2] == 0
+        np.testing.assert_array_equal(strand[-len(loose[0]) :], loose[0])
+        steps = np.diff(strand, axis=0)
+        steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+        assert steps[0, 2] > 0.9  # out of the skin
+        bend = np.degrees(np.arccos((steps[1:] * steps[:-1]).sum(axis=1).clip(-1, 1)))
+        assert bend.max() < 15
+        assert strand[:, 2].max() < 0.022
+
+
+def test_what_has_no_neighbour_rises_to_its_lower_end_or_is_dropped_out_of_reach() -> None:
+    loose = [line((0, 0, 0.035), (0.01, 0, 0.015)), line((0, 0, 0.05), (0.01, 0, 0.045))]
+    result = root_all([], loose, flat_scalp())
+    assert (result.to_scalp, result.joined, result.dropped) == (1, 0, 1)
+    np.testing.assert_array_equal(result.strands[0][-40:], loose[0][::-1])
+
+
 def test_a_neighbour_across_the_way_is_no_way_to_the_root() -> None:
     rooted = [line((-0.02, 0, 0.05), (0.02, 0, 0.05))]
     loose = [line((0, 0, 0.052), (0, 0, 0.10))]
