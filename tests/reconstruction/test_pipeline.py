@@ -109,16 +109,16 @@ def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera])
 
 
 def runs_down(strands: Strands) -> None:
-    """Asserts that strands follow the meridians."""
+    """Asserts that strands follow the meridians once they have risen from the scalp."""
     assert len(strands) > 300
     distance = np.linalg.norm(strands.roots, axis=1)
     assert np.abs(distance - HEAD).max() < 1e-3
     radius = np.linalg.norm(strands.points, axis=1)
-    outer = (radius > 0.096) & (np.abs(strands.points[:, 2]) < 0.07)
+    outer = (radius > 0.098) & (np.abs(strands.points[:, 2]) < 0.07)
     along = (strands.tangents()[outer] * down(strands.points[outer])).sum(axis=1)
     turned = np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))
-    assert np.median(turned) < 8  # ways from the scalp are among them
-    assert (turned < 20).mean() > 0.85
+    assert np.median(turned) < 7
+    assert (turned < 20).mean() > 0.8
 
 
 def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:
