@@ -1,4 +1,4 @@
-"""Strands that reach the scalp: loose ones join their neighbours on the way to the roots."""
+"""Strands that reach the scalp: loose ones rise from it, or join a neighbour on its way."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def root_all(
         if h.min() > near_scalp:
             waiting.append(path)
         else:
-            strands.append(below.lead(path if h[0] <= h[1] else path[::-1]))
+            strands.append(below.lead_lower(path, h))
     to_scalp = len(strands) - len(rooted)
     joined = 0
     for reach in reaches:
@@ -76,7 +76,7 @@ def root_all(
     height = below.heights(_ends(waiting)) if waiting else np.zeros((0, 2))
     for path, h in zip(waiting, height, strict=True):
         if h.min() <= highest:
-            strands.append(below.lead(path if h[0] <= h[1] else path[::-1]))
+            strands.append(below.lead_lower(path, h))
     led = int((height.min(axis=1) <= highest).sum())
     return Rooted(strands, to_scalp + led, joined, len(waiting) - led)
 
@@ -92,6 +92,10 @@ class _Below:
     def heights(self, points: Array) -> Array:
         """Distance `(...)` of `points (..., 3)` to the scalp, metres."""
         return np.asarray(self._tree.query(points)[0])
+
+    def lead_lower(self, path: Polyline, heights: Array) -> Polyline:
+        """`lead` from the lower end; `heights (2,)` are those of both."""
+        return self.lead(path if heights[0] <= heights[1] else path[::-1])
 
     def lead(self, path: Polyline) -> Polyline:
         """The path with a way from the scalp before it: out along its normal, then into the path.
