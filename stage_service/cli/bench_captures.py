@@ -36,11 +36,9 @@ class SimulatedCapture:
     seed: int = 0
 
     def key(self) -> str:
-        """A folder's name: the same for the same frames."""
-        total = hashlib.sha256(json.dumps([VERSION, asdict(self)], sort_keys=True).encode())
-        for file in (self.subject, self.head):
-            if file is not None and Path(file).is_file():
-                total.update(Path(file).read_bytes())
+        """A folder's name: the same for the same frames, wherever the files of the subject lie."""
+        said = {**asdict(self), "subject": _content(self.subject), "head": _content(self.head)}
+        total = hashlib.sha256(json.dumps([VERSION, said], sort_keys=True).encode())
         return f"{self.name}-{total.hexdigest()[:12]}"
 
     def make(self, cache: Path, progress: Progress = silent) -> tuple[Path, Path]:
@@ -81,3 +79,10 @@ class SimulatedCapture:
         if capture["outcome"] != "completed":
             raise CommandError(f"{self.name}: {capture['outcome']}: {capture['error']}", FAILED)
         return Path(capture["path"]).resolve()
+
+
+def _content(subject: str | None) -> str | None:
+    """The digest of a file, or what is no file as it is."""
+    if subject is None or not Path(subject).is_file():
+        return subject
+    return hashlib.sha256(Path(subject).read_bytes()).hexdigest()

@@ -31,3 +31,13 @@ def test_another_drift_is_another_capture_and_the_same_one_is_found_again() -> N
     assert one.key() == replace(one).key()
     assert one.key() != replace(one, drift_mm=1.0).key()
     assert one.key() != replace(one, rig="other").key()
+
+
+def test_a_subject_is_its_file_wherever_that_lies(tmp_path: Path) -> None:
+    here, there = tmp_path / "a.npz", tmp_path / "b.npz"
+    here.write_bytes(b"strands")
+    there.write_bytes(b"strands")
+    one = SimulatedCapture("a", "text", str(here))
+    assert one.key() == replace(one, subject=str(there)).key()
+    there.write_bytes(b"others")
+    assert one.key() != replace(one, subject=str(there)).key()
