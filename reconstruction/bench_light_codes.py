@@ -26,6 +26,7 @@ from reconstruction.rig import Rig
 from reconstruction.strand_files import read_strands
 from reconstruction.strands import Strands
 from reconstruction.visibility import Visibility
+from reconstruction.visual_hull import VoxelGrid
 
 SUN = {
     "Nam 2019, short hair": (6.56, 20.94, 37.32),
@@ -169,14 +170,20 @@ def run_patch(
         }
         _save(out / "patch.json", results)
     progress("controls", len(runs) / (len(runs) + 1))
-    for name, strands in controls(capture, out / "photometric", options.grid).items():
+    ball = (center, radius + options.grid)
+    for name, strands in controls(capture, out / "photometric", options.grid, ball).items():
         results["rows"][name] = truth.score(strands)
     _save(out / "patch.json", results)
     return results
 
 
-def controls(capture: Capture, model: Path, spacing: float) -> dict[str, Strands]:
-    """The controls that use no method, in the masks that the reconstruction had."""
+def controls(
+    capture: Capture, model: Path, spacing: float, ball: tuple[ArrayLike, float]
+) -> dict[str, Strands]:
+    """The controls that use no method, in the masks that the reconstruction had.
+
+    Only in the `ball`, its centre and radius: cameras that see a patch bound no hull elsewhere.
+    """
     masks: dict[str, NDArray[np.bool_]] = {}
     for camera in capture.rig.cameras:
         file = model / "masks" / f"{camera.name}_hair.png"
@@ -184,11 +191,24 @@ def controls(capture: Capture, model: Path, spacing: float) -> dict[str, Strands
         if image is None:
             raise FileNotFoundError(f"{file}: no mask that the reconstruction had")
         masks[camera.name] = np.asarray(image > 127)
-    hull = control_hull(capture.rig.cameras, masks, capture.head, spacing=spacing)
+    hull = within_ball(
+        control_hull(capture.rig.cameras, masks, capture.head, spacing=spacing), *ball
+    )
     return {
         "hull_vertical": hull_vertical(hull),
         "hull_smooth_field": hull_smooth_field(hull, capture.head),
     }
+
+
+def within_ball(hull: VoxelGrid, center: ArrayLike, radius: float) -> VoxelGrid:
+    """The voxels whose centres lie in a ball, on a grid no larger than it."""
+    c = np.asarray(center, float)
+    low, high = hull.index(np.stack([c - radius, c + radius]))
+    low, high = np.maximum(low, 0), np.minimum(high + 1, hull.inside.shape)
+    part = hull.inside[tuple(slice(a, max(a, b)) for a, b in zip(low, high, strict=True))]
+    out = VoxelGrid(hull.origin + low * hull.spacing, hull.spacing, part.copy())
+    out.inside[out.inside] = np.linalg.norm(out.centers() - c, axis=1) <= radius
+    return out
 
 
 def quick(options: ReconstructOptions) -> ReconstructOptions:

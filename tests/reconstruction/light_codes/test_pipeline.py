@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.bench_light_codes import cut_to_ball, part_of
+from reconstruction.bench_light_codes import cut_to_ball, part_of, within_ball
 from reconstruction.capture import Capture, CaptureError
 from reconstruction.evaluation import compare_strands
 from reconstruction.light_codes.options import LightCodeOptions
@@ -19,6 +19,7 @@ from reconstruction.orientation import LogGaborBank
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.strand_files import read_strands
 from reconstruction.strands import Strands
+from reconstruction.visual_hull import VoxelGrid
 
 QUICK = ReconstructOptions(
     light_codes=LightCodeOptions(
@@ -127,3 +128,14 @@ def test_part_of_a_capture_keeps_what_was_asked(shot: Capture) -> None:
     assert [c.name for c in some.rig.cameras] == ["c0", "c4", "c7"]
     assert len(some.olat_lights()) == 5
     assert len(shot.olat_lights()) == 36
+
+
+def test_a_hull_is_cut_to_a_ball_and_its_grid_with_it() -> None:
+    hull = VoxelGrid(np.array([-0.05, -0.05, -0.05]), 2e-3, np.ones((60, 50, 50), bool))
+    center, radius = np.array([0.0, 0.01, -0.01]), 0.02013  # no centre lies on its surface
+    part = within_ball(hull, center, radius)
+    assert max(part.inside.shape) <= 22
+    distance = np.linalg.norm(part.centers() - center, axis=1)
+    assert distance.max() <= radius
+    assert len(distance) == (np.linalg.norm(hull.centers() - center, axis=1) <= radius).sum()
+    assert not within_ball(hull, (1.0, 0.0, 0.0), 0.02).inside.any()
