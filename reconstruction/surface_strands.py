@@ -45,6 +45,14 @@ class SurfaceOptions:
     shortest: float = 2.4
     smooth: float = 1.0
 
+    def __post_init__(self) -> None:
+        lengths = (self.apart, self.bandwidth, self.step, self.longest, self.spacing)
+        if not all(length > 0 for length in lengths) or not self.neighbours > 0:
+            raise ValueError(
+                "apart, bandwidth, step, longest, spacing and neighbours must be positive, "
+                f"got {lengths} and {self.neighbours}"
+            )
+
 
 class LineCloud:
     """Measured lines that are looked up by place and direction."""
