@@ -50,7 +50,7 @@ def test_noisy_lines_become_strands_that_are_better_than_they() -> None:
     paths = surface_strands(lines)
     distance, angle = errors(paths)
     assert np.median(angle) < 5  # the lines themselves: 12 or so
-    assert np.median(distance) < 1.5e-3
+    assert np.median(distance) < 7e-4  # locks are a millimetre wide either way
     lengths = np.array([len(p) for p in paths]) * SurfaceOptions().step * SurfaceOptions().apart
     assert lengths.max() > 40e-3  # a turn of the helix is 43 mm long
 
