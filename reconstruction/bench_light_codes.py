@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,9 +20,15 @@ from reconstruction.capture import Capture
 from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
 from reconstruction.envelope import mesh_depth
 from reconstruction.evaluation import compare_strands
+from reconstruction.import_folder import import_folder
+from reconstruction.light_codes.pipeline import look_at_hair
+from reconstruction.light_codes.study import compare_filters, study_depths
+from reconstruction.masks import hair_masks
 from reconstruction.methods import Method
+from reconstruction.orientation import texture
 from reconstruction.pipeline import ReconstructOptions, reconstruct
-from reconstruction.report import Progress, Report, silent
+from reconstruction.report import Progress, Report, Series, silent
+from reconstruction.report_plots import plot_geometry, plot_report
 from reconstruction.rig import Rig
 from reconstruction.strand_files import read_strands
 from reconstruction.strands import Strands
@@ -135,8 +142,8 @@ def run_patch(
 ) -> dict[str, Any]:
     """All methods and both controls in a ball about `center (3,)` of `radius` metres.
 
-    `thinner` also runs `photometric` with fewer cameras and with fewer lights. Models are left in
-    `OUT/<method>`, figures in `OUT/patch.json` as they come.
+    `thinner` also runs `photometric` with fewer cameras and with fewer lights, and `study`. Models
+    are left in `OUT/<method>`, figures in `OUT/patch.json` as they come.
     """
     options = options or ReconstructOptions()
     capture = Capture(capture_folder)
@@ -169,11 +176,66 @@ def run_patch(
             "stages": _stages(report),
         }
         _save(out / "patch.json", results)
+    if thinner:
+        progress("error against run time", len(runs) / (len(runs) + 1))
+        results["study"], results["filters"] = study(capture, truth.strands, options, out)
+        _save(out / "patch.json", results)
     progress("controls", len(runs) / (len(runs) + 1))
     ball = (center, radius + options.grid)
     for name, strands in controls(capture, out / "photometric", options.grid, ball).items():
         results["rows"][name] = truth.score(strands)
     _save(out / "patch.json", results)
+    plot_geometry(results["rows"], out / "patch.png")
+    return results
+
+
+def study(
+    capture: Capture, truth: Strands, options: ReconstructOptions, out: Path
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """What the depth search finds against what it costs, and the filter bank beside OpenCV's loop.
+
+    On every eighth view. Also drawn, as `OUT/study/error_*.png`.
+    """
+    codes = options.light_codes
+    masks = hair_masks(capture, None, capture.head)
+    views, volume = look_at_hair(capture, masks, capture.head, Report(), options=codes)
+    found = study_depths(views, volume, truth, codes, range(1, len(views), 8))
+    report = Report()
+    for name, variants in found.items():
+        with report.stage(name) as stage:
+            points = [(v["seconds"], 1 - v["right"]) for v in variants.values()]
+            stage.series.append(Series(name, "share of pixels that are wrong", points))
+    plot_report(report, out / "study")
+    camera = capture.rig.cameras[0]
+    image, _ = capture.light(capture.olat_lights()[0], camera.name)
+    pixels = texture(image.mean(axis=-1), masks[camera.name].hair)
+    return found, compare_filters(codes.bank, pixels)
+
+
+def run_imported(
+    out: Path,
+    folder: Path,
+    *,
+    options: ReconstructOptions | None = None,
+    samples: int = 10_000,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """All methods on a folder that `import_folder` reads, with true strands `strands_gt.npz`."""
+    options = options or ReconstructOptions()
+    shutil.rmtree(out / "capture", ignore_errors=True)
+    capture = import_folder(folder, out / "capture")
+    truth = read_strands(folder / "strands_gt.npz")
+    results: dict[str, Any] = {"rows": {}}
+    for method in METHODS:
+        reconstruct(capture, out / method, method=method, options=options, progress=progress)
+        results["rows"][method] = compare_strands(
+            read_strands(out / method / "strands.npz"),
+            truth,
+            cameras=capture.rig.cameras,
+            head=capture.head,
+            samples=samples,
+        )
+        _save(out / "imported.json", results)
     return results
 
 

@@ -21,10 +21,12 @@ class CodeMap:
     `words (H, W, ceil(L / 32)) uint32` hold light `i` in bit `i % 32` of word `i // 32`, 0 outside
     the mask. `varying (words,)` marks the lights whose bit is not the same all over the hair: the
     others say nothing within this view. `threshold` is the response at which a pixel counts as
-    lit, `noise` the part of it that the sensor's noise asked for.
+    lit, `noise` the part of it that the sensor's noise asked for. `reached`, packed alike, marks
+    the lights of which anything arrives: by reciprocity, what stands beside them sees the pixel.
     """
 
     words: Words
+    reached: Words
     varying: Words
     threshold: float
     noise: float
@@ -62,6 +64,13 @@ def asked_bits(a: CodeMap, b: CodeMap) -> Words:
 LEAST_LIT = 0.1
 """Of the median pixel's brightest light: what a shadow lets through is below."""
 
+LEAST_REACHED = 0.02
+"""Of what a light brings to the brightest twentieth of the hair.
+
+One threshold for all lights tells shading from shading: hair that scatters a light away from the
+camera counted as hidden from it, three in four of the pixels that a camera beside it does see.
+"""
+
 
 def along_lines(
     images: NDArray[np.float32], angle: NDArray[np.floating], half: int = 4
@@ -91,8 +100,9 @@ def code_map(
     A pixel is lit where it exceeds the median over the mask `(H, W)` under light `furthest`, the
     one furthest from the camera, which shows what a shadow looks like; and three times `noise`,
     the responses' standard deviation; and `LEAST_LIT`, where the head itself stands before that
-    light and its median is next to nothing. `saturated (L, H, W)` pixels are lit whatever their
-    value. Raises `ValueError` where shapes disagree.
+    light and its median is next to nothing. It is reached by a light that brings it `LEAST_REACHED`
+    and more than the noise. `saturated (L, H, W)` pixels are both whatever their value. Raises
+    `ValueError` where shapes disagree.
     """
     if responses.ndim != 3 or responses.shape[1:] != mask.shape:
         raise ValueError(f"expected responses (L, {mask.shape}), got {responses.shape}")
@@ -101,9 +111,13 @@ def code_map(
     faint = LEAST_LIT * float(np.median(brightest)) if len(brightest) else 0.0
     threshold = max(shadow, 3 * noise, faint, 0.0)
     lit = (responses > threshold) & mask
+    full = np.array([np.percentile(r[mask], 95) if mask.any() else 0.0 for r in responses])
+    least = np.maximum(LEAST_REACHED * full, 3 * noise)
+    reached = (responses > least[:, None, None]) & mask
     if saturated is not None:
         lit |= saturated & mask
+        reached |= saturated & mask
     bits = np.moveaxis(lit, 0, -1)
     inside = bits[mask]
     varying = np.asarray(inside.any(axis=0) & ~inside.all(axis=0))
-    return CodeMap(pack(bits), pack(varying), threshold, noise)
+    return CodeMap(pack(bits), pack(np.moveaxis(reached, 0, -1)), pack(varying), threshold, noise)

@@ -7,8 +7,6 @@ multi-view stereo without visibility, the better half of the cameras counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -17,8 +15,7 @@ from numpy.typing import NDArray
 
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import Pixels, line_through
-from reconstruction.light_codes.search import DEFAULTS, DepthSearch, Floats, SearchOptions
-from reconstruction.light_codes.views import View
+from reconstruction.light_codes.search import DepthSearch, Floats
 
 FAN = np.radians(np.linspace(-50, 50, 5))
 """Inclinations towards the camera at which a line is tried at every depth."""
@@ -28,15 +25,7 @@ ROUNDS = 3
 
 
 class LmvsSearch(DepthSearch):
-    """Searches depth and inclination; same inputs and outputs as `DepthSearch`.
-
-    Segments are not judged by the `misfit` of Eq. 4, which is not this method's.
-    """
-
-    def __init__(
-        self, views: Sequence[View], subject: Any, options: SearchOptions = DEFAULTS
-    ) -> None:
-        super().__init__(views, subject, replace(options, most_misfit=1.0))
+    """Searches depth and inclination; same inputs and outputs as `DepthSearch`."""
 
     def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
         """All neighbours `(P, N)`: nothing says which of them see a pixel."""
@@ -47,6 +36,7 @@ class LmvsSearch(DepthSearch):
     ) -> tuple[Any, ...]:
         """See `DepthSearch.search`; the agreement is 1 less the cost over a right angle."""
         t, options = self.types, self.options
+        pixels.code = []
         along = self._in_plane(view, x, y)
         near, number = t.Float(start), t.UInt32(counts)
         step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, options.samples)

@@ -12,12 +12,16 @@ import drjit as dr
 
 from reconstruction.light_codes.device_views import DeviceViews
 
-MATCH_POWER, ANGLE_POWER = 1, 32
+MATCH_POWER, ANGLE_POWER = 1, 64
 """Powers of the share of equal bits and of the cosine in the objective.
 
-Sun's Eq. 5 has the cosine itself, which two lines drawn at random have 0.64 of: at 32, lines 12
-degrees apart count half, and a fifth more pixels get their true depth.
+Sun's Eq. 5 has the cosine itself, which two lines drawn at random have 0.64 of: at 64, lines 8
+degrees apart count half. Its confidence W is left out: with it, pixels between bright strands are
+drawn to these, and fewer of the strands behind are found.
 """
+
+LINE_MATCH_POWER = 16
+"""Of the share of equal bits, in a view's weight for the direction: other codes, other strands."""
 
 
 def power(x: Any, n: int) -> Any:
@@ -26,7 +30,7 @@ def power(x: Any, n: int) -> Any:
     return half * x if n % 2 else half
 
 
-OUTLIER_POWER = 16
+OUTLIER_POWER = 128
 """Of the cosine between a view's line and the first direction, in the weights of the second."""
 
 
@@ -74,8 +78,8 @@ class Line:
 def line_through(views: DeviceViews, pixels: Pixels, point: Any, active: Any) -> Line:
     """The direction that lies in the planes of the visible views' lines (Sun Eq. 4).
 
-    The singular vector of the smallest singular value of the planes' normals, weighted by the
-    lines' confidence and by how well the lightcodes match: an eigenvector of a 3x3 matrix. Then
+    The singular vector of the smallest singular value of the planes' normals, weighted by how well
+    the lightcodes match, as an eigenvector of a 3x3 matrix. Then
     once more, weighted by how well each line agrees with that direction too: least squares alone
     follow the views that see something else there.
     """
@@ -104,7 +108,9 @@ def _weighed_line(
         square = dr.squared_norm(normal)
         own = seen.lx * seen.lx + seen.ly * seen.ly
         weight = dr.select(
-            seen.there & (square > 0), own * seen.equal / dr.maximum(square, 1e-30), 0
+            seen.there & (square > 0),
+            power(seen.equal, LINE_MATCH_POWER) / dr.maximum(square, 1e-30),
+            0,
         )
         if trust > 0:
             step = views.projection(view, along, 0)
@@ -161,8 +167,7 @@ def agreement(
     """Sun's Eq. 6 over the number of its terms: 0 to 1.
 
     `samples` points stand `along` apart about `point`; each term is the share of equal bits times
-    the cosine between the projected line and the view's own, to their powers, times the confidence
-    there.
+    the cosine between the projected line and the view's own, to their powers, and 0 off the hair.
     """
     t = views.types
     total, terms = t.Float(0), t.Float(0)
@@ -182,7 +187,7 @@ def agreement(
             own = seen.lx * seen.lx + seen.ly * seen.ly
             same = ux * seen.lx + uy * seen.ly
             square = same * same / dr.maximum((ux * ux + uy * uy) * own, 1e-20)
-            share = power(square, ANGLE_POWER // 2) * power(seen.equal, MATCH_POWER) * dr.sqrt(own)
+            share = power(square, ANGLE_POWER // 2) * power(seen.equal, MATCH_POWER)
             total += dr.select(seen.there, share, 0)
             h += step
             s += 1

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from reconstruction.light_codes.chains import ChainOptions
 from reconstruction.light_codes.extension import ExtensionOptions
-from reconstruction.light_codes.mean_shift import MeanShiftOptions
 from reconstruction.light_codes.search import SearchOptions
 from reconstruction.orientation import LogGaborBank
+from reconstruction.surface_strands import SurfaceOptions
 
 
 @dataclass(frozen=True)
@@ -18,22 +17,20 @@ class LightCodeOptions:
     `volume_grid` metres are the voxels in which depths are bounded, at most `deepest` metres behind
     where a ray enters the hair's volume. Segments count that at least `least_views` views found
     alike, their own and three neighbours, within `support_distance` metres and `support_angle_deg`.
-    Lines are averaged in cells of `crowd` metres before mean shift and of `thin` metres after it.
+    Lines are averaged in cells of `crowd` metres before `strands` are traced through them.
     Segments count `field_weight` times their confidence in an orientation field that both feed.
     """
 
     bank: LogGaborBank = LogGaborBank(count=48, spread=1.0, wavelength=5.0)  # noqa: RUF009  frozen
     volume_grid: float = 4e-3
     deepest: float = 0.06
-    least_views: int = 4
+    least_views: int = 3
     support_distance: float = 1e-3
     support_angle_deg: float = 10.0
-    crowd: float = 2e-4
-    thin: float = 3e-4
+    crowd: float = 3e-4
     field_weight: float = 4.0
     search: SearchOptions = SearchOptions()  # noqa: RUF009
-    mean_shift: MeanShiftOptions = MeanShiftOptions()  # noqa: RUF009
-    chains: ChainOptions = ChainOptions()  # noqa: RUF009
+    strands: SurfaceOptions = SurfaceOptions(apart=6e-4, step=0.7, shortest=5.0, smooth=2.0)  # noqa: RUF009
     extension: ExtensionOptions = ExtensionOptions()  # noqa: RUF009
 
 

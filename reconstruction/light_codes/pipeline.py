@@ -9,21 +9,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.capture import Capture, CaptureError
-from reconstruction.light_codes.chains import chains
 from reconstruction.light_codes.depth_range import depth_range, hair_volume
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.from_capture import views_of
 from reconstruction.light_codes.lmvs import LmvsSearch
-from reconstruction.light_codes.mean_shift import mean_shift, thinned_lines
 from reconstruction.light_codes.options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.search import DepthSearch
-from reconstruction.light_codes.segments import Segments, count_supports, to_segments
+from reconstruction.light_codes.segments import (
+    Segments,
+    count_supports,
+    thinned_lines,
+    to_segments,
+)
 from reconstruction.light_codes.views import View
 from reconstruction.masks import HairMask
+from reconstruction.measure import Measured
 from reconstruction.mesh import Mesh
 from reconstruction.report import Progress, Report, silent
+from reconstruction.surface_strands import surface_strands
+from reconstruction.visual_hull import VoxelGrid
 
 Array = NDArray[np.float64]
+
+
+def look_at_hair(
+    capture: Capture,
+    masks: Mapping[str, HairMask],
+    head: Mesh | None,
+    report: Report,
+    *,
+    options: LightCodeOptions = DEFAULTS,
+    bounds: Array | None = None,
+    progress: Progress = silent,
+) -> tuple[list[View], VoxelGrid]:
+    """The views, and the volume that holds the hair; adds the stage `lightcodes` to the report."""
+    cameras = [c for c in capture.rig.cameras if c.name in masks]
+    hair = {c.name: masks[c.name].hair for c in cameras}
+    subject = {c.name: masks[c.name].subject for c in cameras}
+    if not any(m.any() for m in hair.values()):
+        raise CaptureError(f"{capture.path}: no camera's mask holds hair: check the masks")
+    with report.stage("lightcodes") as stage:
+        try:
+            volume = hair_volume(cameras, subject, head, options.volume_grid, bounds)
+        except ValueError as error:
+            raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
+        if not volume.inside.any():
+            raise CaptureError(
+                f"{capture.path}: no volume is seen by enough cameras: check masks, head.obj and "
+                "poses"
+            )
+        center = volume.centers().mean(axis=0)
+        views = views_of(capture, hair, center, options.bank, stage, progress)
+    return views, volume
 
 
 def measure_segments(
@@ -42,23 +79,10 @@ def measure_segments(
     Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
     there are no two views of hair, or no segment is left.
     """
-    cameras = [c for c in capture.rig.cameras if c.name in masks]
-    hair = {c.name: masks[c.name].hair for c in cameras}
-    subject = {c.name: masks[c.name].subject for c in cameras}
-    if not any(m.any() for m in hair.values()):
-        raise CaptureError(f"{capture.path}: no camera's mask holds hair: check the masks")
-    with report.stage("lightcodes") as stage:
-        try:
-            volume = hair_volume(cameras, subject, head, options.volume_grid, bounds)
-        except ValueError as error:
-            raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
-        if not volume.inside.any():
-            raise CaptureError(
-                f"{capture.path}: no volume is seen by enough cameras: check masks, head.obj and "
-                "poses"
-            )
-        center = volume.centers().mean(axis=0)
-        views = views_of(capture, hair, center, options.bank, stage, progress)
+    views, volume = look_at_hair(
+        capture, masks, head, report, options=options, bounds=bounds, progress=progress
+    )
+    center = volume.centers().mean(axis=0)
     with report.stage("depth") as stage:
         search = (
             DepthSearch(views, center, options.search)
@@ -122,9 +146,9 @@ def string_together(
         points, directions, weights = thinned_lines(
             segments.points, segments.directions, weights, options.crowd
         )
-        points, directions = mean_shift(points, directions, weights, options.mean_shift)
-        points, directions, _ = thinned_lines(points, directions, weights, options.thin)
-        found = chains(points, directions, options.chains)
+        trust = np.minimum(weights / np.median(weights), 1.0)
+        lines = Measured(points, directions, trust)
+        found = [p.astype(float) for p in surface_strands(lines, options.strands)]
         grown = extend(views, found, options.extension)
         stage.figures.update(
             lines=len(points),

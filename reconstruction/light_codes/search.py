@@ -36,11 +36,10 @@ class SearchOptions:
 
     `step` metres between depths. `samples` points of a segment, `length` metres end to end, are
     compared in up to `neighbours` nearest visible views. The `candidates` best depths of each pixel
-    by `FEW_SAMPLES` points go on to all of them; 0 gives them all depths (brute force).
+    by `FEW_SAMPLES` points go on to all of them; 0 gives them all depths (brute force). The first
+    stage takes every `coarse`th depth; the second also those between a candidate and the next.
     `least_confidence` of a pixel's line for it to be a reference. Segments whose planes' `spread`
-    is lower are dropped as nearly parallel, and those with a `misfit` above: of the segments
-    that four views agree on, half are right to a millimetre below 0.15, one in twelve above 0.3.
-    `variant` as in `array_backend.chosen_variant`.
+    is lower are dropped as nearly parallel. `variant` as in `array_backend.chosen_variant`.
     """
 
     step: float = 2.5e-4
@@ -48,18 +47,20 @@ class SearchOptions:
     length: float = 5e-3
     neighbours: int = 16
     candidates: int = 8
+    coarse: int = 1
     least_confidence: float = 0.1
     least_spread: float = 0.05
-    most_misfit: float = 0.2
     variant: str | None = None
 
     def __post_init__(self) -> None:
         if not self.step > 0 or not self.length > 0:
             raise ValueError(f"step and length must be positive, got {self.step}, {self.length}")
-        if self.samples < 1 or not 1 <= self.neighbours <= MOST_NEIGHBOURS or self.candidates < 0:
+        few = self.samples < 1 or self.candidates < 0 or self.coarse < 1
+        if few or not 1 <= self.neighbours <= MOST_NEIGHBOURS:
             raise ValueError(
-                f"need samples >= 1, 1 <= neighbours <= {MOST_NEIGHBOURS}, candidates >= 0, got "
-                f"{self.samples}, {self.neighbours}, {self.candidates}"
+                f"need samples >= 1, 1 <= neighbours <= {MOST_NEIGHBOURS}, candidates >= 0, "
+                f"coarse >= 1, got {self.samples}, {self.neighbours}, {self.candidates}, "
+                f"{self.coarse}"
             )
 
 
@@ -101,12 +102,12 @@ class DepthSearch:
         self.neighbours = nearest_views(views, subject, options.neighbours)
 
     def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which neighbours see the pixels `(P, N)`: a light beside them lights the pixel.
+        """Which neighbours see the pixels `(P, N)`: a light beside them reaches the pixel.
 
         A neighbour without a light beside it is taken to see what it stands near to.
         """
         own = self.views[view]
-        words = own.codes.words[y, x]
+        words = own.codes.reached[y, x]
         bits = unpack(words, 32 * words.shape[1])
         sees = [
             bits[:, b] if (b := self.views[k].beside) >= 0 else np.ones(len(x), bool)
@@ -153,8 +154,7 @@ class DepthSearch:
         counts = np.ceil((far[y, x] - start) / options.step).astype(np.uint32) + 1
         found = self.search(pixels, x, y, start, counts, view)
         depth, direction, agree, spread, misfit = found
-        keep = (seen_by > 0) & (spread >= options.least_spread) & (misfit <= options.most_misfit)
-        keep &= agree > 0
+        keep = (seen_by > 0) & (spread >= options.least_spread) & (agree > 0)
         return DepthMap(
             *(a[keep] for a in (x, y, depth, direction, agree, spread, misfit, seen_by))
         )
@@ -189,7 +189,12 @@ def _search(
     if options.candidates:
         few = dr.opaque(t.UInt32, FEW_SAMPLES)
         wide = dr.opaque(t.Float, options.length / FEW_SAMPLES)
-        steps = best_coarse(device, pixels, near, step, number, few, wide, options.candidates)
+        every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
+        steps = best_coarse(
+            device, pixels, near, every * step, coarse, few, wide, options.candidates
+        )
+        between = range(1 - every, every)
+        steps = [t.UInt32(dr.maximum(t.Int32(k * every) + j, 0)) for k in steps for j in between]
         score, best = best_of(device, pixels, near, step, steps, samples, apart)
     else:
         score, best = best_of_all(device, pixels, near, step, number, samples, apart)

@@ -110,6 +110,32 @@ def count_supports(
     )
 
 
+def thinned_lines(
+    points: Array, directions: Array, weights: Array, spacing: float
+) -> tuple[Array, Array, Array]:
+    """One line for each cell of `spacing` metres and each of its main directions.
+
+    Lines of a cell are averaged with those whose largest component is the same: points `(M, 3)`,
+    directions `(M, 3)` and summed weights `(M,)`.
+    """
+    if not len(points):
+        return points, directions, weights
+    axis = np.abs(directions).argmax(axis=1)
+    cell = np.floor(points / spacing).astype(np.int64)
+    sign = np.sign(directions[np.arange(len(axis)), axis])
+    _, member = np.unique(np.column_stack([cell, axis]), axis=0, return_inverse=True)
+    member = member.ravel()
+    count = int(member.max()) + 1
+    total: Array = np.bincount(member, weights, count).astype(float)
+
+    def mean(values: Array) -> Array:
+        sums = [np.bincount(member, weights * v, count) for v in values.T]
+        return np.stack(sums, axis=1) / np.maximum(total, 1e-300)[:, None]
+
+    d = mean(directions * sign[:, None])
+    return mean(points), d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12), total
+
+
 def _lift(view: View, found: DepthMap) -> Array:
     rays = view.camera.rays(np.stack([found.x, found.y], axis=1))
     rays /= (rays @ view.camera.R[2])[:, None]

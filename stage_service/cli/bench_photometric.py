@@ -1,11 +1,11 @@
-"""`bench photometric`: line stereo on patches of two heads, beside the controls and the paper."""
+"""`bench photometric`: line stereo on patches of two heads, and on pictures that are not ours."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from reconstruction.bench_light_codes import quick, run_patch
+from reconstruction.bench_light_codes import quick, run_imported, run_patch
 from reconstruction.pipeline import ReconstructOptions
 from reconstruction.report import Progress, silent
 from stage_service.cli.bench_photometric_rig import TARGETS, patch
@@ -21,8 +21,9 @@ def run(
 ) -> dict[str, Any]:
     """Every patch of `TARGETS`, or `only` one; Sintel's needs `data`, which has her strands.
 
-    Captures are simulated through the wires once and kept in `cache`. Leaves
-    `OUT/<subject>/patch.json` and the models beside it.
+    Captures are simulated through the wires once and kept in `cache`. Fewer cameras and lights and
+    error against run time are Sintel's alone. Leaves `OUT/<subject>/patch.json` and the models
+    beside it. Without `only`, also the capture that Cycles rendered, through `import`.
     """
     from rich.console import Console
 
@@ -40,7 +41,16 @@ def run(
             here.center,
             here.radius,
             options=quick(ReconstructOptions()),
+            thinner=name == "sintel",
             progress=progress,
         )
         Console(stderr=True).print(geometry_table(results[name]["rows"]))
+    if only is None and data is not None:
+        results["imported"] = run_imported(
+            out / "imported",
+            data / "captures" / "cycles_wavy",
+            options=quick(ReconstructOptions()),
+            progress=progress,
+        )
+        Console(stderr=True).print(geometry_table(results["imported"]["rows"]))
     return results

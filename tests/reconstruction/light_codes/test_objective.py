@@ -13,6 +13,7 @@ from reconstruction.array_backend import array_types
 from reconstruction.light_codes.codes import asked_bits, match
 from reconstruction.light_codes.objective import (
     ANGLE_POWER,
+    LINE_MATCH_POWER,
     MATCH_POWER,
     OUTLIER_POWER,
     agreement,
@@ -109,7 +110,7 @@ def test_direction_and_agreement_are_those_of_the_formulas(
             normal = flat @ M
             norm = np.linalg.norm(normal, axis=1, keepdims=True)
             normal = np.divide(normal, norm, out=np.zeros_like(normal), where=norm > 0)
-            weight = sees[:, n] * equal * (own_line**2).sum(axis=1)
+            weight = sees[:, n] * equal**LINE_MATCH_POWER
             if trust:
                 ahead = search.views[k].camera.project(points + 1e-6 * direction)[0] - xy
                 ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -127,7 +128,7 @@ def test_direction_and_agreement_are_those_of_the_formulas(
             xy, own_line, equal = looked_up(search, view, k, code, at)
             ahead = search.views[k].camera.project(at + 1e-6 * direction)[0] - xy
             ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-            cosine = np.abs((ahead * own_line).sum(axis=1))  # the lines' confidence is 1
+            cosine = np.abs((ahead * own_line).sum(axis=1))
             total += sees[:, n] * equal**MATCH_POWER * cosine**ANGLE_POWER
     # pixels on the border of two fibres round to either one in single precision
     difference = np.abs(found - total / (samples * sees.sum(axis=1)))

@@ -21,7 +21,7 @@ def error(stage: Any, view: int, found: DepthMap) -> Any:
 @pytest.mark.parametrize("method", [DepthSearch, LmvsSearch])
 def test_depths_are_true_below_a_pixel(fibres: Any, method: type[DepthSearch]) -> None:
     found = method(fibres.views, (0, 0, 0)).run(1, *fibres.range(1))
-    assert len(found.x) > 0.7 * fibres.views[1].mask.sum()
+    assert len(found.x) > 0.85 * fibres.views[1].mask.sum()
     pixel = 1e3 * fibres.depth(1).max() / fibres.cameras[1].K[0, 0]
     assert np.median(error(fibres, 1, found)) < pixel
     seen = fibres.drawn[1]
@@ -41,7 +41,7 @@ def test_two_stages_find_what_brute_force_finds(fibres: Any) -> None:
     for depths, found in zip(maps, (brute, quick), strict=True):
         depths[found.y, found.x] = found.depth
     same = np.abs(maps[0] - maps[1]) < 1.25e-4
-    assert same.sum() > 0.95 * max(len(brute.x), len(quick.x))
+    assert same.sum() > 0.98 * max(len(brute.x), len(quick.x))
 
 
 def test_lights_beside_cameras_tell_who_sees_a_pixel(fibres: Any) -> None:
