@@ -25,8 +25,8 @@ class LightCodeOptions:
     volume_grid: float = 4e-3
     deepest: float = 0.06
     least_views: int = 3
-    support_distance: float = 1e-3
-    support_angle_deg: float = 10.0
+    support_distance: float = 1.5e-3
+    support_angle_deg: float = 15.0
     crowd: float = 3e-4
     field_weight: float = 4.0
     search: SearchOptions = SearchOptions()  # noqa: RUF009
