@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 
@@ -67,3 +68,44 @@ def test_a_killed_service_leaves_no_lamp_lit_and_every_finished_frame(stage):
     known = stage.get(f"/captures/{capture['id']}")
     assert (known["state"], known["outcome"]) == ("done", "interrupted")
     assert known["frames_written"] == len(frames)
+
+
+def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
+    stage.simulate()
+    stage.serve()
+    worker = stage.work()
+    made = stage.capture({**stage.subject(), "pipeline": stage.pipeline()})
+    model = Path(stage.get(f"/jobs/{made['job']}")["model"]).name
+    stage.until(lambda: stage.get(f"/jobs/{made['job']}")["state"] == "done", 200)
+    effort = {"pixels": 60, "spp": 4, "gradient_spp": 2, "max_depth": 4}
+    fit = {"row": "spatial", "shape": [2, 2, 2], "steps": 200, "check_every": 5, "halvings": 99}
+    asked = {
+        "capture": made["id"],
+        "model": model,
+        "pipeline": {
+            "name": "appearance",
+            "options": {
+                "fit": {"iterations": 2},
+                "stage1": {"first_steps": 5, "judged_spp": 4, "fit": fit | {"effort": effort}},
+            },
+        },
+    }
+    path = f"/jobs/{stage.post('/jobs', asked)['id']}"
+
+    def step() -> int:
+        """The step of the fit that the job tells, with its current error; 0 before the volume's."""
+        progress = stage.get(path)["progress"] or {"what": "", "step_share": 0.0}
+        told = re.match(r"step (\d+): error \d", progress["what"])
+        return int(told[1]) if told and progress["step_share"] > 0.3 else 0
+
+    reached = stage.until(lambda: (n := step()) >= 20 and n, 200)
+    worker.kill()
+    worker.wait()
+    stage.work()
+    stage.until(lambda: step() == 0, 100)  # until then, what the killed worker had told
+    assert stage.until(step, 100) >= reached
+    stage.until(lambda: stage.get(path)["state"] == "done", 300)
+    job = stage.get(path)
+    assert (job["outcome"], job["error"]) == ("succeeded", None)
+    found = {a["path"] for a in stage.get(f"{path}/artifacts")}
+    assert {"hair_maps.npz", "lamps.json", "report.json"} <= found
