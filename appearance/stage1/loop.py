@@ -38,6 +38,8 @@ PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation
 _LATEST = 0.04
 """Least weight of the latest step in the running mean, in which the steps' noise averages out; the
 mean is over about the latest quarter of the steps before that (Shamir & Zhang 2013)."""
+_SLOWED = 0.8
+"""Share of the pace that the later half of the steps gives up, for what noise moves in the end."""
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared prior deviation, beside the image loss."""
 
@@ -245,7 +247,8 @@ class _Fit:
             for name, value in slope.gradient.items():
                 total[name] = total.get(name, 0.0) + value
         self._pull_to_priors(state.raw, total)
-        state.descent.step(state.raw, total, state.convergence.pace)
+        late = max(0.0, 2 * state.step / options.steps - 1)
+        state.descent.step(state.raw, total, state.convergence.pace * (1 - _SLOWED * late))
         state.step += 1
         share = max(_LATEST, 4 / (state.step - state.level_began + 3))
         for name, value in state.raw.items():

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import correlate1d
 
 Array = NDArray[np.float64]
 FLOOR = 0.03
@@ -26,11 +26,13 @@ LEAST_ERROR = 0.02
 
 
 def level(captured: Array) -> Array:
-    """Local mean of captured values `(L, P, 3)`, pixels in image order: what weights are made of.
+    """Mean of each captured pixel's neighbours in image order `(L, P, 3)`, to make weights of.
 
-    Made of the pixel itself, a weight would be largest where noise made it dark.
+    Of the two on either side, without the pixel itself: a weight would be largest where noise made
+    it dark, and a fit darker than the truth the better one.
     """
-    return np.asarray(uniform_filter1d(np.maximum(captured, 0), 5, axis=1, mode="nearest"))
+    values = np.maximum(captured, 0)
+    return np.asarray(correlate1d(values, [0.25, 0.25, 0, 0.25, 0.25], axis=1, mode="mirror"))
 
 
 def weights(level: Array) -> Array:

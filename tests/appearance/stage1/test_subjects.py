@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from appearance.bench_appearance import GROUPS, Table, markdown
+from appearance.ablation_table import GROUPS, Table
+from appearance.bench_appearance import markdown, recovery
 from appearance.hair_appearance import HairAppearance
 from appearance.hair_maps import scalp_coordinates
 from appearance.stage1.loop import Stage1Options
@@ -37,15 +38,25 @@ def test_dyed_hair_is_lighter_at_the_tips_and_has_wisps_of_other_hues():
         subject("d", None, None, HAIR, SKIN)
 
 
-def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(small):
+QUICK = Stage1Options(
+    steps=2,
+    check_every=2,
+    shape=(2, 2, 2),
+    effort=Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4),
+)
+
+
+@pytest.fixture(scope="module")
+def captured(small):
     rig = Rig(size=14, cameras=3, lights=6, spp=64, max_depth=4)
-    captured = subject("a", small.tuft(150), None, HAIR, SKIN, rig)
+    return subject("a", small.tuft(150), None, HAIR, SKIN, rig)
+
+
+def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
     assert captured.held_views == (0, 1)
     assert captured.train_lights == (0, 2, 4)
     assert len(captured.training()) == 1
-    effort = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4)
-    options = Stage1Options(steps=2, check_every=2, shape=(2, 2, 2), effort=effort)
-    rows = Table(captured, options).run(("original",))
+    rows = Table(captured, QUICK).run(("original",))
     assert list(rows) == [
         "mean colour",
         "three nearest",
@@ -56,3 +67,14 @@ def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(small):
     clean = {k: v[GROUPS[1]]["psnr_clean"] for k, v in rows.items()}
     assert clean["truth, fresh numbers"] > max(clean["mean colour"], clean["three nearest"])
     assert "| HairInverse |" in markdown({"subjects": {"a": rows}})
+
+
+def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
+    found = recovery(captured, QUICK)
+    assert [list(rows) for rows in found.values()] == 3 * [["HairInverse", "spatial", "lights"]]
+    *_, off = found.values()
+    assert 0 < off["spatial"]["lamps_off"] < 0.1
+    assert 0 < off["lights"]["lamps_off"] < 0.1
+    text = markdown({"subjects": {}, "recovery": found})
+    assert text.count("dB") == 9
+    assert text.count("lamps") == 5

@@ -57,6 +57,16 @@ def test_the_threshold_is_the_median_under_the_furthest_light_or_three_sigma() -
     assert code_map(responses, mask, 1, noise=0.15).threshold == pytest.approx(0.45)
 
 
+def test_what_a_light_brings_little_of_is_reached_though_it_counts_as_shadow() -> None:
+    mask = np.ones((1, 40), bool)
+    bright, dim = np.ones((1, 40)), np.full((1, 40), 0.02)
+    dim[0, :2] = 1e-4  # behind something
+    found = code_map(np.stack([bright, dim]), mask, 0)
+    assert not unpack(found.words, 2)[..., 1].any()
+    np.testing.assert_array_equal(unpack(found.reached, 2)[0, :, 1], [False] * 2 + [True] * 38)
+    assert not unpack(code_map(np.stack([bright, dim]), mask, 0, 0.01).reached, 2)[..., 1].any()
+
+
 def test_saturated_pixels_are_lit_and_dark_views_have_no_bits() -> None:
     mask = np.ones((1, 2), bool)
     clipped = np.zeros((1, 1, 2), bool)
