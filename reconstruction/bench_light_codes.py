@@ -25,6 +25,7 @@ from reconstruction.light_codes.pipeline import look_at_hair
 from reconstruction.light_codes.study import compare_filters, study_depths
 from reconstruction.masks import hair_masks
 from reconstruction.methods import Method
+from reconstruction.model_pictures import picture_strands
 from reconstruction.orientation import texture
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report import Progress, Report, Series, silent
@@ -186,6 +187,13 @@ def run_patch(
         results["rows"][name] = truth.score(strands)
     _save(out / "patch.json", results)
     plot_geometry(results["rows"], out / "patch.png")
+    found: dict[str, Strands] = {m: read_strands(out / m / "strands.npz") for m in METHODS}
+    everything: dict[str, Strands] = {"true": truth.strands, **found}
+    picture_strands(
+        out / "strands.png",
+        capture.rig.cameras[0],
+        {k: cut_to_ball(s, center, radius) for k, s in everything.items()},
+    )
     return results
 
 

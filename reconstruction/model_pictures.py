@@ -54,6 +54,28 @@ def picture_model(
     figure.savefig(path, dpi=90)
 
 
+def picture_strands(path: Path, camera: Camera, sets: Mapping[str, Strands]) -> None:
+    """Strands as the camera sees them, nearest first, side by side as a PNG at `path`.
+
+    The nearest point of each pixel has a colour by its tangent in the camera's frame: |x|, |y|, |z|
+    are red, green and blue. The head is not drawn: what lies behind is seen through gaps.
+    """
+    figure = Figure(figsize=(3.6 * len(sets), 3.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (title, strands) in zip(figure.subplots(1, len(sets)), sets.items(), strict=True):
+        dense = strands.resampled(2e-4)
+        pixels, depth = camera.project(dense.points)
+        on = np.flatnonzero((depth > 0) & camera.inside(pixels))
+        on = on[np.argsort(-depth[on])]
+        x, y = np.rint(pixels[on]).astype(int).T
+        canvas = np.zeros((camera.height, camera.width, 3))
+        canvas[y, x] = np.abs(dense.tangents()[on] @ camera.R.T)  # the last one stays
+        axes.imshow(np.clip(canvas, 0, 1))
+        axes.set_title(title, loc="left", fontsize=10)
+        axes.axis("off")
+    figure.savefig(path, dpi=90)
+
+
 def picture_motion(path: Path, clouds: Mapping[str, PointCloud]) -> None:
     """The same slice |x| < 1.5 mm through each of `clouds` side by side, as a PNG."""
     figure = Figure(figsize=(4.6 * len(clouds), 4.8), layout="constrained")
