@@ -67,8 +67,8 @@ LEAST_LIT = 0.1
 LEAST_REACHED = 0.02
 """Of what a light brings to the brightest twentieth of the hair.
 
-One threshold for all lights tells shading from shading: hair that scatters a light away from the
-camera counted as hidden from it, three in four of the pixels that a camera beside it does see.
+One threshold for all lights takes shading for shadow: where hair scatters a light away from the
+camera, what stands beside that light counted as hidden though it sees the pixel.
 """
 
 
