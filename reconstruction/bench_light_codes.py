@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from reconstruction.capture import Capture
+from reconstruction.capture import Capture, CaptureError
 from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
 from reconstruction.envelope import mesh_depth
 from reconstruction.evaluation import compare_strands
@@ -228,14 +228,21 @@ def run_imported(
     samples: int = 10_000,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """All methods on a folder that `import_folder` reads, with true strands `strands_gt.npz`."""
+    """All methods on a folder that `import_folder` reads, with true strands `strands_gt.npz`.
+
+    A method that needs what the capture lacks has its reason under "left_out" and no row.
+    """
     options = options or ReconstructOptions()
     shutil.rmtree(out / "capture", ignore_errors=True)
     capture = import_folder(folder, out / "capture")
     truth = read_strands(folder / "strands_gt.npz")
-    results: dict[str, Any] = {"rows": {}}
+    results: dict[str, Any] = {"rows": {}, "left_out": {}}
     for method in METHODS:
-        reconstruct(capture, out / method, method=method, options=options, progress=progress)
+        try:
+            reconstruct(capture, out / method, method=method, options=options, progress=progress)
+        except CaptureError as error:
+            results["left_out"][method] = str(error)
+            continue
         results["rows"][method] = compare_strands(
             read_strands(out / method / "strands.npz"),
             truth,
@@ -243,7 +250,7 @@ def run_imported(
             head=capture.head,
             samples=samples,
         )
-        _save(out / "imported.json", results)
+    _save(out / "imported.json", results)
     return results
 
 
