@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -98,7 +100,9 @@ def test_frames_are_placed_rightly_or_not_at_all(fates, last, stamped, jitter, p
     assert places in (true, None)
     if set(fates) <= {"o", "l"} and fates[-1] == "o":
         assert places == true
-    if stamped and fates[0] == fates[-1] == "o" and len(fates) > 1:
+    off = [abs(pace - 1) * (b - a) + 2 * jitter * ((b - a) % 2) for a, b in pairwise(true)]
+    known = stamped and fates[0] == fates[-1] == "o" and len(fates) > 1
+    if known and max(off) < 0.5:  # beyond half a step nothing tells one pulse from the next
         assert places == true
 
 
