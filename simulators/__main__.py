@@ -8,7 +8,6 @@ import json
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -28,6 +27,7 @@ from simulators.subject import Subject, check_fits, load_subject
 from simulators.truth import EXPOSURES, write_truth
 from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
+from stage_service.signals import taken
 
 _FAILED, _BAD_INPUT = 1, 2
 
@@ -77,9 +77,7 @@ def _run(
     faults: Faults,
 ) -> None:
     rig, sensor, quality = rig_file.rig, Sensor(), Quality.scaled(args.spp)
-    leave = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: leave.set())
+    leave = taken(signal.SIGTERM, signal.SIGINT)
     with ExitStack() as stack:
         make: Callable[[], Responder]
         if isinstance(subject, Subject):
@@ -101,7 +99,7 @@ def _run(
         stack.callback(responder.stop)
         ready = {"ready": True, "devices": str(args.state / "devices.toml"), **stage.devices}
         print(json.dumps(ready), flush=True)
-        leave.wait()
+        leave()
 
 
 def _poses(rig_file: RigFile) -> int:

@@ -113,8 +113,9 @@ def _start(children: Children, args: argparse.Namespace) -> str:
         *("serve", "--json", "--rig", args.rig, "--devices", devices),
         *("--root", out, "--port", "0"),
     )
-    service = children.start("service", serve, answers=True)
+    # Ended the latest first: the service, whose lamps must not wait for the worker.
     worker = children.start("worker", own_command("worker", "--json", "--root", out), answers=True)
+    service = children.start("service", serve, answers=True)
     url: str = children.first_line("service", service, 60)["url"]
     children.first_line("worker", worker, 60)
     return url

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import time
 from pathlib import Path
 
 from stage_service.cli.output import Commands, Output, add_command
@@ -108,7 +109,8 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
         child = children.start("simulators", command, to_log=False, answers=True)
         devices = children.first_line("simulators", child, 600)["devices"]
         output.result({"devices": devices}, f"the simulated rig answers; see {devices}")
-        code = child.wait()
+        while (code := child.poll()) is None:  # a signal may come just before a sleep: a short one
+            time.sleep(0.2)
         return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
 
 

@@ -24,6 +24,7 @@ from stage_service.jobs.queue import APP, QUEUE, WORKFLOW, JobQueue, database_ur
 from stage_service.jobs.records import JobOptions
 from stage_service.jobs.slots import WorkerSlot
 from stage_service.jobs.steps import STEPS, StepContext
+from stage_service.signals import taken
 
 log = logging.getLogger("hairstage.worker")
 
@@ -113,13 +114,11 @@ def run_worker(
     def job(spec: dict[str, Any]) -> dict[str, Any]:
         return worker.run_job(spec)
 
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = taken(signal.SIGTERM, signal.SIGINT)
     DBOS.launch()
     DBOS.register_queue(QUEUE, worker_concurrency=concurrency, polling_interval_sec=0.2)
     ready(slot.name)
-    stop.wait()
+    stop()
     worker.stop()
     DBOS.destroy()
     # Step threads may be deep in native code; they hold nothing that the next worker needs.

@@ -187,14 +187,16 @@ while manager.events.last < 12:
 print("going", flush=True)
 {ending}
 """
+# Short sleeps: Python sees a signal that came just before a sleep only after it.
+ASLEEP = "for _ in range(600): time.sleep(0.1)"
 
 
 @pytest.mark.parametrize(
     ("ending", "send"),
     [
         ("", None),
-        ("time.sleep(60)", signal.SIGTERM),
-        ("time.sleep(60)", signal.SIGINT),
+        (ASLEEP, signal.SIGTERM),
+        (ASLEEP, signal.SIGINT),
         ("raise ValueError", None),
     ],
     ids=["exit", "SIGTERM", "Ctrl-C", "exception"],
