@@ -36,7 +36,7 @@ class LmvsSearch(DepthSearch):
     ) -> tuple[Any, ...]:
         """See `DepthSearch.search`; the agreement is 1 less the cost over a right angle."""
         t, options = self.types, self.options
-        pixels.code = []
+        pixels.code = []  # this method knows no lightcode: nothing is compared, all is equal
         along = self._in_plane(view, x, y)
         near, number = t.Float(start), t.UInt32(counts)
         step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, options.samples)

@@ -79,9 +79,9 @@ def line_through(views: DeviceViews, pixels: Pixels, point: Any, active: Any) ->
     """The direction that lies in the planes of the visible views' lines (Sun Eq. 4).
 
     The singular vector of the smallest singular value of the planes' normals, weighted by how well
-    the lightcodes match, as an eigenvector of a 3x3 matrix. Then
-    once more, weighted by how well each line agrees with that direction too: least squares alone
-    follow the views that see something else there.
+    the lightcodes match, as an eigenvector of a 3x3 matrix. Then once more, weighted by how well
+    each line agrees with that direction too: least squares alone follow the views that see
+    something else there.
     """
     zero = views.types.Array3f(0, 0, 0)
     first = _weighed_line(views, pixels, point, zero, active, 0)

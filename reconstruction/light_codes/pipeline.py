@@ -146,8 +146,8 @@ def string_together(
         points, directions, weights = thinned_lines(
             segments.points, segments.directions, weights, options.crowd
         )
-        trust = np.minimum(weights / np.median(weights), 1.0)
-        lines = Measured(points, directions, trust)
+        usual = np.median(weights[weights > 0]) if (weights > 0).any() else 1.0
+        lines = Measured(points, directions, np.minimum(weights / usual, 1.0))
         found = [p.astype(float) for p in surface_strands(lines, options.strands)]
         grown = extend(views, found, options.extension)
         stage.figures.update(
