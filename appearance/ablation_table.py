@@ -113,7 +113,7 @@ class Table:
                     scene,
                     o.camera,
                     [o.lights[i] for i in held],
-                    spp=self.captured.spp // 2,
+                    spp=self.captured.judged_spp // 2,
                     max_depth=self.captured.max_depth,
                     pixels=o.pixels,
                     seed=(self.seed << 8) + 31 + 2 * k + h,
@@ -130,6 +130,7 @@ class Table:
             "beta_n": hair.beta_n,
             "eta": hair.eta,
             "beta_m_error": hair.beta_m / true.beta_m - 1,
+            "beta_n_error": hair.beta_n / true.beta_n - 1,
             "sigma_a_error": float(np.abs(np.array(hair.sigma_a) / true.sigma_a - 1).max()),
         }
 

@@ -17,8 +17,7 @@ from appearance.hair_maps import HairMaps
 from appearance.observations import Observed
 from appearance.stage1.loop import Stage1Options, run
 from appearance.stage1.problem import Effort, Problem
-from appearance.stage1.subjects import SUBJECTS, Captured, Rig, subject
-from reconstruction.lights import Light
+from appearance.stage1.subjects import SUBJECTS, Captured, Rig, on_bent, subject
 from reconstruction.mesh import Mesh
 from reconstruction.report import Progress, silent
 from reconstruction.strands import Strands
@@ -26,14 +25,14 @@ from reconstruction.strands import Strands
 Array = NDArray[np.float64]
 
 QUICK = Stage1Options(
-    steps=90,
-    check_every=30,
+    steps=45,
+    check_every=45,
     shape=(6, 12, 12),
-    effort=Effort(pixels=400, spp=48, gradient_spp=32, max_depth=8),
+    effort=Effort(pixels=400, spp=512, gradient_spp=64, max_depth=8),
 )
-STAGE = Rig(size=36, cameras=5, lights=12, spp=768)
-PLAIN_STEPS = 4
-"""Of the plain version that are run; the rest of its curve is extrapolated and marked."""
+STAGE = Rig(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
+PLAIN = Effort(spp=16, gradient_spp=16)
+"""Paths of the plain version: as many for the picture as for its gradient."""
 
 
 def run_bench(
@@ -56,30 +55,46 @@ def run_bench(
     Writes `appearance.json` and `appearance.md` into `out` and returns the former.
     """
     result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
+    made: dict[str, Captured] = {}
     for name in names:
-        captured = subject(name, strands, head, hair, skin, rig, seed)
-        table = Table(captured, options, progress=named(progress, name), seed=seed)
-        result["subjects"][name] = table.run()
+        if name == "c" and "b" in made:
+            captured = on_bent(made["b"], strands, head, seed)
+        else:
+            captured = subject(name, strands, head, hair, skin, rig, seed)
+        made[name] = captured
+        rows = Table(captured, options, progress=named(progress, name), seed=seed).run()
+        result["subjects"][name] = rows
+        _write(out, result)
         if name == "a":
-            result["recovery"] = recovery(captured, options, named(progress, name), seed)
+            result["recovery"] = recovery(captured, rows, options, named(progress, name), seed)
         if name == "b":
             result["seeds"] = [
                 _final(Table(captured, options, seed=seed + k).run()) for k in range(1, seeds)
             ]
             if plain:
                 result["time"] = error_against_time(captured, options, progress, seed)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "appearance.json").write_text(json.dumps(result, indent=1) + "\n")
-    (out / "appearance.md").write_text(markdown(result))
+        _write(out, result)
     return result
 
 
+def _write(out: Path, result: dict[str, Any]) -> None:
+    """What there is so far: a benchmark of an hour may be interrupted."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "appearance.json").write_text(json.dumps(result, indent=1) + "\n")
+    (out / "appearance.md").write_text(markdown(result))
+
+
 def recovery(
-    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+    captured: Captured,
+    rows: dict[str, dict[str, Any]],
+    options: Stage1Options,
+    progress: Progress = silent,
+    seed: int = 0,
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """What is recovered from frames with noise, and with lamps 2 mm and 3 % off their calibration.
 
-    For each case the rows "spatial" (lamps as calibrated) and "lights" (lamps fitted too).
+    `rows` are those of the table of the frames as they are. The rows "spatial" (lamps as
+    calibrated) and, with lamps off, "lights" (lamps fitted too).
     """
     rng = np.random.default_rng([seed, 9])
     lights = captured.views[0].lights
@@ -104,32 +119,29 @@ def recovery(
         )
         for o in captured.views
     ]
-    cases: dict[str, tuple[Captured, Sequence[Light] | None]] = {
-        "as captured": (captured, None),
-        "noise of 2 % of white and 500 electrons at white": (
-            replace(captured, views=tuple(noisy)),
-            None,
-        ),
-        "lamps 2 mm and 3 % off": (captured, off),
-    }
-    out: dict[str, dict[str, dict[str, Any]]] = {}
-    for name, (frames, known) in cases.items():
-        table = Table(frames, options, lights=known, progress=named(progress, name), seed=seed)
-        rows = table.run(("spatial", "lights"))
-        out[name] = {
-            row: {
-                "psnr_clean": rows[row][GROUPS[1]]["psnr_clean"],
-                "beta_m_error": rows[row]["beta_m_error"],
-                "sigma_a_error": rows[row]["sigma_a_error"],
-            }
-            for row in ("HairInverse", "spatial", "lights")
-        }
-        if known is not None:
-            true = np.array([lights[i].intensity[0] for i in captured.train_lights])
-            mine = np.array([known[i].intensity[0] for i in captured.train_lights])
-            out[name]["spatial"]["lamps_off"] = _relative_spread(mine / true)
-            out[name]["lights"]["lamps_off"] = _relative_spread(mine * table.found[1].gain / true)
+    out = {"as captured": _recovered(rows)}
+    name = "noise of 2 % of white and 500 electrons at white"
+    table = Table(
+        replace(captured, views=tuple(noisy)), options, progress=named(progress, name), seed=seed
+    )
+    out[name] = _recovered(table.run(("spatial",)))
+    name = "lamps 2 mm and 3 % off"
+    table = Table(captured, options, lights=off, progress=named(progress, name), seed=seed)
+    out[name] = _recovered(table.run(("spatial", "lights")))
+    true = np.array([lights[i].intensity[0] for i in captured.train_lights])
+    known = np.array([off[i].intensity[0] for i in captured.train_lights])
+    out[name]["spatial"]["lamps_off"] = _relative_spread(known / true)
+    out[name]["lights"]["lamps_off"] = _relative_spread(known * table.found[1].gain / true)
     return out
+
+
+def _recovered(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    wanted = ("beta_m_error", "beta_n_error", "sigma_a_error")
+    return {
+        name: {"psnr_clean": row[GROUPS[1]]["psnr_clean"], **{k: row[k] for k in wanted}}
+        for name, row in rows.items()
+        if name in ("HairInverse", "spatial", "lights")
+    }
 
 
 def _relative_spread(ratio: Array) -> float:
@@ -142,14 +154,16 @@ def error_against_time(
 ) -> dict[str, list[dict[str, float]]]:
     """Held-out PSNR of "spatial" against CPU seconds: ours, and ours with one choice undone.
 
-    "plain" draws pairs evenly, renders whole frames one at a time to a fixed number of bounces, and
-    starts from one colour; of its steps only the first are run. Watching is not counted.
+    "plain" draws pairs evenly, renders whole frames one at a time to a fixed number of bounces, as
+    many paths for a picture as for its gradient, and starts from one colour. Watching is not
+    counted.
     """
     training = captured.training()
     scale, skin = captured.exposure.scale, captured.skin
     ours = replace(options, row="spatial", check_every=max(2, options.steps // 3))
     even = replace(ours, residual_weighted=False, cell_start=False, shared_paths=False)
     frame = captured.views[0].camera.width * captured.views[0].camera.height
+    depth = options.effort.max_depth
     versions = {
         "ours": ours,
         "one colour first": replace(ours, cell_start=False),
@@ -157,10 +171,8 @@ def error_against_time(
         "even batches": replace(ours, residual_weighted=False),
         "plain": replace(
             even,
-            effort=replace(options.effort, pixels=frame, rr_depth=options.effort.max_depth),
-            check_every=1,
+            effort=replace(PLAIN, pixels=frame, max_depth=depth, rr_depth=depth),
             levels=1,
-            steps=PLAIN_STEPS,
         ),
     }
     start = HairMaps.of(replace(captured.truth.mean(), sigma_a=(0.3, 0.3, 0.3), beta_m=0.4))
@@ -212,18 +224,18 @@ def markdown(result: dict[str, Any]) -> str:
             f"## Subject ({name})",
             "",
             "| row | held-out views, lights: PSNR without noise | PSNR | SSIM | training views, "
-            "held-out lights: PSNR without noise | β_M off | mean σ off | s |",
-            "|---|---|---|---|---|---|---|---|",
+            "held-out lights: PSNR without noise | β_M off | β_N off | mean σ off | s |",
+            "|---|---|---|---|---|---|---|---|---|",
         ]
         for row, figures in rows.items():
             held, train = figures[GROUPS[1]], figures[GROUPS[0]]
             off = [
                 f"{100 * figures[k]:+.1f} %" if k in figures else ""
-                for k in ("beta_m_error", "sigma_a_error")
+                for k in ("beta_m_error", "beta_n_error", "sigma_a_error")
             ]
             lines.append(
                 f"| {row} | {held['psnr_clean']:.2f} | {held['psnr']:.2f} | {held['ssim']:.3f} | "
-                f"{train['psnr_clean']:.2f} | {off[0]} | {off[1]} | "
+                f"{train['psnr_clean']:.2f} | {' | '.join(off)} | "
                 f"{figures.get('seconds', 0):.0f} |"
             )
         lines.append("")
@@ -233,6 +245,7 @@ def markdown(result: dict[str, Any]) -> str:
             lines.append(
                 f"- {case}, {row}: {found['psnr_clean']:.2f} dB, "
                 f"β_M {100 * found['beta_m_error']:+.1f} %, "
+                f"β_N {100 * found['beta_n_error']:+.1f} %, "
                 f"σ {100 * found['sigma_a_error']:.1f} %{lamps}"
             )
     for name, curve in result.get("time", {}).items():

@@ -95,10 +95,21 @@ def transported_normals(
         root = np.asarray(root_normals, float)
         if root.shape != (len(starts), 3):
             raise ValueError(f"root_normals must be ({len(starts)}, 3), got {root.shape}")
+    return transported(tangents, segments_of_strand, root)
+
+
+def transported(
+    tangents: NDArray[np.float64], counts: NDArray[np.int64], root: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Unit normals `(K, 3)` of unit `tangents (K, 3)`, `counts (S,)` of them to a strand.
+
+    Each strand begins with the part of its `root (S, 3)` across the first tangent.
+    """
+    starts = np.cumsum(counts) - counts
     normals = np.empty_like(tangents)
     normals[starts] = _upright(root, tangents[starts])
-    for i in range(1, int(segments_of_strand.max())):
-        at = starts[segments_of_strand > i] + i
+    for i in range(1, int(counts.max())):
+        at = starts[counts > i] + i
         moved = _turned(normals[at - 1], tangents[at - 1], tangents[at])
         normals[at] = _upright(moved, tangents[at])
     return normals

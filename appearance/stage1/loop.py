@@ -308,7 +308,7 @@ class _Fit:
 
     def _judged(self, state: State, gains: Gains, ended: str, seconds: float) -> Outcome:
         """The best of the start, the first maps and the result, by fresh random numbers."""
-        effort = replace(self.options.effort, spp=4 * self.options.effort.spp)
+        effort = self.options.effort
         seed = (self.seed << 16) + (1 << 24)
         guesses = [
             (state.average, self._gain(gains), ended),

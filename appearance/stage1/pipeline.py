@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from appearance.fitted import FittedAppearance
 from appearance.hair_maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.metrics import LPIPS_UNAVAILABLE, psnr, relative_error, ssim
+from appearance.metrics import LPIPS_UNAVAILABLE
 from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
 from appearance.render.bounces import bounce_limit
-from appearance.render.olat import render_olat
 from appearance.scene import build_scene
+from appearance.stage1.held_out import held_out_frames, judge
 from appearance.stage1.loop import Outcome, Stage1Options, run
 from appearance.stage1.problem import Effort, Problem
 from appearance.stage1.unknowns import Lamps
@@ -26,7 +26,7 @@ from reconstruction.strand_files import read_strands
 from reconstruction.strands import Strands
 
 Array = NDArray[np.float64]
-MAPS, LAMPS = "hair_maps.npz", "lamps.json"
+MAPS, LAMPS, PICTURE = "hair_maps.npz", "lamps.json", "stage1.png"
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,11 @@ def fit_stage1(
     """Fit maps and lamps, from the `appearance.json` of Sun's fit, and judge them.
 
     Reads `strands.npz`, `masks/` and `appearance.json` of the folder `model`. Writes
-    `hair_maps.npz`, `lamps.json` and the stage "stage1" of `report.json`; a fit that was killed
-    goes on from its checkpoint, which stays in the folder until the fit is done. Returns
-    `{"ended", "steps", "error", "start_error", "held_out": {"start" | "stage1": {"psnr", "ssim",
-    "relative_error"}}}`, the latter where images are held out. Raises `CaptureError`,
+    `hair_maps.npz`, `lamps.json`, `stage1.png` where images are held out (captured, rendered and
+    error maps) and the stage "stage1" of `report.json`; a fit that was killed goes on from its
+    checkpoint, which stays in the folder until the fit is done. Returns `{"ended", "steps",
+    "error", "start_error", "held_out": {"start" | "stage1": {"psnr", "ssim", "relative_error"}}}`,
+    the latter where images are held out. Raises `CaptureError`,
     `FileNotFoundError` or `ValueError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or Stage1Request()
@@ -105,12 +106,20 @@ def fit_stage1(
             "start_error": outcome.start_error,
             "error": outcome.error,
         }
-        judged = _held_out_images(capture, model, held_out, request.judged_images, seed)
-        if judged:
-            result["held_out"] = {
-                name: _scores(mapped, maps, judged, fitted, options, request, seed)
-                for name, maps in (("start", start), ("stage1", outcome.maps))
-            }
+        frames = held_out_frames(capture, model, held_out, request.judged_images, seed)
+        if frames:
+            result["held_out"] = judge(
+                model / PICTURE,
+                frames,
+                {
+                    name: mapped.painted(maps).with_skin(fitted.skin)
+                    for name, maps in (("start", start), ("stage1", outcome.maps))
+                },
+                fitted.exposure,
+                spp=request.judged_spp,
+                max_depth=options.effort.max_depth,
+                seed=seed,
+            )
             result["lpips"] = LPIPS_UNAVAILABLE
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     report.save(model / "report.json")
@@ -179,68 +188,6 @@ def _views(
     if not views:
         raise ValueError(f"{model}: the hair masks of the training cameras are all empty")
     return views
-
-
-def _held_out_images(
-    capture: Capture, model: Path, held_out: HeldOut, most: int, seed: int
-) -> list[Observed]:
-    """Held-out cameras under held-out lights; where one of them is missing, under all others."""
-    cameras = held_out.cameras or tuple(c.name for c in capture.rig.cameras)
-    lights = held_out.lights or tuple(capture.olat_lights())
-    if not (held_out.cameras or held_out.lights):
-        return []
-    out = []
-    for name in cameras[:2]:
-        there = [x for x in lights if capture.has_light(x, name)]
-        some = there[:: max(1, -(-len(there) // max(1, most // min(2, len(cameras)))))]
-        pixels = np.flatnonzero(model_mask(model, name, "hair", capture))
-        if len(pixels) and some:
-            out.append(observe(capture, name, some, pixels))
-    return out
-
-
-def _scores(
-    mapped: MappedStrands,
-    maps: HairMaps,
-    images: list[Observed],
-    fitted: FittedAppearance,
-    options: Stage1Options,
-    request: Stage1Request,
-    seed: int,
-) -> dict[str, float]:
-    scene = mapped.painted(maps).with_skin(fitted.skin)
-    values = []
-    for k, o in enumerate(images):
-        rendered = render_olat(
-            scene,
-            o.camera,
-            o.lights,
-            spp=request.judged_spp,
-            max_depth=options.effort.max_depth,
-            pixels=o.pixels,
-            seed=(seed << 8) + 91 + k,
-        )
-        mask = np.zeros((o.camera.height, o.camera.width), bool)
-        mask.reshape(-1)[o.pixels] = True
-        for i in range(len(o.lights)):
-            ours, true = (_image(x[i], mask) for x in (rendered, o.radiance))
-            if true[mask].max() > 0:
-                shown, wanted = fitted.exposure(ours), fitted.exposure(true)
-                values.append(
-                    (
-                        psnr(shown, wanted, mask),
-                        ssim(shown, wanted, mask),
-                        relative_error(ours, true, mask),
-                    )
-                )
-    mean = np.mean(values, axis=0)
-    return dict(zip(("psnr", "ssim", "relative_error"), map(float, mean), strict=True))
-
-
-def _image(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> Array:
-    out = np.zeros((*mask.shape, 3))
-    out[mask] = values
-    return out
 
 
 def _write_lamps(path: Path, lamps: Lamps, problem: Problem) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from appearance.bsdf.strand_coordinates import transported
 from appearance.hair_appearance import HairAppearance
 from appearance.hair_maps import HairMaps, MappedStrands, root_normals, scalp_coordinates
 from appearance.metrics import Exposure
@@ -33,13 +34,17 @@ _BEND = 0.1
 
 @dataclass(frozen=True)
 class Rig:
-    """A small stage: cameras on a ring, lamps on a dome; every other lamp is held out."""
+    """A small stage: cameras on a ring, lamps on a dome; every other lamp is held out.
+
+    Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`.
+    """
 
     size: int = 64
     cameras: int = 6
     lights: int = 16
     fov_deg: float = 24.0
     spp: int = 384
+    judged_spp: int = 384
     max_depth: int = 10
 
 
@@ -60,7 +65,7 @@ class Captured:
     held_views: tuple[int, ...]
     held_lights: tuple[int, ...]
     exposure: Exposure
-    spp: int
+    judged_spp: int
     max_depth: int
 
     @property
@@ -96,16 +101,13 @@ def subject(
     """Subject `name` of `SUBJECTS`, its base colour and roughness those of `hair`."""
     if name not in SUBJECTS:
         raise ValueError(f"there is no subject {name!r}; there are {SUBJECTS}")
-    rig = rig or Rig()
-    uv = scalp_coordinates(strands, head)
-    scene = build_scene(strands, head, hair=hair, skin=skin)
-    true_mapped = MappedStrands.of(scene, strands, uv)
-    truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed)
-    mapped = true_mapped
     if name == "c":
-        noisy = bent(strands, uv, TANGENT_NOISE_DEG, seed)
-        mapped = MappedStrands.of(build_scene(noisy, head, hair=hair, skin=skin), noisy, uv)
-    shown = true_mapped.painted(truth)
+        return on_bent(subject("b", strands, head, hair, skin, rig, seed), strands, head, seed)
+    rig = rig or Rig()
+    scene = build_scene(strands, head, hair=hair, skin=skin)
+    mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, head))
+    truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed)
+    shown = mapped.painted(truth)
     cameras, lights = _ring(strands, rig), _dome(rig)
     views, halves = [], []
     for k, camera in enumerate(cameras):
@@ -130,7 +132,7 @@ def subject(
     exposure = Exposure.of([o.radiance[::2] for i, o in enumerate(views) if i not in held_views])
     return Captured(
         mapped,
-        true_mapped,
+        mapped,
         truth,
         skin,
         tuple(views),
@@ -138,9 +140,17 @@ def subject(
         held_views,
         held_lights,
         exposure,
-        rig.spp,
+        rig.judged_spp,
         rig.max_depth,
     )
+
+
+def on_bent(captured: Captured, strands: Strands, head: Mesh | None, seed: int = 0) -> Captured:
+    """The frames of `captured`, whose strands are `strands`, to be fitted on bent ones."""
+    uv = captured.mapped.root_uv
+    noisy = bent(strands, uv, TANGENT_NOISE_DEG, seed)
+    scene = build_scene(noisy, head, hair=captured.truth.mean(), skin=captured.skin)
+    return replace(captured, mapped=MappedStrands.of(scene, noisy, uv))
 
 
 def dyed(hair: HairAppearance, seed: int, shape: tuple[int, int, int] = (6, 24, 24)) -> HairMaps:
@@ -161,33 +171,36 @@ def dyed(hair: HairAppearance, seed: int, shape: tuple[int, int, int] = (6, 24, 
 def bent(strands: Strands, uv: Array, rms_deg: float, seed: int) -> Strands:
     """`strands` offset along a wave, so that tangents turn by `rms_deg` RMS and roots stay.
 
-    Direction and phase of the wave vary smoothly over the scalp: neighbours are wrong alike, as in
-    reconstructions. About 2 mm of offset for 5°.
+    Direction and phase of the wave, in the strands' own frames, vary smoothly over the scalp:
+    neighbours are wrong alike, as in reconstructions. About 2 mm of offset for 5°.
     """
     rng = np.random.default_rng([seed, 5])
-    normal = root_normals(strands)
     waves = rng.normal(size=(2, 4, 2)) * 3.0
     shift = rng.uniform(0, 2 * np.pi, (2, 4))
     phase, turn = (
         1.5 * np.sin(uv @ w.T + s).sum(axis=1) for w, s in zip(waves, shift, strict=True)
     )
     tangents = strands.tangents().astype(float)
-    starts = strands.segment_starts
-    arc = np.zeros(len(strands.points))
-    arc[starts + 1] = np.linalg.norm(
-        strands.points[starts + 1].astype(float) - strands.points[starts], axis=1
-    )
-    arc = np.cumsum(arc)
+    offsets = strands.offsets
+    points = np.arange(len(tangents))
+    normals = transported(tangents, np.diff(offsets), root_normals(strands))
     strand = strands.strand_of_point
-    s = arc - arc[strands.offsets[:-1]][strand]
-    side = np.cross(tangents, normal[strand])
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    other = np.cross(side, tangents)
-    across = np.cos(turn)[strand, None] * side + np.sin(turn)[strand, None] * other
-    angle = 2 * np.pi * s / _BEND
-    height = np.sin(angle + phase[strand]) - np.sin(phase[strand])
-    size = np.tan(np.radians(rms_deg)) * np.sqrt(2) * _BEND / (2 * np.pi)
-    return replace(strands, points=(strands.points + size * height[:, None] * across))
+    across = np.cos(turn)[strand, None] * normals
+    across += np.sin(turn)[strand, None] * np.cross(tangents, normals)
+    step = np.linalg.norm(np.diff(strands.points.astype(float), axis=0, prepend=0), axis=1)
+    arc = np.cumsum(np.where(points == offsets[strand], 0, step))
+    angle = 2 * np.pi * (arc - arc[offsets[strand]]) / _BEND
+    wave = (np.sin(angle + phase[strand]) - np.sin(phase[strand]))[:, None] * across
+    size = np.radians(rms_deg) * np.sqrt(2) * _BEND / (2 * np.pi)
+    for _ in range(3):
+        out = replace(strands, points=strands.points + size * wave)
+        size *= np.radians(rms_deg) / _rms_angle(tangents, out.tangents().astype(float))
+    return out
+
+
+def _rms_angle(one: Array, other: Array) -> float:
+    sine = np.linalg.norm(np.cross(one, other), axis=1)
+    return float(np.sqrt((np.arctan2(sine, (one * other).sum(axis=1)) ** 2).mean()))
 
 
 def _ring(strands: Strands, rig: Rig) -> list[Camera]:

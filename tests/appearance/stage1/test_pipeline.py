@@ -89,6 +89,9 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lamps_and_figures(made):
     assert [share for _, share in again] == sorted(share for _, share in again)
     assert result["error"] < result["start_error"]
     assert set(result["held_out"]) == {"start", "stage1"}
+    picture = cv2.imread(str(model / "stage1.png"))
+    # four frames, each captured, before, after and its error map
+    assert picture.shape[0] > 3.5 * picture.shape[1] / 4
     maps, uv = HairMaps.load(model / "hair_maps.npz")
     assert maps.shape == (2, 2, 2)
     assert uv.shape == (300, 2)

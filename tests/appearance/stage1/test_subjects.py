@@ -23,7 +23,7 @@ def test_bent_strands_turn_by_five_degrees_and_keep_their_roots(small):
     noisy = bent(strands, uv, 5.0, seed=0)
     cosine = (noisy.tangents() * strands.tangents()).sum(axis=1)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    assert np.sqrt((angle**2).mean()) == pytest.approx(5.0, rel=0.2)
+    assert np.sqrt((angle**2).mean()) == pytest.approx(5.0, rel=0.01)
     np.testing.assert_allclose(noisy.roots, strands.roots, atol=1e-7)
     assert np.linalg.norm(noisy.points - strands.points, axis=1).max() < 6e-3
 
@@ -70,11 +70,15 @@ def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
 
 
 def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
-    found = recovery(captured, QUICK)
-    assert [list(rows) for rows in found.values()] == 3 * [["HairInverse", "spatial", "lights"]]
-    *_, off = found.values()
-    assert 0 < off["spatial"]["lamps_off"] < 0.1
-    assert 0 < off["lights"]["lamps_off"] < 0.1
+    rows = Table(captured, QUICK).run(("spatial", "lights"))
+    found = recovery(captured, rows, QUICK)
+    as_is, noisy, off = found.values()
+    assert list(as_is) == list(off) == ["HairInverse", "spatial", "lights"]
+    assert list(noisy) == ["HairInverse", "spatial"]
+    # three training lamps of one seed are this far off each other; two steps learn no gain
+    assert off["spatial"]["lamps_off"] == pytest.approx(0.03, abs=0.02)
+    assert off["lights"]["lamps_off"] < 1.5 * off["spatial"]["lamps_off"]
+    assert as_is["spatial"] != noisy["spatial"]
     text = markdown({"subjects": {}, "recovery": found})
-    assert text.count("dB") == 9
+    assert text.count("dB") == 8
     assert text.count("lamps") == 5
