@@ -37,9 +37,9 @@ HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = Stage1Options(
     row="original",
     steps=40,
-    check_every=10,
+    check_every=20,
     watched_views=2,
-    effort=Effort(pixels=300, spp=48, gradient_spp=8, max_depth=12),
+    effort=Effort(pixels=300, spp=384, gradient_spp=48, max_depth=12),
 )
 AFAR = HairAppearance((0.13, 0.15, 0.35), 0.42, 0.2)
 

@@ -34,7 +34,8 @@ class Adam:
     """Adam (Kingma & Ba 2015), whose second moment is at least that of a table's mean cell.
 
     With each cell's own alone, a cell that hardly any ray meets would walk about at full speed on
-    noise; this way it moves in proportion to what it is told. The second moment forgets slowly: a
+    noise; this way it moves in proportion to what it is told, and not at all where that may be
+    noise. The second moment forgets slowly: a
     gradient of path tracing is small most of the time and rarely large the other way, and a short
     memory scales the rare ones down, so that the numbers drift where the mean gradient is zero.
     """
@@ -53,9 +54,16 @@ class Adam:
             v += (1 - _SECOND) * (g * g - v)
             ahead = m / (1 - _FIRST**self.count)
             size = v / (1 - _SECOND**self.count)
-            usual = size.mean()
-            reach = pace * STEP[name] * (1.0 if g.size <= 3 else _OF_CELLS)
-            raw[name] = raw[name] - reach * ahead / np.sqrt(np.maximum(size, usual) + _TINY**2)
+            step = ahead / np.sqrt(np.maximum(size, size.mean()) + _TINY**2)
+            if g.size > 3:
+                step *= _OF_CELLS * self._told(ahead, size)
+            raw[name] = raw[name] - pace * STEP[name] * step
+
+    def _told(self, ahead: Array, size: Array) -> Array:
+        """The share of each cell's mean gradient that is more than noise (James & Stein 1961)."""
+        decay = _FIRST**self.count
+        noise = size * (1 - _FIRST) / (1 + _FIRST) * (1 - decay**2) / (1 - decay) ** 2
+        return np.maximum(1 - noise / np.maximum(ahead**2, _TINY**2), 0)
 
 
 @dataclass

@@ -62,7 +62,7 @@ class Stage1Options:
     shape: Shape = (4, 8, 8)
     levels: int = 3
     cell_start: bool = True
-    steps: int = 150
+    steps: int = 60
     images: int = 8
     effort: Effort = field(default_factory=Effort)
     loss: str = "squares"

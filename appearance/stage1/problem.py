@@ -27,13 +27,13 @@ Array = NDArray[np.float64]
 class Effort:
     """What one step may cost: `pixels` of a view, paths a pixel of at most `max_depth` vertices.
 
-    The picture gets more paths (`spp`) than its gradient (`gradient_spp`): they cost a fifth, and
-    the picture's noise multiplies the gradient's.
+    The picture gets more paths (`spp`) than its gradient (`gradient_spp`): they cost an eighth, and
+    the picture's noise multiplies the gradient's. Few steps of many paths beat many of few.
     """
 
     pixels: int = 600
-    spp: int = 24
-    gradient_spp: int = 8
+    spp: int = 128
+    gradient_spp: int = 16
     max_depth: int = 8
     rr_depth: int = 3
 
