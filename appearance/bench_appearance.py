@@ -95,7 +95,7 @@ def recovery(
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """What is recovered from frames with noise, and with lamps 2 mm and 3 % off their calibration.
 
-    `rows` are those of the table of the frames as they are. The rows "spatial" (lamps as
+    `rows` are those of the table of the frames as they are. The row "original" (lamps as
     calibrated) and, with lamps off, "lights" (lamps fitted too).
     """
     rng = np.random.default_rng([seed, 9])
@@ -126,13 +126,13 @@ def recovery(
     table = Table(
         replace(captured, views=tuple(noisy)), options, progress=named(progress, name), seed=seed
     )
-    out[name] = _recovered(table.run(("spatial",)))
+    out[name] = _recovered(table.run(("original",)))
     name = "lamps 2 mm and 3 % off"
     table = Table(captured, options, lights=off, progress=named(progress, name), seed=seed)
-    out[name] = _recovered(table.run(("spatial", "lights")))
+    out[name] = _recovered(table.run(("original", "lights")))
     true = np.array([lights[i].intensity[0] for i in captured.train_lights])
     known = np.array([off[i].intensity[0] for i in captured.train_lights])
-    out[name]["spatial"]["lamps_off"] = _relative_spread(known / true)
+    out[name]["original"]["lamps_off"] = _relative_spread(known / true)
     out[name]["lights"]["lamps_off"] = _relative_spread(known * table.found[1].gain / true)
     return out
 
@@ -142,7 +142,7 @@ def _recovered(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {
         name: {"psnr_clean": row[GROUPS[1]]["psnr_clean"], **{k: row[k] for k in wanted}}
         for name, row in rows.items()
-        if name in ("HairInverse", "spatial", "lights")
+        if name in ("HairInverse", "original", "lights")
     }
 
 

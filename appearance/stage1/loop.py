@@ -307,27 +307,29 @@ class _Fit:
         return self.problem.error(raw, gain, self.watched, self.options.effort, seed << 16)
 
     def _judged(self, state: State, gains: Gains, ended: str, seconds: float) -> Outcome:
-        """The best of the start, the first maps and the result, by fresh random numbers."""
+        """The best of the result and of what it came from, by fresh random numbers."""
         effort = self.options.effort
         seed = (self.seed << 16) + (1 << 24)
+        start, found_gain = self._raw(self.start), self._gain(gains)
         guesses = [
-            (state.average, self._gain(gains), ended),
+            (state.average, found_gain, ended),
             (state.first, self.lamps.gain, f"{ended}; kept the first maps, which are better"),
-            (self._raw(self.start), self.lamps.gain, f"{ended}; kept the start, which is better"),
+            (start, found_gain, f"{ended}; kept all but the intensities, which is better"),
+            (start, self.lamps.gain, f"{ended}; kept the start, which is better"),
         ]
         errors = [
             self.problem.error(raw, gain, self.watched, effort, seed) for raw, gain, _ in guesses
         ]
-        best = int(np.argmin(errors))
+        best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
         raw, gain, how = guesses[best]
         self.series.append((seconds, state.step, errors[best]))
-        if best == 2:
+        if best == len(errors) - 1:
             return Outcome(
-                self.start, self.lamps, how, errors[2], errors[2], state.step, self.series
+                self.start, self.lamps, how, errors[best], errors[best], state.step, self.series
             )
         profile = np.exp(raw["profile"])[self.problem.profile_of]
         found = Lamps(raw["position"], raw["turn"], gain, profile)
-        return Outcome(maps_of(raw), found, how, errors[2], errors[best], state.step, self.series)
+        return Outcome(maps_of(raw), found, how, errors[-1], errors[best], state.step, self.series)
 
     def _unchanged(self, reason: str) -> Outcome:
         return Outcome(self.start, self.lamps, reason, 0.0, 0.0, 0)

@@ -70,15 +70,15 @@ def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
 
 
 def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
-    rows = Table(captured, QUICK).run(("spatial", "lights"))
+    rows = Table(captured, QUICK).run(("original", "lights"))
     found = recovery(captured, rows, QUICK)
     as_is, noisy, off = found.values()
-    assert list(as_is) == list(off) == ["HairInverse", "spatial", "lights"]
-    assert list(noisy) == ["HairInverse", "spatial"]
+    assert list(as_is) == list(off) == ["HairInverse", "original", "lights"]
+    assert list(noisy) == ["HairInverse", "original"]
     # three training lamps of one seed are this far off each other; two steps learn no gain
-    assert off["spatial"]["lamps_off"] == pytest.approx(0.03, abs=0.02)
-    assert off["lights"]["lamps_off"] < 1.5 * off["spatial"]["lamps_off"]
-    assert as_is["spatial"] != noisy["spatial"]
+    assert off["original"]["lamps_off"] == pytest.approx(0.03, abs=0.02)
+    assert off["lights"]["lamps_off"] < 1.5 * off["original"]["lamps_off"]
+    assert as_is["original"] != noisy["original"]
     text = markdown({"subjects": {}, "recovery": found})
     assert text.count("dB") == 8
     assert text.count("lamps") == 5
