@@ -108,7 +108,6 @@ class Problem:
         with _threads(1 if repeatable else None):
             found = op.gradients(known, wanted, mi.TensorXf(weight.astype(np.float32)), seeds[1])
             dr.eval(found)
-            dr.sync_thread()
         total = losses.smoothness(values, *lambdas)
         for name in wanted:
             total = total + dr.sum(found[name] * values[name], axis=None)
@@ -239,11 +238,14 @@ class Problem:
 
 @contextmanager
 def _threads(count: int | None) -> Iterator[None]:
+    """Dr.Jit with `count` threads (None: as it is); no kernel runs while that changes."""
     import drjit as dr
 
     before = dr.thread_count()
+    dr.sync_thread()
     dr.set_thread_count(count or before)
     try:
         yield
     finally:
+        dr.sync_thread()
         dr.set_thread_count(before)
