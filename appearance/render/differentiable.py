@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from appearance.hair_appearance import DiffuseHair
 from appearance.render.lamps import LampBank
@@ -74,6 +74,8 @@ class DifferentiableOlat:
         self.scene, self.camera, self.lights = scene, camera, tuple(lights)
         self.guide = guide
         self.index = pixel_indices(camera, pixels)
+        # Dr.Jit reads NumPy's memory in place, and must find it there when a kernel runs at last
+        self._pixel = _array(self.index)
         self.spp, self.max_depth, self.rr_depth = spp, max_depth, rr_depth
         self._bank = LampBank.of(self.lights)
 
@@ -195,10 +197,13 @@ class DifferentiableOlat:
         return {k: dr.grad(leaves[k]) * _UNITS.get(k, 1.0) for k in wanted}
 
     def _each_sample(self, seed: int, trace: Any) -> None:
-        import mitsuba as mi
+        each_sample(self.camera, self._pixel, len(self.index), self.spp, (seed,), trace)
 
-        pixel = mi.UInt32(self.index.astype(np.uint32))
-        each_sample(self.camera, pixel, len(self.index), self.spp, (seed,), trace)
+
+def _array(index: NDArray[np.int64]) -> Any:
+    import mitsuba as mi
+
+    return mi.UInt32(index.astype(np.uint32))
 
 
 def _operation() -> Any:
