@@ -19,7 +19,7 @@ class Core:
     """The core as a library; `now` is microseconds, which wrap as the board's do."""
 
     def __init__(self, library, now):
-        self.library, self.now, self.inputs = library, now, 0
+        self.core, self.now, self.inputs = library, now, 0
         self.box = ctypes.create_string_buffer(1 << 18)  # more than a tb_box, which is 67 KB
         self.text = ctypes.create_string_buffer(97)
         library.tb_init(self.box)
@@ -28,9 +28,7 @@ class Core:
         """All that it answers to these bytes."""
         out = b""
         for byte in data:
-            length = self.library.tb_receive(
-                self.box, self.now % WRAP, self.inputs, byte, self.text
-            )
+            length = self.core.tb_receive(self.box, self.now % WRAP, self.inputs, byte, self.text)
             assert length <= 97
             out += self.text.raw[:length]
         return out
@@ -39,7 +37,7 @@ class Core:
         return self.feed(line.encode() + b"\n").decode().removesuffix("\n")
 
     def poll(self):
-        return self.library.tb_poll(self.box, self.now % WRAP, self.inputs)
+        return self.core.tb_poll(self.box, self.now % WRAP, self.inputs)
 
     def run(self, microseconds, tick=5):
         """(when, outputs) at each change, polled every `tick` microseconds."""
