@@ -21,6 +21,7 @@ from appearance.render.olat import render_olat
 from appearance.render.paths import Surface, stream, wave
 from appearance.render.reference import PathReference
 from appearance.scene import HairScene, build_scene
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light, dome_positions
 from reconstruction.mesh import Mesh
@@ -313,7 +314,7 @@ def bare_rays(
     import mitsuba as mi
 
     surface = Surface(scene)
-    pixel = mi.UInt32(index.astype(np.uint32))
+    pixel = mi.UInt32(for_kernels(index, np.uint32))
     camera_paths = wave(camera, pixel, len(index), 0, 1, 1, seed)
     start = surface.interact(camera_paths.rays, mi.Bool(True))
     found = {}

@@ -13,6 +13,7 @@ from appearance.render.bounces import bounce_limit
 from appearance.render.paths import wave
 from appearance.render.scanlines import render_scanlines
 from appearance.scene import SCALE, HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 from reconstruction.projectors import Projector
 
@@ -132,9 +133,9 @@ class _Lines:
         import drjit as dr
         import mitsuba as mi
 
-        self._parameters["lamp.irradiance.data"] = mi.TensorXf(self._picture(row))
+        self._parameters["lamp.irradiance.data"] = mi.TensorXf(for_kernels(self._picture(row)))
         self._parameters.update()
-        pixels = mi.UInt32(index.astype(np.uint32))
+        pixels = mi.UInt32(for_kernels(index, np.uint32))
         paths = wave(camera, pixels, len(index), 0, spp, spp, seed, row)
         sampler: Any = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed * 8191 + row), spp * len(index))

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.hair_appearance import HairAppearance
 from appearance.render.paths import opaque
 from appearance.scene import HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.mesh import Mesh
 from reconstruction.scalp_map import ScalpMap, sphere_center
 from reconstruction.strands import Strands
@@ -140,8 +141,8 @@ class MappedStrands:
                 "azimuthal_roughness": maps.beta_n,
                 "scale_tilt": -maps.tilt_deg,
                 "eta": maps.eta,
-                "sigma_a": mi.TensorXf(maps.sigma_a.astype(np.float32)),
-                "rotation": mi.TensorXf(maps.rotation.astype(np.float32)),
+                "sigma_a": mi.TensorXf(for_kernels(maps.sigma_a)),
+                "rotation": mi.TensorXf(for_kernels(maps.rotation)),
                 **self.coordinates,
             }
         )
@@ -152,8 +153,8 @@ class MappedStrands:
         import mitsuba as mi
 
         values = mi.traverse(scene.hair_bsdf)
-        values["sigma_a"] = mi.TensorXf(maps.sigma_a.astype(np.float32))
-        values["rotation"] = mi.TensorXf(maps.rotation.astype(np.float32))
+        values["sigma_a"] = mi.TensorXf(for_kernels(maps.sigma_a))
+        values["rotation"] = mi.TensorXf(for_kernels(maps.rotation))
         for name, value in (
             ("longitudinal_roughness", maps.beta_m),
             ("azimuthal_roughness", maps.beta_n),

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.backend import ensure_backend
 from appearance.curves import spline_control_points
 from appearance.hair_appearance import DiffuseHair, HairAppearance
+from reconstruction.array_backend import for_kernels
 from reconstruction.mesh import Mesh
 from reconstruction.strands import Strands
 
@@ -156,8 +157,8 @@ def _curves(strands: Strands) -> Any:
         shape = mi.load_dict({"type": "bsplinecurve", "filename": str(file)})
     parameters = mi.traverse(shape)
     parameters["control_point_count"] = len(points)
-    parameters["segment_indices"] = mi.UInt32(segments.astype(np.uint32))
-    parameters["control_points"] = mi.Float((points * SCALE).astype(np.float32).ravel())
+    parameters["segment_indices"] = mi.UInt32(for_kernels(segments, np.uint32))
+    parameters["control_points"] = mi.Float(for_kernels((points * SCALE).ravel()))
     parameters.update()
     return shape
 
@@ -184,8 +185,8 @@ def _mesh(head: Mesh) -> Any:
 
     mesh = mi.Mesh("head", len(head.vertices), len(head.faces))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float((head.vertices * SCALE).astype(np.float32).ravel())
-    parameters["faces"] = mi.UInt32(head.faces.astype(np.uint32).ravel())
+    parameters["vertex_positions"] = mi.Float(for_kernels((head.vertices * SCALE).ravel()))
+    parameters["faces"] = mi.UInt32(for_kernels(head.faces.ravel(), np.uint32))
     parameters.update()
     return mesh
 

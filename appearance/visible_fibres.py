@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene import SCALE, HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 
 
@@ -54,7 +55,7 @@ def visible_fibres(
     lane = dr.arange(mi.UInt32, count)
     slot = lane // samples
     sample = lane - slot * samples
-    pixel = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), slot)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(for_kernels(index, np.uint32)), slot)
     ray = jittered(camera, pixel, sample, samples, stream(count, seed))
     surface = Surface(scene)
     si = surface.interact(ray, mi.Bool(True))

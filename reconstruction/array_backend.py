@@ -8,7 +8,11 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
 OLDEST_LLVM = 16
+_PACKET = 256  # bytes: no vector of any back end is longer
 _FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/lib")
 
 
@@ -81,3 +85,20 @@ def array_types(variant: str | None = None) -> Any:
         f"the variant {chosen!r} has no arrays to compute with: choose llvm_* or cuda_* in "
         "HAIRSTAGE_VARIANT"
     )
+
+
+def for_kernels(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """A copy of `values`, of the same shape, that may be handed to a Dr.Jit array type.
+
+    Dr.Jit reads NumPy's memory in place, and its LLVM kernels read the last packet of lanes whole:
+    up to 60 bytes past the end of float32, which ends the process where the next page is not
+    mapped. They are also compiled anew for memory that does not begin at a packet. The copy begins
+    at one, and has room for one after its end.
+    """
+    values = np.asarray(values)
+    size = values.size * np.dtype(dtype).itemsize
+    memory = np.zeros(size + 2 * _PACKET, np.uint8)
+    start = -memory.ctypes.data % _PACKET
+    copy = memory[start : start + size].view(dtype).reshape(values.shape)
+    copy[...] = values
+    return copy

@@ -16,6 +16,7 @@ from appearance.backend import ensure_backend
 from appearance.bsdf import lobes, reference
 from appearance.bsdf.bessel import scaled_i0
 from appearance.bsdf.measure import Case, array_types, fibre, sphere, uniforms
+from reconstruction.array_backend import for_kernels
 
 SAMPLES = 200_000
 CASES = [
@@ -69,9 +70,7 @@ def measured(bsdf: Any, case: Case) -> Measured:
     drawn = np.array(bs.wo, float).T
     usable = np.array(bs.pdf) > 0
     w, weights = sphere(case)
-    value, pdf = bsdf.eval_pdf(
-        mi.BSDFContext(), interaction(len(w)), mi.Vector3f(w.T.astype(np.float32))
-    )
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(len(w)), mi.Vector3f(for_kernels(w.T)))
     density = np.array(pdf, float) * weights
     moment = float("inf")
     if usable.any():
@@ -112,7 +111,7 @@ def bessel_errors(x: float) -> tuple[float, float]:
     """
     import mitsuba as mi
 
-    single: Any = mi.Float(x)
+    single: Any = mi.Float(for_kernels(x))
     exact = float(i0e(x))
     lobe = exact * x / (2 * np.pi * -np.expm1(-2 * x))
     across, along = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)

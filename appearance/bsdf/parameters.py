@@ -13,6 +13,7 @@ from appearance.bsdf.corrective import axis_in_frame
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
+from reconstruction.array_backend import for_kernels
 
 INFINITE = float("inf")
 SCALARS = {
@@ -249,7 +250,7 @@ def _checked(name: str, value: Any, low: float, high: float) -> Any:
     if len(numbers) == 1:
         # not NumPy's memory: kernels are compiled anew for each alignment
         return dr.opaque(mi.Float, float(numbers[0]))
-    return mi.Float(numbers)
+    return mi.Float(for_kernels(numbers))
 
 
 def _tensor(name: str, value: Any, channels: int, low: float, high: float) -> Any:

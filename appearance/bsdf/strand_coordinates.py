@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.array_backend import for_kernels
+
 NAMES = (
     "control_points",
     "segment_indices",
@@ -60,13 +62,13 @@ def strand_parameters(
     beyond = len(first_point) - total
     strand = np.repeat(np.arange(strands), counts)
     return {
-        "control_points": mi.Float(points.astype(np.float32).ravel()),
-        "segment_indices": mi.UInt32(first_point.astype(np.uint32)),
-        "strand_of_segment": mi.UInt32(np.pad(strand, (0, beyond), "edge").astype(np.uint32)),
-        "first_segment": mi.UInt32(np.concatenate([[0], np.cumsum(counts)]).astype(np.uint32)),
-        "root_uv": mi.Float(uv.astype(np.float32).ravel()),
+        "control_points": mi.Float(for_kernels(points.ravel())),
+        "segment_indices": mi.UInt32(for_kernels(first_point, np.uint32)),
+        "strand_of_segment": mi.UInt32(for_kernels(np.pad(strand, (0, beyond), "edge"), np.uint32)),
+        "first_segment": mi.UInt32(for_kernels(np.append(0, np.cumsum(counts)), np.uint32)),
+        "root_uv": mi.Float(for_kernels(uv.ravel())),
         "reference_normals": mi.Float(
-            np.pad(normals, ((0, beyond), (0, 0)), "edge").astype(np.float32).ravel()
+            for_kernels(np.pad(normals, ((0, beyond), (0, 0)), "edge").ravel())
         ),
     }
 

@@ -33,6 +33,7 @@ from appearance.render.paths import (
     pixel_indices,
 )
 from appearance.scene import SCALE, HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
@@ -74,8 +75,6 @@ class DifferentiableOlat:
         self.scene, self.camera, self.lights = scene, camera, tuple(lights)
         self.guide = guide
         self.index = pixel_indices(camera, pixels)
-        # Dr.Jit reads NumPy's memory in place, and must find it there when a kernel runs at last
-        self._pixel = _array(self.index)
         self.spp, self.max_depth, self.rr_depth = spp, max_depth, rr_depth
         self._bank = LampBank.of(self.lights)
 
@@ -93,8 +92,8 @@ class DifferentiableOlat:
 
         values: dict[str, Any] = {
             "skin": mi.Color3f(*self.scene.skin),
-            "lamps.position": mi.TensorXf(np.array([x.position for x in self.lights])),
-            "lamps.intensity": mi.TensorXf(np.array([x.intensity for x in self.lights])),
+            "lamps.position": mi.TensorXf(for_kernels([x.position for x in self.lights])),
+            "lamps.intensity": mi.TensorXf(for_kernels([x.intensity for x in self.lights])),
             "lamps.turn": dr.zeros(mi.TensorXf, (len(self.lights), 3)),
         }
         if isinstance(self.scene.hair, DiffuseHair):
@@ -197,13 +196,13 @@ class DifferentiableOlat:
         return {k: dr.grad(leaves[k]) * _UNITS.get(k, 1.0) for k in wanted}
 
     def _each_sample(self, seed: int, trace: Any) -> None:
-        each_sample(self.camera, self._pixel, len(self.index), self.spp, (seed,), trace)
+        each_sample(self.camera, _array(self.index), len(self.index), self.spp, (seed,), trace)
 
 
 def _array(index: NDArray[np.int64]) -> Any:
     import mitsuba as mi
 
-    return mi.UInt32(index.astype(np.uint32))
+    return mi.UInt32(for_kernels(index, np.uint32))
 
 
 def _operation() -> Any:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from appearance.render.paths import opaque, opaque_index
 from appearance.render.tracing import Paths
 from appearance.scene import SCALE, HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.lights import Light
 
 Array = NDArray[np.float64]
@@ -64,7 +65,7 @@ class Dome:
                 f"light stands {distance.min() / SCALE:.2f} m from it: lights must stand around "
                 "the subject for a smooth basis; render with degree=None"
             )
-        basis = dr.sh_eval(mi.Vector3f((position / distance[:, None]).T), degree)
+        basis = dr.sh_eval(mi.Vector3f(for_kernels((position / distance[:, None]).T)), degree)
         intensity = np.array([light.intensity_towards(np.zeros(3)) for light in lights]) * SCALE**2
         return cls(
             degree,

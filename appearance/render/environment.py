@@ -18,6 +18,7 @@ from appearance.render.environment_maps import check_environment
 from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
 from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene import HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 
 
@@ -94,8 +95,8 @@ class Sky:
             weight = np.ones_like(weight)
         (turn,) = opaque(rotation_deg / 360)
         return cls(
-            mi.Float(envmap.astype(np.float32).ravel()),
-            mi.DiscreteDistribution(mi.Float((weight / weight.sum()).ravel())),
+            mi.Float(for_kernels(np.ravel(envmap))),
+            mi.DiscreteDistribution(mi.Float(for_kernels((weight / weight.sum()).ravel()))),
             opaque_index(width),
             opaque_index(height),
             turn,

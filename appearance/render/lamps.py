@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from appearance.bsdf.corrective import rodrigues
 from appearance.render.paths import opaque, opaque_index, opaque_matrix
 from appearance.scene import SCALE, light_arrays
+from reconstruction.array_backend import for_kernels
 from reconstruction.lamp_profiles import POLAR_FRAMES, LampProfile
 from reconstruction.lights import Light
 
@@ -60,7 +61,7 @@ class LampBank:
             _floats(radii) if radii.any() else None,
             _floats(sizes) if sizes.any() else None,
             tuple(ProfileTable.of(p) for p in profiles),
-            mi.UInt32(np.array(numbers, np.uint32)) if profiles else None,
+            mi.UInt32(for_kernels(numbers, np.uint32)) if profiles else None,
         )
 
     def sample(self, light: Any, p: Any, rng: Any, active: Any) -> tuple[Any, Any]:
@@ -209,7 +210,6 @@ def _interval(nodes: Any, count: int, x: Any) -> tuple[Any, Any, Any]:
 
 
 def _floats(values: ArrayLike) -> Any:
-    """`values` in Dr.Jit's own memory: kernels are compiled anew for each alignment of NumPy's."""
     import mitsuba as mi
 
-    return mi.Float(np.asarray(values, np.float32).ravel().tolist())
+    return mi.Float(for_kernels(np.ravel(values)))

@@ -17,6 +17,7 @@ from appearance.render.olat import render_olat
 from appearance.render.paths import Surface, opaque, pixel_indices
 from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene import HairScene
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
@@ -126,7 +127,7 @@ def _render(
     spp, max_depth, seed = how
     film = dr.zeros(mi.Float, 3 * len(index))
     surface = Surface(scene)
-    draw = mi.DiscreteDistribution(mi.Float(choice)) if bank is not None else None
+    draw = mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if bank is not None else None
 
     gather = _Gather(surface, film, bank, draw, skies)
     follow(surface, camera, index, spp, (seed,), Reach(max_depth), gather)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from appearance.render.paths import passes, wave
 from appearance.scene import HairScene, light_arrays
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
@@ -68,7 +69,7 @@ class PathReference:
         import drjit as dr
         import mitsuba as mi
 
-        index = mi.UInt32(pixels.astype(np.uint32))
+        index = mi.UInt32(for_kernels(pixels, np.uint32))
         film = dr.zeros(mi.Float, 3 * len(pixels))
         for first, count in passes(spp, max(1, _LANES // len(pixels))):
             paths = wave(camera, index, len(pixels), first, count, spp, *seed)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.render.paths import Surface, jittered, opaque, opaque_index
+from reconstruction.array_backend import for_kernels
 from reconstruction.cameras import Camera
 
 LANE_BYTES = 512
@@ -76,7 +77,7 @@ def follow(
     import mitsuba as mi
 
     slot = dr.arange(mi.UInt32, len(pixels))
-    pixel = mi.UInt32(pixels.astype(np.uint32))
+    pixel = mi.UInt32(for_kernels(pixels, np.uint32))
     size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(reach.max_depth)
     (roulette,) = opaque(reach.roulette)
     state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)

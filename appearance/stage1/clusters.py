@@ -19,6 +19,7 @@ from appearance.render.paths import Surface, jittered, stream
 from appearance.stage1.batches import Batch
 from appearance.stage1.problem import Effort, Problem
 from appearance.stage1.unknowns import BRACKET, Lamps, Raw, maps_of
+from reconstruction.array_backend import for_kernels
 
 Array = NDArray[np.float64]
 Shape = tuple[int, int, int]
@@ -66,7 +67,7 @@ def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> NDA
     count = len(o.pixels) * _RAYS
     lane = dr.arange(mi.UInt32, count)
     slot = lane // _RAYS
-    pixel = dr.gather(mi.UInt32, mi.UInt32(o.pixels.astype(np.uint32)), slot)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(for_kernels(o.pixels, np.uint32)), slot)
     ray = jittered(o.camera, pixel, lane - slot * _RAYS, _RAYS, stream(count, seed, 77))
     surface = Surface(problem.mapped.scene)
     si = surface.interact(ray, mi.Bool(True))

@@ -18,6 +18,7 @@ from appearance.scene import HairScene
 from appearance.stage1 import losses
 from appearance.stage1.batches import Batch, Pairs, Seen
 from appearance.stage1.unknowns import Lamps, Raw, hair_values, maps_of, raw_of
+from reconstruction.array_backend import for_kernels
 from reconstruction.lights import Light
 
 Array = NDArray[np.float64]
@@ -93,7 +94,7 @@ class Problem:
 
         o = self.views[batch.view]
         few = np.sort(rng.permutation(len(o.pixels))[: effort.pixels])
-        leaves = {k: mi.TensorXf(v.astype(np.float32)) for k, v in raw.items()}
+        leaves = {k: mi.TensorXf(for_kernels(v)) for k, v in raw.items()}
         for name in free:
             dr.enable_grad(leaves[name])
         seen = self.seen(batch, few, self.render(raw, gain, batch, few, effort, seeds[0]))
@@ -106,7 +107,7 @@ class Problem:
         known = op.parameters() | {k: dr.detach(v) for k, v in values.items()}
         wanted = [k for k, v in values.items() if dr.grad_enabled(v)]
         with _threads(1 if repeatable else None):
-            found = op.gradients(known, wanted, mi.TensorXf(weight.astype(np.float32)), seeds[1])
+            found = op.gradients(known, wanted, mi.TensorXf(for_kernels(weight)), seeds[1])
             dr.eval(found)
         total = losses.smoothness(values, *lambdas)
         for name in wanted:
@@ -224,7 +225,9 @@ class Problem:
         rows = (lights[:, None] * 3 + np.arange(3)).ravel()
         for name, parameter in (("position", "lamps.position"), ("turn", "lamps.turn")):
             if name in free:
-                moved = dr.gather(mi.Float, leaves[name].array, mi.UInt32(rows.astype(np.uint32)))
+                moved = dr.gather(
+                    mi.Float, leaves[name].array, mi.UInt32(for_kernels(rows, np.uint32))
+                )
                 moved = moved - dr.detach(moved)
                 out[parameter] = known[parameter] + mi.TensorXf(moved, (len(lights), 3))
         if "profile" in free:

@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.array_backend import for_kernels
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import Pixels, line_through
 from reconstruction.light_codes.search import DepthSearch, Floats
@@ -38,9 +39,9 @@ class LmvsSearch(DepthSearch):
         t, options = self.types, self.options
         pixels.code = []  # this method knows no lightcode: nothing is compared, all is equal
         along = self._in_plane(view, x, y)
-        near, number = t.Float(start), t.UInt32(counts)
+        near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
         step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, options.samples)
-        fan = t.Float(FAN.astype(np.float32))
+        fan = t.Float(for_kernels(FAN))
         total = len(self.neighbours[view])
         few = min(COARSE_NEIGHBOURS, total)
         coarse = _Cost(self.device, pixels, along, few, options.length)
@@ -80,7 +81,7 @@ class LmvsSearch(DepthSearch):
         across = own.camera.rays(pixel + line) - ray
         across -= (across * ray).sum(axis=1, keepdims=True) * ray
         across /= np.linalg.norm(across, axis=1, keepdims=True)
-        a, r = (t.Array3f(*(t.Float(c.astype(np.float32)) for c in v.T)) for v in (across, ray))
+        a, r = (t.Array3f(*(t.Float(for_kernels(c)) for c in v.T)) for v in (across, ray))
         return lambda tilt: dr.cos(tilt) * a + dr.sin(tilt) * r
 
 

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.array_backend import array_types
+from reconstruction.array_backend import array_types, for_kernels
 from reconstruction.light_codes.codes import unpack
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import (
@@ -130,12 +130,12 @@ class DepthSearch:
         order = np.array([view, *self.neighbours[view]], np.uint32)
         lanes = Pixels(
             t.Array3f(*(float(c) for c in camera.center)),
-            t.Array3f(*(t.Float(c.astype(np.float32)) for c in rays.T)),
-            [t.UInt32(np.ascontiguousarray(w)) for w in code],
+            t.Array3f(*(t.Float(for_kernels(c)) for c in rays.T)),
+            [t.UInt32(for_kernels(w, np.uint32)) for w in code],
             dr.opaque(t.UInt32, view),
-            t.UInt32(order),
+            t.UInt32(for_kernels(order, np.uint32)),
             dr.opaque(t.UInt32, len(order)),
-            t.UInt32(mask),
+            t.UInt32(for_kernels(mask, np.uint32)),
         )
         return lanes, visible.sum(axis=1)
 
@@ -182,7 +182,7 @@ def _search(
     counts: NDArray[np.uint32],
 ) -> tuple[Any, ...]:
     t = device.types
-    near, number = t.Float(start), t.UInt32(counts)
+    near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
     step = dr.opaque(t.Float, options.step)
     samples = dr.opaque(t.UInt32, options.samples)
     apart = dr.opaque(t.Float, options.length / max(options.samples - 1, 1))

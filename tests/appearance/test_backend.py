@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from appearance.backend import BackendError, ensure_backend, find_libllvm
+from reconstruction.array_backend import for_kernels
 
 
 def test_an_old_libllvm_is_refused_with_what_to_install(tmp_path, monkeypatch):
@@ -55,3 +57,42 @@ def test_a_usable_library_is_found_and_the_variant_is_set():
     import mitsuba as mi
 
     assert mi.variant() == chosen == ensure_backend()
+
+
+_AT_AN_EDGE = """
+import ctypes, mmap
+import numpy as np
+from appearance.backend import ensure_backend
+from reconstruction.array_backend import for_kernels
+page = mmap.PAGESIZE
+memory = mmap.mmap(-1, 2 * page)
+start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+protect = ctypes.CDLL(None, use_errno=True).mprotect
+protect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+assert protect(start + page, page, 0) == 0
+five = np.frombuffer(memory, np.float32, count=5, offset=page - 20)
+five[:] = range(5)
+ensure_backend("llvm_ad_rgb")
+import mitsuba as mi
+print((mi.Float(for_kernels(five)) + 1).numpy().tolist())
+"""
+
+
+def test_an_array_that_ends_where_memory_ends_does_not_end_the_process():
+    """Without `for_kernels` this is a segfault: kernels read the last packet whole."""
+    done = subprocess.run([sys.executable, "-c", _AT_AN_EDGE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[1.0, 2.0, 3.0, 4.0, 5.0]"
+
+
+@pytest.mark.parametrize("shape", [(1,), (17,), (3, 5, 2)])
+def test_arrays_for_kernels_begin_at_a_packet_and_have_room_after_their_end(shape):
+    values = np.asfortranarray(np.arange(np.prod(shape)).reshape(shape))
+    copy = for_kernels(values, np.uint32)
+    assert copy.flags.c_contiguous
+    assert (copy == values).all()
+    owner = copy
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    assert copy.ctypes.data % 128 == 0
+    assert owner.ctypes.data + owner.nbytes - copy.ctypes.data - copy.nbytes >= 128
