@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from appearance.stage1.descent import Adam, Convergence
 from appearance.stage1.unknowns import Raw
@@ -16,8 +17,8 @@ from appearance.stage1.unknowns import Raw
 class State:
     """Where a fit stands. `average` is the running mean of `raw` that is watched and returned.
 
-    `first` is what the steps began with. `tables` are what batches have taught: `taught (V, L)` and
-    the gains' `sums (3, L)`.
+    `first` is what the steps began with. `tables` are `taught (V, L)`, what batches have taught,
+    and the lamps' `gain (L,)`.
     """
 
     raw: Raw
@@ -29,6 +30,11 @@ class State:
     level_began: int = 0
     history: list[list[float]] = field(default_factory=list)
     tables: Raw = field(default_factory=dict)
+
+    @property
+    def gain(self) -> NDArray[np.float64]:
+        """The factors on the lamps' intensities."""
+        return self.tables["gain"]
 
     def save(self, path: Path | None, fingerprint: str) -> None:
         """Write the state, whole or not at all; nothing where `path` is None."""

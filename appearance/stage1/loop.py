@@ -1,4 +1,4 @@
-"""The fit: batches, gradients and steps until the watched error no longer falls."""
+"""The fit: what pictures alone tell first, then steps until the watched error no longer falls."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from appearance.hair_maps import HairMaps
 from appearance.stage1.batches import Batch, Pairs
 from appearance.stage1.checkpoint import State
 from appearance.stage1.clusters import cell_colours
-from appearance.stage1.gains import Gains
-from appearance.stage1.problem import Effort, Problem
+from appearance.stage1.problem import Effort, Problem, Watched
+from appearance.stage1.shared_numbers import WIDE, solved
 from appearance.stage1.unknowns import Lamps, Raw, maps_of
 from reconstruction.report import Progress, silent
 
@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 Shape = tuple[int, int, int]
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
-ROWS: dict[str, tuple[tuple[str, ...], bool, bool]] = {
-    "original": (COLOUR, False, False),
-    "spatial": (COLOUR, True, False),
-    "correctives": ((*COLOUR, "rotation"), True, False),
-    "lights": ((*COLOUR, "rotation", "position", "turn", "profile"), True, True),
+ROWS: dict[str, tuple[tuple[str, ...], bool]] = {
+    "original": (COLOUR, False),
+    "spatial": (COLOUR, True),
+    "correctives": ((*COLOUR, "rotation"), True),
+    "lights": ((*COLOUR, "rotation", "position", "turn", "profile", "gain"), True),
 }
-"""The ablations: what is free, whether it varies over the volume, and whether gains are solved."""
+"""The ablations: what is free, and whether colour and correctives vary over the volume."""
 PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation": 0.2}
 """Standard deviations about the calibration, and of correctives in radians."""
 _LATEST = 0.04
@@ -40,6 +40,9 @@ _LATEST = 0.04
 mean is over about the latest quarter of the steps before that (Shamir & Zhang 2013)."""
 _SLOWED = 0.8
 """Share of the pace that the later half of the steps gives up, for what noise moves in the end."""
+_ALTERNATIONS = 2
+"""Of shared numbers and cells, each with what it knows of the other."""
+_MORE_ROUNDS = 6
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared prior deviation, beside the image loss."""
 
@@ -49,12 +52,14 @@ class Stage1Options:
     """How a fit is run; the defaults are ours, the plain version has `plain()`.
 
     `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
-    reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. There are
-    at most `steps`, of `images` pairs each: lights of one view on shared paths, or pairs drawn one
-    by one and rendered alone. `common_numbers` repeats the same random numbers for a
-    view in every step. `repeatable` gives the same bytes for the same seed, with gradients in a
-    single thread. The watched error is that of `watched_views`
-    views, every `check_every` steps; after `halvings` of the pace it has converged.
+    reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. With
+    `gauss_newton` the numbers that all hair shares and the lamps' intensities are solved for (see
+    `shared_numbers`), and steps are for what is left: correctives and the lamps' places, and
+    nothing in the rows before those. There are at most `steps`, of `images` pairs each: lights of
+    one view on shared paths, or pairs drawn one by one and rendered alone. `common_numbers` repeats
+    the same random numbers for a view in every step. `repeatable` gives the same bytes for the same
+    seed, with gradients in a single thread. The watched error is that of `watched_views` views,
+    every `check_every` steps; after `halvings` of the pace it has converged.
     """
 
     row: str = "lights"
@@ -62,6 +67,7 @@ class Stage1Options:
     shape: Shape = (4, 8, 8)
     levels: int = 3
     cell_start: bool = True
+    gauss_newton: bool = True
     steps: int = 60
     images: int = 8
     effort: Effort = field(default_factory=Effort)
@@ -122,7 +128,7 @@ def run(
 
     With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
     data or options is replaced. The file stays: whoever starts the fit removes it. `snapshot` is
-    told the CPU seconds that steps have taken and the maps, whenever the error is watched.
+    told the CPU seconds so far, without watching, and the maps: as they come, and in the end.
     """
     options = options or Stage1Options()
     fit = _Fit(problem, maps, lamps, options, checkpoint, progress, seed)
@@ -146,60 +152,96 @@ class _Fit:
         self.checkpoint, self.progress = checkpoint, progress
         self.start = maps
         self.lamps = Lamps.calibrated(len(problem.lights)) if lamps is None else lamps
-        free, self.spatial, self.solves_gains = ROWS[options.row]
-        self.free = [*free, *(["tilt_deg"] if options.tilt else [])]
+        free, self.spatial = ROWS[options.row]
+        free = (*free, "tilt_deg") if options.tilt else free
+        self.solves = [n for n in free if n in WIDE] if options.gauss_newton else []
+        self.free = [n for n in free if n not in self.solves and n != "gain"]
+        if self.spatial and not options.cell_start and self.solves:
+            self.free.append("sigma_a")
         self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
-        self.watched = problem.watched(self.pairs, options.watched_views, options.images)
+        self.spread = problem.spread(self.pairs, options.watched_views, options.images)
         self.series: list[tuple[float, int, float]] = []
         self.snapshot: Callable[[float, HairMaps], None] = lambda seconds, maps: None
 
     def run(self) -> Outcome:
-        begun, worked = time.perf_counter(), time.process_time()
+        begun = time.perf_counter()
+        self.worked = time.process_time()
         if not self.pairs.used.any():
             return self._unchanged("no pair of camera and light shows lit hair")
         state = self._begun()
-        gains = Gains(state.tables["gains"])
         self.pairs.taught = state.tables["taught"]
-        ended = "all steps taken"
+        ended = "all steps taken" if self.free else "converged"
         self.series = [(s, int(k), e) for s, k, e in state.history]
         spent = self.series[-1][0] if self.series else 0.0
-        while state.step < self.options.steps:
+        while self.free and state.step < self.options.steps:
             if state.step % self.options.check_every == 0:
-                self.snapshot(time.process_time() - worked, maps_of(state.average))
+                self._show(state.average)
                 paused = time.process_time()
                 state.history = [list(p) for p in self.series]
                 state.save(self.checkpoint, self._fingerprint)
-                error = self._watch(state.average, self._gain(gains), self.seed)
+                error = self._watch(state.average, state.gain, self.seed)
                 self.series.append((spent + time.perf_counter() - begun, state.step, error))
-                share = state.step / self.options.steps
+                share = 0.5 + 0.5 * state.step / self.options.steps
                 self.progress(f"step {state.step}: error {max(error, 0.0) ** 0.5:.4f}", share)
                 if state.convergence.tell(error) and self._level(state.step) == self._last_level:
                     ended = "converged"
                     break
-                worked += time.process_time() - paused
-            reason = self._step(state, gains)
+                self.worked += time.process_time() - paused
+            reason = self._step(state)
             if reason:
                 ended = reason
                 break
-        return self._judged(state, gains, ended, spent + time.perf_counter() - begun)
+        self._show(state.average)
+        return self._judged(state, ended, spent + time.perf_counter() - begun)
 
     def _begun(self) -> State:
         saved = State.load(self.checkpoint, self._fingerprint)
         if saved is not None:
             return saved
-        raw = self._raw(self._first_maps())
+        raw, gain = self._first()
         state = State(raw, _copied(raw), _copied(raw))
-        state.tables = {"taught": self.pairs.taught, "gains": np.zeros((3, len(self.lamps.gain)))}
+        state.tables = {"taught": self.pairs.taught, "gain": gain}
         state.convergence.halvings = self.options.halvings
         return state
 
-    def _first_maps(self) -> HairMaps:
-        """The start in this row's volume, cells of one colour told apart by their own pictures."""
-        options, last = self.options, self._last_level
-        if not (self.spatial and self.options.cell_start and self.start.shape == (1, 1, 1)):
-            return self.start.resized(self._shape(self._level(0)))
-        even = self._raw(self.start.resized(self._shape(last)))
-        return cell_colours(self.problem, even, self.lamps.gain, options.effort, seed=self.seed)
+    def _first(self) -> tuple[Raw, Array]:
+        """What pictures tell without a gradient: cells, shared numbers, and each again."""
+        options, effort, shape = self.options, self.options.effort, self._shape(self._last_level)
+        one_colour = self.start.shape == (1, 1, 1)
+        cells = self.spatial and options.cell_start and one_colour
+        gain = self.lamps.gain
+        if not cells:
+            raw = self._raw(self.start.resized(self._shape(self._level(0))))
+        else:
+            self.progress("colours of cells", 0.0)
+            raw = self._coloured(self._raw(self.start.resized(shape)), gain, 12, 0)
+        # maps that differ from cell to cell come from a row that has solved for all but the gains
+        solves = self.solves if one_colour or "gain" in self.solves else []
+        for k in range(_ALTERNATIONS if cells and solves else bool(solves)):
+            self._show(raw)
+            raw, gain = solved(
+                self.problem,
+                raw,
+                gain,
+                solves,
+                self.spread,
+                effort,
+                progress=lambda what, share, k=k: self.progress(  # type: ignore[misc]
+                    what, 0.25 * (k + share)
+                ),
+                seed=(self.seed << 4) + k,
+            )
+            if cells:
+                self._show(raw)
+                raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
+        return raw, gain
+
+    def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
+        effort, seed = self.options.effort, (self.seed << 4) + number
+        return self._raw(cell_colours(self.problem, raw, gain, effort, rounds=rounds, seed=seed))
+
+    def _show(self, raw: Raw) -> None:
+        self.snapshot(time.process_time() - self.worked, maps_of(raw))
 
     @cached_property
     def _fingerprint(self) -> str:
@@ -217,7 +259,7 @@ class _Fit:
     def _raw(self, maps: HairMaps) -> Raw:
         return self.problem.raw_of(maps, self.lamps)
 
-    def _step(self, state: State, gains: Gains) -> str | None:
+    def _step(self, state: State) -> str | None:
         """One step; why the fit must end, if it must."""
         options = self.options
         rng = np.random.default_rng([self.seed, state.step])
@@ -228,7 +270,7 @@ class _Fit:
             first = (self.seed << 20) + 2 * numbers
             slope = self.problem.slope(
                 state.raw,
-                self._gain(gains),
+                state.gain,
                 self.free,
                 batch,
                 options.effort,
@@ -242,8 +284,6 @@ class _Fit:
             if not all(np.isfinite(g).all() for g in slope.gradient.values()):
                 return f"step {state.step}: the gradient is not finite"
             self.pairs.learn(batch, slope.seen)
-            if self.solves_gains:
-                gains.learn(batch, slope.seen)
             for name, value in slope.gradient.items():
                 total[name] = total.get(name, 0.0) + value
         self._pull_to_priors(state.raw, total)
@@ -300,25 +340,34 @@ class _Fit:
         state.level_began = state.step
         state.average = _copied(state.raw)
 
-    def _gain(self, gains: Gains) -> Array:
-        return gains.value if self.solves_gains else self.lamps.gain
+    @cached_property
+    def _watched(self) -> Watched:
+        return self.problem.watched(
+            self._raw(self.start),
+            self.lamps.gain,
+            self.spread,
+            self.options.effort,
+            self.seed << 16,
+        )
 
     def _watch(self, raw: Raw, gain: Array, seed: int) -> float:
-        return self.problem.error(raw, gain, self.watched, self.options.effort, seed << 16)
+        return self.problem.error(raw, gain, self._watched, self.options.effort, seed << 16)
 
-    def _judged(self, state: State, gains: Gains, ended: str, seconds: float) -> Outcome:
+    def _judged(self, state: State, ended: str, seconds: float) -> Outcome:
         """The best of the result and of what it came from, by fresh random numbers."""
         effort = self.options.effort
         seed = (self.seed << 16) + (1 << 24)
-        start, found_gain = self._raw(self.start), self._gain(gains)
-        guesses = [
-            (state.average, found_gain, ended),
-            (state.first, self.lamps.gain, f"{ended}; kept the first maps, which are better"),
-            (start, found_gain, f"{ended}; kept all but the intensities, which is better"),
-            (start, self.lamps.gain, f"{ended}; kept the start, which is better"),
-        ]
+        start, found = self._raw(self.start), state.gain
+        guesses = [(state.average, found, ended)]
+        if state.step:
+            guesses.append((state.first, found, f"{ended}; kept the first maps, which are better"))
+        if (found != self.lamps.gain).any():
+            guesses.append(
+                (start, found, f"{ended}; kept all but the intensities, which is better")
+            )
+        guesses.append((start, self.lamps.gain, f"{ended}; kept the start, which is better"))
         errors = [
-            self.problem.error(raw, gain, self.watched, effort, seed) for raw, gain, _ in guesses
+            self.problem.error(raw, gain, self._watched, effort, seed) for raw, gain, _ in guesses
         ]
         best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
         raw, gain, how = guesses[best]
@@ -328,8 +377,8 @@ class _Fit:
                 self.start, self.lamps, how, errors[best], errors[best], state.step, self.series
             )
         profile = np.exp(raw["profile"])[self.problem.profile_of]
-        found = Lamps(raw["position"], raw["turn"], gain, profile)
-        return Outcome(maps_of(raw), found, how, errors[-1], errors[best], state.step, self.series)
+        lamps = Lamps(raw["position"], raw["turn"], gain, profile)
+        return Outcome(maps_of(raw), lamps, how, errors[-1], errors[best], state.step, self.series)
 
     def _unchanged(self, reason: str) -> Outcome:
         return Outcome(self.start, self.lamps, reason, 0.0, 0.0, 0)

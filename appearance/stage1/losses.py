@@ -21,6 +21,8 @@ from scipy.ndimage import correlate1d
 
 Array = NDArray[np.float64]
 FLOOR = 0.03
+LEAST_NOISE = 0.1
+"""Of the median pixel's: what a pixel's noise is held to be at least, known from few paths."""
 LEAST_ERROR = 0.02
 """Of the root of the squares: below it smoothness gets no more say."""
 
@@ -43,6 +45,24 @@ def weights(level: Array) -> Array:
     return 0.2 * (level + FLOOR) ** -1.17
 
 
+def quieted(weight: Array, squares: Array) -> Array:
+    """`weight (L, P, 3)`, less of it where pictures are noisy: one pixel in a hundred has two
+    fifths of all noise.
+
+    `squares` are those of differences of independent pictures. They are averaged over channels and
+    five pixels in image order; a pixel of the median noise keeps half of its weight, all together
+    keep theirs. The weights do not depend on what is judged, if the squares do not.
+    """
+    noise = correlate1d(squares.mean(axis=-1), np.full(5, 0.2), axis=1, mode="mirror")[..., None]
+    relative = weight * noise
+    counted = relative[weight > 0]
+    usual = float(np.median(counted)) if counted.size else 0.0
+    if not usual > 0:
+        return weight
+    out = weight / (1 + LEAST_NOISE + relative / usual)
+    return np.asarray(out * (weight.sum() / out.sum()))
+
+
 def slope(
     difference: Array, level: Array, valid: NDArray[np.bool_], kind: str, error: float
 ) -> Array:
@@ -57,13 +77,12 @@ def slope(
     return np.where(valid[..., None], out, 0.0) / used
 
 
-def squares(one: Array, other: Array, level: Array, valid: NDArray[np.bool_]) -> float:
+def squares(one: Array, other: Array, weight: Array, valid: NDArray[np.bool_]) -> float:
     """Weighted mean square of the differences `one` and `other`, of two independent renderings.
 
     Without their noise: may be slightly negative where the renderings agree with the captured.
     """
-    product = one * other * weights(level)
-    return float(product[valid].mean()) if valid.any() else 0.0
+    return float((one * other * weight)[valid].mean()) if valid.any() else 0.0
 
 
 def smoothness(values: dict[str, Any], lambda_sigma: float, lambda_r: float) -> Any:

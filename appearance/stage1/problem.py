@@ -22,6 +22,8 @@ from reconstruction.array_backend import for_kernels
 from reconstruction.lights import Light
 
 Array = NDArray[np.float64]
+Watched = Sequence[tuple[Batch, NDArray[np.int64], Array]]
+"""Pairs, the numbers of some of their pixels, and the share of its weight that each keeps."""
 
 
 @dataclass(frozen=True)
@@ -116,34 +118,56 @@ class Problem:
         gradient = {k: np.array(dr.grad(leaves[k]), float) for k in free}
         return Slope(gradient, seen)
 
-    def error(
+    def error(self, raw: Raw, gain: Array, watched: Watched, effort: Effort, seed: int) -> float:
+        """Weighted mean squared difference, noise taken off, with fixed random numbers."""
+        values = []
+        for batch, few, quiet in watched:
+            a, b = self._twice(raw, gain, batch, few, effort, seed)
+            values.append(
+                losses.squares(
+                    a.rendered - a.captured,
+                    b.rendered - b.captured,
+                    quiet * losses.weights(0.5 * (a.level + b.level)),
+                    a.valid,
+                )
+            )
+        return float(np.mean(values)) if values else 0.0
+
+    def watched(
+        self, raw: Raw, gain: Array, pairs: Sequence[Batch], effort: Effort, seed: int
+    ) -> Watched:
+        """What `error` looks at: some pixels of `pairs`, and how quiet they are about `raw`."""
+        out = []
+        for batch in pairs:
+            count = len(self.views[batch.view].pixels)
+            few = np.sort(np.random.default_rng(seed).permutation(count)[: effort.pixels])
+            a, b = self._twice(raw, gain, batch, few, effort, seed + (1 << 22))
+            weight = np.where(a.valid[..., None], losses.weights(0.5 * (a.level + b.level)), 0)
+            quiet = losses.quieted(weight, (a.rendered - b.rendered) ** 2)
+            share = np.divide(quiet, weight, out=np.zeros_like(weight), where=weight > 0)
+            out.append((batch, few, share))
+        return out
+
+    def _twice(
         self,
         raw: Raw,
         gain: Array,
-        pairs: Sequence[Batch],
+        batch: Batch,
+        few: NDArray[np.int64],
         effort: Effort,
         seed: int,
-    ) -> float:
-        """Weighted mean squared difference over `pairs`, noise taken off, with fixed numbers."""
-        total, count = 0.0, 0
-        for batch in pairs:
-            o = self.views[batch.view]
-            few = np.sort(np.random.default_rng(seed).permutation(len(o.pixels))[: effort.pixels])
-            one, other = (
-                self.render(raw, gain, batch, few, effort, seed + k) for k in (0, 1 << 20)
-            )
-            a, b = (self.seen(batch, few, x) for x in (one, other))
-            total += losses.squares(
-                a.rendered - a.captured, b.rendered - b.captured, a.level, a.valid
-            )
-            count += 1
-        return total / max(count, 1)
+    ) -> tuple[Seen, Seen]:
+        """Two independent pictures beside what was captured."""
+        one, other = (self.render(raw, gain, batch, few, effort, seed + k) for k in (0, 1 << 20))
+        return self.seen(batch, few, one), self.seen(batch, few, other)
 
     def seen(self, batch: Batch, few: NDArray[np.int64], rendered: Array) -> Seen:
         """`rendered (k, P, 3)` beside what was captured of a view's pixels number `few`."""
         o = self.views[batch.view]
         captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
         level = self._level[batch.view][batch.lights][:, few].astype(float)
+        # weights at the middle of both make squares those of displayed differences, large ones too
+        level = 0.5 * (level + losses.level(rendered))
         return Seen(rendered, captured, level, o.valid[batch.lights][:, few])
 
     def render(
@@ -175,8 +199,8 @@ class Problem:
         profile = np.exp(raw["profile"])[self.profile_of]
         return Lamps(raw["position"], raw["turn"], gain, profile).of(self.lights)
 
-    def watched(self, pairs: Pairs, views: int, images: int) -> list[Batch]:
-        """Views and lights for `error`, spread evenly over what is used."""
+    def spread(self, pairs: Pairs, views: int, images: int) -> list[Batch]:
+        """Some views and lights, spread evenly over what is used."""
         usable = np.flatnonzero(pairs.used.any(axis=1))
         out = []
         for view in usable[:: max(1, len(usable) // views)][:views]:

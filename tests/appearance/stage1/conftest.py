@@ -47,7 +47,7 @@ def exposure(views) -> float:
 
 @pytest.fixture(scope="session")
 def tufted(small):
-    """`mapped` strands, and `problem(truth=…, views=…, lights=…)` with frames of that truth.
+    """`mapped` strands, and `problem(truth=…, views=…, lights=…, spp=…)` with frames of that truth.
 
     `quick` is what a test can afford a step, `truth` the hair of `plain`.
     """
@@ -55,11 +55,11 @@ def tufted(small):
     scene = build_scene(strands, None, hair=TRUTH)
     mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, None))
 
-    def problem(truth=None, views=2, lights=None):
+    def problem(truth=None, views=2, lights=None, spp=128):
         maps = HairMaps.of(TRUTH) if truth is None else truth
         lamps = dome(8) if lights is None else lights
         shown = mapped.painted(maps)
-        seen = [observed(shown, c, lamps) for c in cameras(views)]
+        seen = [observed(shown, c, lamps, spp) for c in cameras(views)]
         return Problem(mapped, seen, exposure(seen), SKIN)
 
     return SimpleNamespace(

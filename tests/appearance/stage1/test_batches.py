@@ -7,7 +7,6 @@ import pytest
 
 from appearance.observations import Observed
 from appearance.stage1.batches import Batch, Pairs, Seen
-from appearance.stage1.gains import PRIOR, Gains
 from reconstruction.cameras import Camera
 from reconstruction.lights import Light
 
@@ -66,21 +65,3 @@ def test_pairs_with_larger_errors_are_drawn_more_often_and_noise_counts_for_noth
     even = Pairs([view([1] * 4)], scale=1.0, weighted=False)
     even.taught = pairs.taught
     np.testing.assert_allclose(even.chance(), 0.25)
-
-
-def test_gains_are_unbiased_by_noise_and_stay_near_the_calibration_without_data():
-    rng = np.random.default_rng(3)
-    true = np.array([1.05, 0.96, 1.0, 0.99, 1.0])
-    gains = Gains(np.zeros((3, 5)))
-    captured = rng.uniform(0.1, 1, (4, PIXELS, 3))
-    valid = np.ones((4, PIXELS), bool)
-    for _ in range(60):
-        noise = rng.gamma(4, 1 / 4, captured.shape)  # mean 1
-        now = gains.value[:4] / true[:4]
-        rendered = captured * noise * now[:, None, None]
-        seen = Seen(rendered, captured, captured, valid)
-        gains.learn(Batch(0, np.arange(4), np.ones(4)), seen)
-    expected = true[:4] / np.exp(np.log(true[:4]).mean())
-    np.testing.assert_allclose(gains.value[:4], expected, atol=0.015)
-    assert gains.value[4] == 1.0
-    assert abs(np.log(gains.value)).max() < 3 * PRIOR

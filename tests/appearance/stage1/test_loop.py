@@ -16,7 +16,8 @@ START = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.35))
 
 @pytest.fixture
 def original(tufted):
-    return Stage1Options(row="original", steps=50, effort=tufted.quick)
+    """By steps alone, as rows with more to find end."""
+    return Stage1Options(row="original", steps=50, effort=tufted.quick, gauss_newton=False)
 
 
 def far(maps: HairMaps, truth: HairAppearance) -> float:
@@ -32,6 +33,27 @@ def test_one_colour_and_roughness_are_found_from_pictures(plain, tufted, origina
     assert far(found.maps, tufted.truth) < 0.4 < far(START, tufted.truth)
     assert "error" in told[0]
     assert [step for _, step, _ in found.history][:3] == [0, 10, 20]
+
+
+def test_without_steps_too_and_the_tilt_with_them(plain, tufted, original):
+    told = []
+    options = replace(original, gauss_newton=True, tilt=True)
+    found = run(plain, START, options=options, progress=lambda what, share: told.append(share))
+    assert (found.ended, found.steps) == ("converged", 0)
+    assert found.error < 0.5 * found.start_error
+    assert far(found.maps, tufted.truth) < 0.4
+    assert abs(found.maps.tilt_deg - tufted.truth.tilt_deg) < 3
+    assert told == sorted(told)
+
+
+def test_a_volume_is_coloured_before_its_correctives_take_steps(plain, tufted, original):
+    options = replace(original, gauss_newton=True, row="correctives", shape=(2, 2, 2), steps=4)
+    seen = []
+    found = run(plain, START, options=options, snapshot=lambda seconds, maps: seen.append(maps))
+    assert found.steps == 4
+    assert found.error < 0.5 * found.start_error
+    assert all(maps.shape == (2, 2, 2) for maps in seen)
+    assert (seen[-1].rotation == 0).all()
 
 
 def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_path):

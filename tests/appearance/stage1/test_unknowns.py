@@ -85,7 +85,9 @@ def test_squares_have_no_noise_of_two_renderings_in_them_and_l1_has_a_sign():
     valid = np.ones((2, 4000), bool)
     one, other = (0.1 + rng.normal(scale=0.2, size=level.shape) for _ in range(2))
     expected = 0.01 * float(losses.weights(level)[0, 0, 0])
-    assert losses.squares(one, other, level, valid) == pytest.approx(expected, rel=0.2)
+    assert losses.squares(one, other, losses.weights(level), valid) == pytest.approx(
+        expected, rel=0.2
+    )
     valid[1] = False
     slope = losses.slope(one, level, valid, "l1", 1.0)
     assert set(np.unique(slope * valid.sum() * 3)) <= {-1.0, 0.0, 1.0}
@@ -98,7 +100,7 @@ def test_the_loss_is_of_differences_as_they_are_displayed_and_proportional_to_th
     valid = np.ones((1, 1), bool)
     step = 0.01 * level
     shown = srgb(level + step) - srgb(level)
-    squares = losses.squares(step, step, level, valid)
+    squares = losses.squares(step, step, losses.weights(level), valid)
     assert squares == pytest.approx((shown**2).mean(), rel=0.4)
     once, twice = (
         losses.slope(k * step, level, valid, "squares", k * k * 0.01) for k in (1.0, 2.0)
@@ -139,3 +141,17 @@ def test_maps_are_saved_with_the_strands_places_and_bad_ones_refused(tmp_path):
         HairMaps(np.ones((2, 2, 3)), np.zeros((1, 1, 1, 2)), 0.3, 0.3)
     with pytest.raises(ValueError, match="negative"):
         HairMaps(-np.ones((1, 1, 1, 3)), np.zeros((1, 1, 1, 2)), 0.3, 0.3)
+
+
+def test_noisy_pixels_count_less_and_all_together_as_much():
+    rng = np.random.default_rng(2)
+    weight = np.ones((1, 500, 3))
+    weight[:, 400:] = 0  # not valid
+    squares = rng.exponential(size=weight.shape)
+    squares[:, 100:110] *= 1e4
+    quiet = losses.quieted(weight, squares)
+    assert quiet.sum() == pytest.approx(weight.sum())
+    assert quiet[:, 102:108].max() < 0.01 * np.median(quiet[:, :400])
+    assert (quiet[:, 400:] == 0).all()
+    for nothing in (np.zeros_like(weight), weight):
+        assert (losses.quieted(nothing, np.zeros_like(weight)) == nothing).all()
