@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from appearance.fit import FitOptions
 from appearance.hair_maps import HairMaps, MappedStrands
-from appearance.metrics import LPIPS_UNAVAILABLE, psnr, ssim
+from appearance.metrics import mean_scores, scores, scores_unavailable
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.stage1.loop import ROWS, Stage1Options, run
@@ -142,7 +142,7 @@ class Table:
         of differences between independent halves.
         """
         captured, exposure = self.captured, self.captured.exposure
-        groups: dict[str, list[tuple[float, float, float]]] = {n: [] for n in GROUPS}
+        groups: dict[str, list[dict[str, float]]] = {n: [] for n in GROUPS}
         for (one, other), (k, i) in zip(pictures, self._truth(), strict=True):
             o, (true_one, true_other) = captured.views[k], captured.halves[k]
             size = (o.camera.height, o.camera.width)
@@ -156,15 +156,12 @@ class Table:
                 exposure(other) - exposure(true_other[i])
             )
             group = GROUPS[int(k in captured.held_views)]
-            groups[group].append((psnr(shown, true, mask), ssim(shown, true, mask), clean.mean()))
-        figures: dict[str, Any] = {"lpips": LPIPS_UNAVAILABLE}
+            groups[group].append({**scores(shown, true, mask), "clean": float(clean.mean())})
+        figures: dict[str, Any] = scores_unavailable()
         for group, values in groups.items():
-            mean = np.mean(values, axis=0)
-            figures[group] = {
-                "psnr": float(mean[0]),
-                "ssim": float(mean[1]),
-                "psnr_clean": float(-10 * np.log10(max(mean[2], 1e-5))),
-            }
+            mean = mean_scores(values)
+            mean["psnr_clean"] = float(-10 * np.log10(max(mean.pop("clean"), 1e-5)))
+            figures[group] = mean
         self.rows[row] = figures
 
     def _nearest(self, o: Observed, frames: NDArray[np.float32], light: int) -> Array:

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from appearance.fitted import FittedAppearance
 from appearance.hair_appearance import DiffuseHair
-from appearance.metrics import LPIPS_UNAVAILABLE, psnr, relative_error, ssim
+from appearance.metrics import (
+    mean_scores,
+    psnr,
+    relative_error,
+    scores,
+    scores_unavailable,
+    ssim,
+)
 from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
 from appearance.pictures import comparison_picture
 from appearance.relight import relight_model
@@ -67,12 +74,13 @@ def assess(
     """Compare a fitted model with the frames it was not fitted to.
 
     Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}}, "held_out_camera":
-    …, "lpips": None, …}` with the methods "ours", "mean_colour" (one colour: the mean over training
-    frames and hair pixels), "diffuse" (Lambertian fibres on our strands whose albedo reproduces
-    that mean) and "three_nearest" (the camera's own captured frames under the three nearest other
-    training lights, interpolated: a control that needs the camera's frames, also where that camera
-    is held out). Means over images, each over the captured hair mask. A group with nothing held
-    out is left out.
+    …}` with the methods "ours", "mean_colour" (one colour: the mean over training frames and hair
+    pixels), "diffuse" (Lambertian fibres on our strands whose albedo reproduces that mean) and
+    "three_nearest" (the camera's own captured frames under the three nearest other training
+    lights, interpolated: a control that needs the camera's frames, also where that camera is held
+    out). Means over images, each over the captured hair mask. A group with nothing held out is left
+    out. "lpips" is a score like the others where its weights are given (`appearance.lpips`), and a
+    reason beside the groups where not.
 
     Writes `comparison.png`, `relit.png` and `relit.exr` (see `relight_model` for `environment`)
     into the folder `model`, and the stage "images" into its report.
@@ -104,7 +112,7 @@ def assess(
             for group, images in groups.items()
         }
         judge(result, stage)
-        stage.figures |= {**result, "diffuse_albedo": list(albedo), "lpips": LPIPS_UNAVAILABLE}
+        stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
         progress("relighting", 0.8)
         comparison_picture(model / "comparison.png", _rows(groups, fitted), COLUMNS)
         relight_model(
@@ -117,7 +125,7 @@ def assess(
         )
     report.save(model / "report.json")
     progress("images compared", 1.0)
-    return {**result, "lpips": None}
+    return {**result, **scores_unavailable()}
 
 
 def _training(
@@ -221,15 +229,14 @@ def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut
 
 
 def _scores(images: Sequence[_Compared], method: str, fitted: FittedAppearance) -> dict[str, float]:
-    """Means over `images` of a method's PSNR, SSIM and linear relative error on the hair."""
-    values: dict[str, list[float]] = {"psnr": [], "ssim": [], "relative_error": []}
+    """Means over `images` of a method's `metrics.scores` and relative error on the hair."""
+    found = []
     for image in images:
         radiance, truth = image.frames[method], image.frames["captured"]
         shown, true = fitted.exposure(radiance), fitted.exposure(truth)
-        values["psnr"].append(psnr(shown, true, image.mask))
-        values["ssim"].append(ssim(shown, true, image.mask))
-        values["relative_error"].append(relative_error(radiance, truth, image.mask))
-    return {name: float(np.mean(v)) for name, v in values.items()}
+        relative = relative_error(radiance, truth, image.mask)
+        found.append({**scores(shown, true, image.mask), "relative_error": relative})
+    return mean_scores(found)
 
 
 def judge(result: dict[str, Any], stage: Stage) -> None:
@@ -253,13 +260,13 @@ def _rows(
         picked += [c for c in ranked if c.camera != picked[0].camera][:1] or ranked[1:2]
         for c in picked:
             shown: dict[str, Array] = {k: fitted.exposure(v) for k, v in c.frames.items()}
-            scores = {
+            captions = {
                 k: f"{psnr(v, shown['captured'], c.mask):.1f} dB  "
                 f"{ssim(v, shown['captured'], c.mask):.2f}"
                 for k, v in shown.items()
                 if k != "captured"
             }
-            rows.append((f"{group.replace('_', ' ')}\n{c.camera}, {c.light}", shown, scores))
+            rows.append((f"{group.replace('_', ' ')}\n{c.camera}, {c.light}", shown, captions))
     return rows
 
 

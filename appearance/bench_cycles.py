@@ -36,9 +36,7 @@ HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = Stage1Options(
     row="original",
-    steps=40,
-    check_every=20,
-    watched_views=2,
+    watched_views=6,
     effort=Effort(pixels=300, spp=384, gradient_spp=48, max_depth=12),
 )
 AFAR = HairAppearance((0.13, 0.15, 0.35), 0.42, 0.2)

@@ -1,23 +1,25 @@
 """How well a rendered picture agrees with a captured one, on the hair alone.
 
 Radiance becomes a picture by one exposure for the whole capture (`Exposure`) and the sRGB curve.
-PSNR and SSIM compare such pictures; the relative error compares radiance. LPIPS needs network
-weights that are not part of this project and is reported as unavailable.
+PSNR and SSIM compare such pictures, and LPIPS where the user supplies its weights; the relative
+error compares radiance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import correlate1d
 
+from appearance import lpips
+
 Image = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-LPIPS_UNAVAILABLE = "LPIPS needs network weights that were not given"
 _WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 _WINDOW /= _WINDOW.sum()
 
@@ -49,6 +51,24 @@ class Exposure:
     def __call__(self, radiance: ArrayLike) -> NDArray[np.float64]:
         """Picture values in [0, 1] of `radiance`, any shape."""
         return srgb(np.asarray(radiance, float) * self.scale)
+
+
+def scores(image: Image, truth: Image, mask: Mask | None = None) -> dict[str, float]:
+    """ "psnr" and "ssim" of pictures `(H, W, 3)`, and "lpips" where its weights are given."""
+    image, truth, mask = _checked(image, truth, mask)
+    out = {"psnr": psnr(image, truth, mask), "ssim": ssim(image, truth, mask)}
+    distance = lpips.lpips(image, truth, mask)
+    return out if distance is None else {**out, "lpips": distance}
+
+
+def mean_scores(images: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The mean over images of each score; there must be an image."""
+    return {name: float(np.mean([one[name] for one in images])) for name in images[0]}
+
+
+def scores_unavailable() -> dict[str, str]:
+    """Names of scores that cannot be had here, with the reason."""
+    return {} if os.environ.get(lpips.VARIABLE) else {"lpips": lpips.UNAVAILABLE}
 
 
 def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance.metrics import Exposure, psnr, relative_error, ssim
+from appearance.metrics import Exposure, mean_scores, relative_error, scores
 from appearance.observations import HeldOut, Observed, model_mask, observe
 from appearance.pictures import Row, comparison_picture
 from appearance.render.olat import render_olat
@@ -48,11 +48,11 @@ def judge(
     max_depth: int,
     seed: int = 0,
 ) -> dict[str, dict[str, float]]:
-    """Mean "psnr", "ssim" and "relative_error" of each of `scenes` over lit `frames`; {} of none.
+    """Mean `metrics.scores` and "relative_error" of each of `scenes` over lit `frames`; {} of none.
 
     Writes a PNG: each frame as captured, as each scene renders it, and the last one's error map.
     """
-    scores: dict[str, list[tuple[float, float, float]]] = {name: [] for name in scenes}
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in scenes}
     rows: list[Row] = []
     for k, o in enumerate(frames):
         rendered = {
@@ -78,21 +78,16 @@ def judge(
             for name, values in rendered.items():
                 image = _image(values[i], mask)
                 shown[name] = exposure(image)
-                score = psnr(shown[name], wanted, mask), ssim(shown[name], wanted, mask)
-                captions[name] = f"{score[0]:.1f} dB"
-                scores[name].append((*score, relative_error(image, true, mask)))
+                score = scores(shown[name], wanted, mask)
+                captions[name] = f"{score['psnr']:.1f} dB"
+                found[name].append({**score, "relative_error": relative_error(image, true, mask)})
             shown["error"] = MAGNIFIED * np.abs(shown[name] - wanted)
             captions["error"] = f"of {name}, x {MAGNIFIED:g}"
             rows.append((f"{o.camera.name}, {light.name}", shown, captions))
     if not rows:
         return {}
     comparison_picture(picture, rows, ["captured", *scenes, "error"])
-    return {
-        name: dict(
-            zip(("psnr", "ssim", "relative_error"), map(float, np.mean(v, axis=0)), strict=True)
-        )
-        for name, v in scores.items()
-    }
+    return {name: mean_scores(images) for name, images in found.items()}
 
 
 def _image(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> Array:

@@ -357,7 +357,7 @@ class _Fit:
         """The best of the result and of what it came from, by fresh random numbers."""
         effort = self.options.effort
         seed = (self.seed << 16) + (1 << 24)
-        start, found = self._raw(self.start), state.gain
+        start, found = self._raw(self.start.resized(state.first["sigma_a"].shape[:3])), state.gain
         guesses = [(state.average, found, ended)]
         if state.step:
             guesses.append((state.first, found, f"{ended}; kept the first maps, which are better"))
@@ -373,8 +373,10 @@ class _Fit:
         raw, gain, how = guesses[best]
         self.series.append((seconds, state.step, errors[best]))
         if best == len(errors) - 1:
+            # in cells, though all alike: the next row need not tell them apart again
+            maps = self.start.resized(raw["sigma_a"].shape[:3])
             return Outcome(
-                self.start, self.lamps, how, errors[best], errors[best], state.step, self.series
+                maps, self.lamps, how, errors[best], errors[best], state.step, self.series
             )
         profile = np.exp(raw["profile"])[self.problem.profile_of]
         lamps = Lamps(raw["position"], raw["turn"], gain, profile)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from appearance.fitted import FittedAppearance
 from appearance.hair_maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.metrics import LPIPS_UNAVAILABLE
+from appearance.metrics import scores_unavailable
 from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
 from appearance.render.bounces import bounce_limit
 from appearance.scene import build_scene
@@ -33,13 +33,12 @@ MAPS, LAMPS, PICTURE = "hair_maps.npz", "lamps.json", "stage1.png"
 class Stage1Request:
     """What a job may ask for.
 
-    `hair_pixels` a camera are fitted; `first_steps` fit one colour before the volume. `fit` are
-    fields of `Stage1Options`, of which `effort` holds fields of `Effort`. Held-out images are
+    `hair_pixels` a camera are fitted, one colour before the volume. `fit` are fields of
+    `Stage1Options`, of which `effort` holds fields of `Effort`. Held-out images are
     judged on at most `judged_images`, with `judged_spp` paths a pixel.
     """
 
     hair_pixels: int = 4000
-    first_steps: int = 40
     judged_images: int = 6
     judged_spp: int = 48
     fit: dict[str, Any] = field(default_factory=dict)
@@ -85,7 +84,7 @@ def fit_stage1(
         options = request.options(min(depth, 16))
         problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
         start = HairMaps.of(fitted.hair)
-        first = replace(options, row="original", steps=request.first_steps)
+        first = replace(options, row="original")
         outcome = _run(problem, start, None, first, model, _part(progress, 0.05, 0.3), seed, stage)
         outcome = _run(
             problem,
@@ -120,7 +119,7 @@ def fit_stage1(
                 max_depth=options.effort.max_depth,
                 seed=seed,
             )
-            result["lpips"] = LPIPS_UNAVAILABLE
+            result |= scores_unavailable()
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     report.save(model / "report.json")
     for row in ("original", options.row):

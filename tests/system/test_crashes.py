@@ -78,7 +78,7 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
     model = Path(stage.get(f"/jobs/{made['job']}")["model"]).name
     stage.until(lambda: stage.get(f"/jobs/{made['job']}")["state"] == "done", 200)
     effort = {"pixels": 60, "spp": 4, "gradient_spp": 2, "max_depth": 4}
-    fit = {"row": "spatial", "shape": [2, 2, 2], "steps": 200, "check_every": 5, "halvings": 99}
+    fit = {"row": "correctives", "shape": [2, 2, 2], "steps": 200, "check_every": 5, "halvings": 99}
     asked = {
         "capture": made["id"],
         "model": model,
@@ -86,7 +86,7 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
             "name": "appearance",
             "options": {
                 "fit": {"iterations": 2},
-                "stage1": {"first_steps": 5, "judged_spp": 4, "fit": fit | {"effort": effort}},
+                "stage1": {"judged_spp": 4, "fit": fit | {"effort": effort}},
             },
         },
     }

@@ -53,7 +53,8 @@ def test_a_volume_is_coloured_before_its_correctives_take_steps(plain, tufted, o
     assert found.steps == 4
     assert found.error < 0.5 * found.start_error
     assert all(maps.shape == (2, 2, 2) for maps in seen)
-    assert (seen[-1].rotation == 0).all()
+    assert (seen[0].rotation == 0).all()
+    assert (seen[-1].rotation != 0).any()
 
 
 def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_path):
