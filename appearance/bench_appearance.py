@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -31,6 +32,13 @@ QUICK = Stage1Options(
     effort=Effort(pixels=400, spp=512, gradient_spp=64, max_depth=8),
 )
 STAGE = Rig(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
+STARTS = (
+    (0.4, 0.2, 1.45, (0.75, 1.25, 1.3)),
+    (0.9, 0.9, 1.55, (1.0, 1.0, 1.0)),
+    (0.02, 0.3, 1.55, (1.0, 1.0, 1.0)),
+    (0.15, 0.6, 1.55, (8.0, 4.0, 2.0)),
+)
+"""beta_m, beta_n and eta to start from, and factors on the true absorption."""
 PLAIN = Effort(spp=16, gradient_spp=16)
 """Paths of the plain version: as many for the picture as for its gradient."""
 
@@ -50,7 +58,7 @@ def run_bench(
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """The table of every subject; recovery on (a); error against run time on (b).
+    """The table of every subject; recovery, also from afar, on (a); error against time on (b).
 
     The rows up to "spatial" of (b) for all `seeds`. Writes `appearance.json` and `appearance.md`
     into `out`, as far as it is, and returns the former.
@@ -68,6 +76,7 @@ def run_bench(
         _write(out, result)
         if name == "a":
             result["recovery"] = recovery(captured, rows, options, named(progress, name), seed)
+            result["starts"] = from_afar(captured, options, named(progress, name), seed)
         if name == "b":
             result["seeds"] = [
                 _final(Table(captured, options, seed=seed + k).run(("original", "spatial")))
@@ -134,6 +143,35 @@ def recovery(
     known = np.array([off[i].intensity[0] for i in captured.train_lights])
     out[name]["original"]["lamps_off"] = _relative_spread(known / true)
     out[name]["lights"]["lamps_off"] = _relative_spread(known * table.found[1].gain / true)
+    return out
+
+
+def from_afar(
+    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+) -> list[dict[str, Any]]:
+    """What the row "original" finds of one colour from `STARTS`, and in how many CPU seconds."""
+    true, out = captured.truth.mean(), []
+    problem = Problem(captured.mapped, captured.training(), captured.exposure.scale, captured.skin)
+    for beta_m, beta_n, eta, (r, g, b) in STARTS:
+        sigma_a = (r * true.sigma_a[0], g * true.sigma_a[1], b * true.sigma_a[2])
+        start = replace(true, sigma_a=sigma_a, beta_m=beta_m, beta_n=beta_n, eta=eta)
+        progress(f"from β_M {beta_m:g}, β_N {beta_n:g}", 0.0)
+        begun = time.process_time()
+        found = run(
+            problem, HairMaps.of(start), options=replace(options, row="original"), seed=seed
+        )
+        hair = found.maps.mean()
+        out.append(
+            {
+                "start": start.to_dict(),
+                "ended": found.ended,
+                "beta_m_error": hair.beta_m / true.beta_m - 1,
+                "beta_n_error": hair.beta_n / true.beta_n - 1,
+                "eta": hair.eta,
+                "sigma_a_error": (np.array(hair.sigma_a) / true.sigma_a - 1).tolist(),
+                "cpu_seconds": time.process_time() - begun,
+            }
+        )
     return out
 
 
@@ -255,6 +293,14 @@ def markdown(result: dict[str, Any]) -> str:
                 f"β_N {100 * found['beta_n_error']:+.1f} %, "
                 f"σ {100 * found['sigma_a_error']:.1f} %{lamps}"
             )
+    for row in result.get("starts", []):
+        start = row["start"]
+        sigma_a = ", ".join(f"{100 * e:+.1f}" for e in row["sigma_a_error"])
+        lines.append(
+            f"- from β_M {start['beta_m']:g}, β_N {start['beta_n']:g}, η {start['eta']:g}: "
+            f"β_M {100 * row['beta_m_error']:+.1f} %, β_N {100 * row['beta_n_error']:+.1f} %, "
+            f"η {row['eta']:.3f}, σ {sigma_a} %, {row['cpu_seconds']:.0f} CPU s"
+        )
     for name, curve in result.get("time", {}).items():
         points = ", ".join(f"{p['cpu_seconds']:.0f} s: {p['psnr_clean']:.2f}" for p in curve)
         lines.append(f"- {name}: {points}")

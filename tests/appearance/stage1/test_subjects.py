@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appearance.ablation_table import GROUPS, Table
-from appearance.bench_appearance import markdown, recovery
+from appearance.bench_appearance import from_afar, markdown, recovery
 from appearance.hair_appearance import HairAppearance
 from appearance.hair_maps import scalp_coordinates
 from appearance.stage1.loop import Stage1Options
@@ -79,6 +79,10 @@ def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
     assert off["original"]["lamps_off"] == pytest.approx(0.03, abs=0.02)
     assert off["lights"]["lamps_off"] < 1.5 * off["original"]["lamps_off"]
     assert as_is["original"] != noisy["original"]
-    text = markdown({"subjects": {}, "recovery": found})
+    starts = from_afar(captured, QUICK)
+    assert [x["start"]["beta_m"] for x in starts] == [0.4, 0.9, 0.02, 0.15]
+    assert all(abs(x["beta_m_error"]) <= abs(x["start"]["beta_m"] / 0.28 - 1) for x in starts)
+    text = markdown({"subjects": {}, "recovery": found, "starts": starts})
+    assert text.count("CPU s") == 4
     assert text.count("dB") == 8
     assert text.count("lamps") == 5
