@@ -56,7 +56,7 @@ def fit_cycles(
     afar: bool = False,
     options: Stage1Options = OPTIONS,
     pixels: int = 600,
-    judged_spp: int = 64,
+    judged_spp: int = 512,
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:

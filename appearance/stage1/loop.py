@@ -49,7 +49,7 @@ PRIOR_WEIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Stage1Options:
-    """How a fit is run; the defaults are ours, the plain version has `plain()`.
+    """How a fit is run.
 
     `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
     reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. With
@@ -164,40 +164,45 @@ class _Fit:
         self.snapshot: Callable[[float, HairMaps], None] = lambda seconds, maps: None
 
     def run(self) -> Outcome:
-        begun = time.perf_counter()
-        self.worked = time.process_time()
+        self.begun, self.worked = time.perf_counter(), time.process_time()
         if not self.pairs.used.any():
             return self._unchanged("no pair of camera and light shows lit hair")
         state = self._begun()
         self.pairs.taught = state.tables["taught"]
         ended = "all steps taken" if self.free else "converged"
-        self.series = [(s, int(k), e) for s, k, e in state.history]
-        spent = self.series[-1][0] if self.series else 0.0
         while self.free and state.step < self.options.steps:
             if state.step % self.options.check_every == 0:
-                self._show(state.average)
-                paused = time.process_time()
                 state.history = [list(p) for p in self.series]
                 state.save(self.checkpoint, self._fingerprint)
-                error = self._watch(state.average, state.gain, self.seed)
-                self.series.append((spent + time.perf_counter() - begun, state.step, error))
                 share = 0.5 + 0.5 * state.step / self.options.steps
-                self.progress(f"step {state.step}: error {max(error, 0.0) ** 0.5:.4f}", share)
+                what = f"step {state.step}"
+                error = self._tell(state.average, state.gain, what, share, state.step)
                 if state.convergence.tell(error) and self._level(state.step) == self._last_level:
                     ended = "converged"
                     break
-                self.worked += time.process_time() - paused
             reason = self._step(state)
             if reason:
                 ended = reason
                 break
-        self._show(state.average)
-        return self._judged(state, ended, spent + time.perf_counter() - begun)
+        self.snapshot(time.process_time() - self.worked, maps_of(state.average))
+        return self._judged(state, ended)
+
+    def _tell(self, raw: Raw, gain: Array, what: str, share: float, step: int = 0) -> float:
+        """Watch the error, tell it and note when it was; CPU time for that does not count."""
+        self.snapshot(time.process_time() - self.worked, maps_of(raw))
+        paused = time.process_time()
+        error = self._watch(raw, gain, self.seed)
+        self.series.append((time.perf_counter() - self.begun, step, error))
+        self.progress(f"{what}: error {max(error, 0.0) ** 0.5:.4f}", share)
+        self.worked += time.process_time() - paused
+        return error
 
     def _begun(self) -> State:
-        saved = State.load(self.checkpoint, self._fingerprint)
-        if saved is not None:
-            return saved
+        state = State.load(self.checkpoint, self._fingerprint)
+        if state is not None:
+            self.series = [(s, int(k), e) for s, k, e in state.history]
+            self.begun -= self.series[-1][0] if self.series else 0.0
+            return state
         raw, gain = self._first()
         state = State(raw, _copied(raw), _copied(raw))
         state.tables = {"taught": self.pairs.taught, "gain": gain}
@@ -206,42 +211,40 @@ class _Fit:
 
     def _first(self) -> tuple[Raw, Array]:
         """What pictures tell without a gradient: cells, shared numbers, and each again."""
-        options, effort, shape = self.options, self.options.effort, self._shape(self._last_level)
         one_colour = self.start.shape == (1, 1, 1)
-        cells = self.spatial and options.cell_start and one_colour
-        gain = self.lamps.gain
-        if not cells:
-            raw = self._raw(self.start.resized(self._shape(self._level(0))))
-        else:
-            self.progress("colours of cells", 0.0)
-            raw = self._coloured(self._raw(self.start.resized(shape)), gain, 12, 0)
+        cells = self.spatial and self.options.cell_start and one_colour
         # maps that differ from cell to cell come from a row that has solved for all but the gains
         solves = self.solves if one_colour or "gain" in self.solves else []
-        for k in range(_ALTERNATIONS if cells and solves else bool(solves)):
-            self._show(raw)
+        gain = self.lamps.gain
+        raw = self._raw(self.start.resized(self._shape(self._level(0))))
+        if cells or solves:
+            self._tell(raw, gain, "start", 0.0)
+        if cells:
+            raw = self._coloured(raw, gain, 12, 0)
+        rounds = (_ALTERNATIONS if cells else 1) if solves else 0
+        for k in range(rounds):
+            if cells:
+                self._tell(raw, gain, "cells", 0.5 * k / rounds)
             raw, gain = solved(
                 self.problem,
                 raw,
                 gain,
                 solves,
                 self.spread,
-                effort,
+                self.options.effort,
                 progress=lambda what, share, k=k: self.progress(  # type: ignore[misc]
-                    what, 0.25 * (k + share)
+                    what, 0.5 * (k + share) / rounds
                 ),
                 seed=(self.seed << 4) + k,
             )
+            self._tell(raw, gain, "shared numbers", 0.5 * (k + 1) / rounds)
             if cells:
-                self._show(raw)
                 raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
         return raw, gain
 
     def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
         effort, seed = self.options.effort, (self.seed << 4) + number
         return self._raw(cell_colours(self.problem, raw, gain, effort, rounds=rounds, seed=seed))
-
-    def _show(self, raw: Raw) -> None:
-        self.snapshot(time.process_time() - self.worked, maps_of(raw))
 
     @cached_property
     def _fingerprint(self) -> str:
@@ -353,7 +356,7 @@ class _Fit:
     def _watch(self, raw: Raw, gain: Array, seed: int) -> float:
         return self.problem.error(raw, gain, self._watched, self.options.effort, seed << 16)
 
-    def _judged(self, state: State, ended: str, seconds: float) -> Outcome:
+    def _judged(self, state: State, ended: str) -> Outcome:
         """The best of the result and of what it came from, by fresh random numbers."""
         effort = self.options.effort
         seed = (self.seed << 16) + (1 << 24)
@@ -371,7 +374,7 @@ class _Fit:
         ]
         best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
         raw, gain, how = guesses[best]
-        self.series.append((seconds, state.step, errors[best]))
+        self.series.append((time.perf_counter() - self.begun, state.step, errors[best]))
         if best == len(errors) - 1:
             # in cells, though all alike: the next row need not tell them apart again
             maps = self.start.resized(raw["sigma_a"].shape[:3])
