@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture, CaptureError
-from reconstruction.lights import Light
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 
 Mask = NDArray[np.bool_]
 

@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture, CaptureError
-from reconstruction.hair_features import (
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.images.hair_features import (
     FAINTEST_LINES,
     light_contrast,
     line_strength,
     otsu,
     tell_apart,
 )
+from reconstruction.images.segmentation import Network
+from reconstruction.images.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
 from reconstruction.light_planes.point_cloud import PointCloud
-from reconstruction.mesh import Mesh
-from reconstruction.report import Stage
-from reconstruction.segmentation import Network
-from reconstruction.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
+from reconstruction.report.report import Stage
 
 Mask = NDArray[np.bool_]
 Source = Literal["user", "network", "geometry", "light and lines", "lines", "silhouette"]

@@ -12,11 +12,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.capture import Capture, CaptureError
-from reconstruction.field import FieldOptions, OrientationField, solve_field
-from reconstruction.fitted_head import FittedHead, digitised_points, lay_head, skin_points
-from reconstruction.growth import Coverage, fill_gaps, grow_from_roots
-from reconstruction.hair_envelope import build_envelope
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.undistorted import as_shot, straightened
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
+from reconstruction.growth.from_roots import Coverage, fill_gaps, grow_from_roots
+from reconstruction.growth.hair_envelope import build_envelope
+from reconstruction.growth.rooting import root_all
+from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
+from reconstruction.head.fitted import FittedHead, digitised_points, lay_head, skin_points
+from reconstruction.head.root_map import save_root_map
+from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
+from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.line_strands import both, line_strands
 from reconstruction.light_codes.options import LightCodeOptions
 from reconstruction.light_planes import (
@@ -28,20 +39,9 @@ from reconstruction.light_planes import (
     triangulate,
 )
 from reconstruction.masks import HairMask, hair_masks, usable_masks
-from reconstruction.measure import Measured, MeasureOptions, measure_tangents
-from reconstruction.mesh import Mesh
 from reconstruction.methods import METHODS, Method
-from reconstruction.report import Progress, Report, Stage, silent
-from reconstruction.rig import Rig
-from reconstruction.root_map import save_root_map
-from reconstruction.rooting import root_all
-from reconstruction.scalp import Scalp, find_scalp, sample_roots
-from reconstruction.segmentation import Network
-from reconstruction.straightened import as_shot, straightened
-from reconstruction.strand_files import write_strands
-from reconstruction.strands import Strands
-from reconstruction.surface_strands import SurfaceOptions, surface_strands
-from reconstruction.visual_hull import VoxelGrid
+from reconstruction.report.report import Progress, Report, Stage, silent
+from reconstruction.tangents.estimate import Measured, MeasureOptions, measure_tangents
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -13,18 +13,18 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
-from reconstruction.rig import RigError
-from simulators.drift import Drift
-from simulators.faults import Faults
-from simulators.frames import FrameMaker, cache_key
-from simulators.lamps import Lamps
-from simulators.props import Prop, PropResponder, named_prop
-from simulators.render_process import RenderPool
-from simulators.responses import Quality, Responder, reproducible
-from simulators.sensor import Sensor
-from simulators.stage import SimulatedStage
-from simulators.subject import Subject, check_fits, load_subject
-from simulators.truth import EXPOSURES, write_truth
+from reconstruction.geometry.rig import RigError
+from simulators.frames.frames import FrameMaker, cache_key
+from simulators.frames.render_process import RenderPool
+from simulators.frames.responses import Quality, Responder, reproducible
+from simulators.frames.sensor import Sensor
+from simulators.peers.devices import SimulatedStage
+from simulators.peers.faults import Faults
+from simulators.peers.lamps import Lamps
+from simulators.subject.drift import Drift
+from simulators.subject.props import Prop, PropResponder, named_prop
+from simulators.subject.subject import Subject, check_fits, load_subject
+from simulators.subject.truth import EXPOSURES, write_truth
 from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
 from stage_service.signals import taken
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--head", type=Path, help="OBJ of the head under the strand file's hair")
     parser.add_argument("--state", type=Path, help="folder for devices.toml and the serial ports")
     parser.add_argument("--seed", type=int, default=0, help="subject, drift and noise (default: 0)")
-    parser.add_argument("--faults", type=Path, help="JSON list of faults (simulators/faults.py)")
+    parser.add_argument("--faults", type=Path, help="JSON list of faults (peers/faults.py)")
     parser.add_argument(
         "--ports", choices=("auto", "rig"), default="rig", help="free TCP ports, or the rig file's"
     )

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.rig import Rig
-from simulators.faults import Fault, Faults
-from simulators.frames import Snapshot
-from simulators.lamps import Lamps
-from simulators.projector_controller import ProjectorController, Show
+from reconstruction.geometry.rig import Rig
+from simulators.frames.frames import Snapshot
+from simulators.peers.faults import Fault, Faults
+from simulators.peers.lamps import Lamps
+from simulators.peers.projector_controller import ProjectorController, Show
 
 Counts = NDArray[np.uint16]
 MakeCounts = Callable[[str, Snapshot, float], Counts]

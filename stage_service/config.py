@@ -1,6 +1,6 @@
 """The rig file as the service reads it: geometry, the wires, defaults for captures.
 
-Geometry goes through `reconstruction.rig`; the tables `[devices]` and `[capture]` are read
+Geometry goes through `reconstruction.geometry.rig`; the tables `[devices]` and `[capture]` are read
 strictly: an unknown or wrong field is an error that names file and field.
 """
 
@@ -22,7 +22,7 @@ from pydantic import (
     model_validator,
 )
 
-from reconstruction.rig import Rig, RigError
+from reconstruction.geometry.rig import Rig, RigError
 
 SHORTEST_S, LONGEST_S = 1e-6, 10.0
 """Exposures that the trigger box makes."""

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction.rig import Rig
-from simulators.faults import Fault, Faults
-from simulators.frames import FrameMaker
-from simulators.lamps import Lamps
-from simulators.responses import Response
-from simulators.sensor import Sensor
-from simulators.stage import DEVICES_FILE, SimulatedStage
+from reconstruction.geometry.rig import Rig
+from simulators.frames.frames import FrameMaker
+from simulators.frames.responses import Response
+from simulators.frames.sensor import Sensor
+from simulators.peers.devices import DEVICES_FILE, SimulatedStage
+from simulators.peers.faults import Fault, Faults
+from simulators.peers.lamps import Lamps
 from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
 

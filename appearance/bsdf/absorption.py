@@ -1,14 +1,14 @@
 """Ways to say how much a fibre absorbs: pigments, or the colour that dense hair should show.
 
-Both work on Dr.Jit arrays and are differentiable; `appearance.longitudinal` has the second in
-NumPy, with its inverse.
+Both work on Dr.Jit arrays and are differentiable; `appearance.sun_fit.longitudinal` has the
+second in NumPy, with its inverse.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from appearance.longitudinal import LEAST_COLOUR
+from appearance.sun_fit.longitudinal import LEAST_COLOUR
 
 EUMELANIN = (0.419, 0.697, 1.37)
 """Absorption of black-brown pigment per unit of concentration (d'Eon et al. 2011), linear RGB."""

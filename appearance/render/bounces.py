@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import Surface, opaque_index
 from appearance.render.tracing import Paths, Reach, follow
-from appearance.scene import HairScene
-from reconstruction.cameras import Camera
+from appearance.scene.hair_scene import HairScene
+from reconstruction.geometry.cameras import Camera
 
 _LONGEST = 256
 _STREAM = 1 << 29

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.render.paths import Surface, wave
-from appearance.scene import HairScene
-from reconstruction.cameras import Camera
+from appearance.scene.hair_scene import HairScene
+from reconstruction.geometry.cameras import Camera
 
 
 def coverage(

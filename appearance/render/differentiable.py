@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from appearance.hair_appearance import DiffuseHair
 from appearance.render.lamps import LampBank
 from appearance.render.paths import (
     Surface,
@@ -32,10 +31,11 @@ from appearance.render.paths import (
     opaque_index,
     pixel_indices,
 )
-from appearance.scene import SCALE, HairScene
+from appearance.scene.hair_appearance import DiffuseHair
+from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.array_backend import for_kernels
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 
 _GRADIENT_STREAM = 1 << 29
 _UNITS = {"lamps.position": SCALE, "lamps.intensity": SCALE**2, "lamps.turn": 1.0}

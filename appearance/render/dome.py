@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from appearance.render.paths import opaque, opaque_index
 from appearance.render.tracing import Paths
-from appearance.scene import SCALE, HairScene
+from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.array_backend import for_kernels
-from reconstruction.lights import Light
+from reconstruction.geometry.lights import Light
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
 from appearance.render.tracing import Paths, Reach, follow
-from appearance.scene import HairScene
+from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
-from reconstruction.cameras import Camera
+from reconstruction.geometry.cameras import Camera
 
 
 def render_environment(

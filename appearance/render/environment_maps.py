@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.exr import read_exr
+from reconstruction.files.exr import read_exr
 
 Image = NDArray[np.float32]
 

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from appearance.bsdf.corrective import rodrigues
 from appearance.render.paths import opaque, opaque_index, opaque_matrix
-from appearance.scene import SCALE, light_arrays
+from appearance.scene.hair_scene import SCALE, light_arrays
 from reconstruction.array_backend import for_kernels
-from reconstruction.lamp_profiles import POLAR_FRAMES, LampProfile
-from reconstruction.lights import Light
+from reconstruction.geometry.light_profiles import POLAR_FRAMES, LampProfile
+from reconstruction.geometry.lights import Light
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from appearance.render.lamps import LampBank
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface, opaque, pixel_indices
 from appearance.render.tracing import Paths, Reach, follow
-from appearance.scene import HairScene
+from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 
 _PILOT = 256  # pixels whose light from each lamp is looked at first
 _SPREAD = 0.1  # share of the choices that all lamps have alike

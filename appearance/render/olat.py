@@ -15,9 +15,9 @@ from appearance.render.dome import Dome
 from appearance.render.lamps import LampBank
 from appearance.render.paths import Surface, light_from, opaque_index, pixel_indices
 from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
-from appearance.scene import HairScene
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light
+from appearance.scene.hair_scene import HairScene
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from appearance.scene import SCALE, HairScene
-from reconstruction.cameras import Camera, undistorted
+from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction.geometry.cameras import Camera, undistorted
 
 
 def camera_rays(camera: Camera, u: Any, v: Any) -> Any:

@@ -20,9 +20,9 @@ from appearance.render.paths import (
     pixel_indices,
 )
 from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
-from appearance.scene import SCALE, HairScene
-from reconstruction.cameras import Camera
-from reconstruction.projectors import Projector
+from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.projectors import Projector
 
 Image = NDArray[np.float32]
 

@@ -18,9 +18,9 @@ from scipy.ndimage import gaussian_filter
 from appearance.render.coverage import coverage
 from appearance.render.environment import render_environment
 from appearance.render.olat import render_olat
-from appearance.scene import HairScene
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light
+from appearance.scene.hair_scene import HairScene
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 
 Image = NDArray[np.float32]
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from appearance.render.paths import Surface, jittered, opaque, opaque_index
 from reconstruction.array_backend import for_kernels
-from reconstruction.cameras import Camera
+from reconstruction.geometry.cameras import Camera
 
 LANE_BYTES = 512
 """What a path in flight takes, about."""

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.least_squares import Solution, minimise
-from reconstruction.calibration.rigid import Rigid, align_devices
-from reconstruction.cameras import Camera
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.rigid_motion import Rigid, align_devices
 
 Array = NDArray[np.float64]
 Sightings = Mapping[str, Mapping[str, Sighting]]

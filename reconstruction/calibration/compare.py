@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.calibration.least_squares import minimise, numeric
-from reconstruction.calibration.rigid import Rigid, align_devices
-from reconstruction.cameras import Pinhole
-from reconstruction.projectors import Projector
-from reconstruction.rig import Rig
+from reconstruction.geometry.cameras import Pinhole
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.rigid_motion import Rigid, align_devices
 
 Array = NDArray[np.float64]
 

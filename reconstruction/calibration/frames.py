@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.capture import Capture, Step
-from reconstruction.silhouettes import dark_rgb
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.images.silhouettes import dark_rgb
 
 
 def dark_response(

@@ -17,8 +17,8 @@ from scipy import sparse
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.least_squares import Solution, minimise
 from reconstruction.calibration.spheres import Highlight, crossing, mirrored
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 
 Array = NDArray[np.float64]
 

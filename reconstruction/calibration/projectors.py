@@ -21,11 +21,11 @@ from reconstruction.calibration.cameras import CameraSolution
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.frames import dark_response
 from reconstruction.calibration.least_squares import Linearised, Solution, minimise, numeric
-from reconstruction.calibration.rigid import Rigid
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rigid_motion import Rigid
 from reconstruction.light_planes.peaks import find_peaks
-from reconstruction.projectors import Projector
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.lamps import LOOSE, Lamp
 from reconstruction.calibration.least_squares import minimise
-from reconstruction.lights import Light
+from reconstruction.geometry.lights import Light
 
 Array = NDArray[np.float64]
 

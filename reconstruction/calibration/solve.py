@@ -20,13 +20,13 @@ from reconstruction.calibration.projectors import (
 )
 from reconstruction.calibration.shading import refine_centres, shaded_lamp, with_intensity
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
-from reconstruction.lights import Light
-from reconstruction.projectors import Projector
-from reconstruction.report import Progress, Report, Stage, silent
-from reconstruction.rig import Rig
-from reconstruction.silhouettes import NoSilhouette, lit_image
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
+from reconstruction.images.silhouettes import NoSilhouette, lit_image
+from reconstruction.report.report import Progress, Report, Stage, silent
 
 
 @dataclass(frozen=True)

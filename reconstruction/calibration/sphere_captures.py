@@ -13,9 +13,9 @@ from reconstruction.calibration.frames import lamp_response
 from reconstruction.calibration.lamps import Glint
 from reconstruction.calibration.shading import Shading
 from reconstruction.calibration.spheres import find_highlight, find_outline, sphere_centre
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
-from reconstruction.silhouettes import NoSilhouette, background_noise, lit_image
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.cameras import Camera
+from reconstruction.images.silhouettes import NoSilhouette, background_noise, lit_image
 
 Array = NDArray[np.float64]
 Samples = tuple[Array, Array, NDArray[np.int64], Array, Array]

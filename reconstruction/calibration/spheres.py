@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.least_squares import minimise, numeric
-from reconstruction.cameras import Camera
-from reconstruction.silhouettes import background_noise
+from reconstruction.geometry.cameras import Camera
+from reconstruction.images.silhouettes import background_noise
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from reconstruction.cameras import Camera
-from reconstruction.envelope import inside_mesh
-from reconstruction.mesh import Mesh
-from reconstruction.visual_hull import VoxelGrid, visual_hull
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.visual_hull import VoxelGrid, visual_hull
+from reconstruction.growth.envelope import inside_mesh
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]

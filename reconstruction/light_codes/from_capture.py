@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture, CaptureError
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.images.orientation import LogGaborBank, orientations
+from reconstruction.images.silhouettes import background_noise, dark_frame
 from reconstruction.light_codes.codes import along_lines, code_map
 from reconstruction.light_codes.views import View, furthest_light, light_beside, line_vectors
-from reconstruction.lights import Light
-from reconstruction.orientation import LogGaborBank, orientations
-from reconstruction.report import Progress, Stage, silent
-from reconstruction.silhouettes import background_noise, dark_frame
+from reconstruction.report.report import Progress, Stage, silent
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from reconstruction.capture import Capture
-from reconstruction.envelope import surface_samples
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.growth.envelope import surface_samples
 from reconstruction.light_codes.options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.pipeline import measure_segments, string_together
 from reconstruction.light_codes.segments import Segments
 from reconstruction.masks import HairMask
-from reconstruction.measure import Measured
-from reconstruction.mesh import Mesh
-from reconstruction.report import Progress, Report, silent
+from reconstruction.report.report import Progress, Report, silent
+from reconstruction.tangents.estimate import Measured
 
 Array = NDArray[np.float64]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from reconstruction.growth.surface_strands import SurfaceOptions
+from reconstruction.images.orientation import LogGaborBank
 from reconstruction.light_codes.extension import ExtensionOptions
 from reconstruction.light_codes.search import SearchOptions
-from reconstruction.orientation import LogGaborBank
-from reconstruction.surface_strands import SurfaceOptions
 
 # Frozen, so that all options may share them.
 _BANK = LogGaborBank(count=48, spread=1.0, wavelength=5.0)

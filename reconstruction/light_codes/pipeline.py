@@ -8,7 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.capture import Capture, CaptureError
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.growth.surface_strands import surface_strands
 from reconstruction.light_codes.depth_range import depth_range, hair_volume
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.from_capture import views_of
@@ -23,11 +26,8 @@ from reconstruction.light_codes.segments import (
 )
 from reconstruction.light_codes.views import View
 from reconstruction.masks import HairMask
-from reconstruction.measure import Measured
-from reconstruction.mesh import Mesh
-from reconstruction.report import Progress, Report, silent
-from reconstruction.surface_strands import surface_strands
-from reconstruction.visual_hull import VoxelGrid
+from reconstruction.report.report import Progress, Report, silent
+from reconstruction.tangents.estimate import Measured
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reconstruction.cameras import Camera
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 from reconstruction.light_codes.codes import CodeMap
-from reconstruction.lights import Light
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

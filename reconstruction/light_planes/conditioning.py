@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reconstruction.cameras import Camera
-from reconstruction.lights import dome_positions
-from reconstruction.projectors import Projector
-from reconstruction.rig import Rig
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import dome_positions
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
 
 GRAZING = 0.1  # cosine to the surface under which a sphere's point is not counted as seen or lit
 

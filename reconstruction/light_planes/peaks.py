@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.capture import Capture, Step
-from reconstruction.projectors import Projector
-from reconstruction.silhouettes import background_noise, dark_frame
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.geometry.projectors import Projector
+from reconstruction.images.silhouettes import background_noise, dark_frame
 
 REACH = 3  # frames kept before and after a maximum
 WINDOW = 2 * REACH + 1

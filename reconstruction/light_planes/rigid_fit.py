@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from reconstruction.cameras import Camera
+from reconstruction.geometry.cameras import Camera
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]

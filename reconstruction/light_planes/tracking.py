@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture, Step
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.geometry.cameras import Camera
+from reconstruction.images.silhouettes import dark_frame
 from reconstruction.light_planes.motion import Between, Motion
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.light_planes.registration import (
@@ -36,8 +37,7 @@ from reconstruction.light_planes.rigid_fit import (
     gauss_newton,
     numeric,
 )
-from reconstruction.report import Progress, Stage, silent
-from reconstruction.silhouettes import dark_frame
+from reconstruction.report.report import Progress, Stage, silent
 
 Array = NDArray[np.float64]
 

@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.capture import Capture, CaptureError
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.projectors import Projector
+from reconstruction.images.silhouettes import NoSilhouette, silhouette
 from reconstruction.light_planes.conditioning import row_pitch
 from reconstruction.light_planes.consensus import flatten, support, supported
 from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.peaks import CLEAN, PeakOptions, Peaks, find_peaks
 from reconstruction.light_planes.point_cloud import PointCloud
-from reconstruction.projectors import Projector
-from reconstruction.report import Progress, Stage, silent
-from reconstruction.silhouettes import NoSilhouette, silhouette
+from reconstruction.report.report import Progress, Stage, silent
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from stage_service.api.problems import (
     install_problems,
     problem_response,
 )
-from stage_service.api.stage import Stage
+from stage_service.service import Stage
 
 LOOPBACK = "127.0.0.1"
 OWN_NAMES = {"127.0.0.1", "localhost", "[::1]"}

@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Request
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from stage_service.events import EventLog
+from stage_service.records.events import EventLog
 
 router = APIRouter()
 POLL_S = 0.5

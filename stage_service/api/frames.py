@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from appearance.metrics import srgb
-from reconstruction.exr import read_exr
+from appearance.metrics.scores import srgb
+from reconstruction.files.exr import read_exr
 
 
 def png_preview(path: Path, percentile: float = 99.5) -> bytes:

@@ -13,21 +13,21 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
-from reconstruction.capture import CaptureError, MissingFrame
-from reconstruction.capture_writer import JournalInUse
-from stage_service.api.stage import (
+from reconstruction.capture.folder import CaptureError, MissingFrame
+from reconstruction.capture.writer import JournalInUse
+from stage_service.acquisition.captures import Busy, UnknownCapture
+from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
+from stage_service.acquisition.states import WrongState
+from stage_service.jobs.queue import NoSuchJob
+from stage_service.plan.capture_plan import PlanError
+from stage_service.plan.flash import FlashRefusal
+from stage_service.records.lease import Leased, NoLease
+from stage_service.service import (
     BadInput,
     NotFinished,
     UnknownArtifact,
     UnknownFrame,
 )
-from stage_service.captures import Busy, UnknownCapture
-from stage_service.flash import FlashRefusal
-from stage_service.jobs.queue import NoSuchJob
-from stage_service.latch import CannotAcknowledge, Unsafe
-from stage_service.lease import Leased, NoLease
-from stage_service.plan import PlanError
-from stage_service.states import WrongState
 
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"

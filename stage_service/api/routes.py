@@ -10,16 +10,16 @@ from fastapi import APIRouter, Query, Response, status
 from fastapi.responses import FileResponse
 
 from stage_service.api.frames import png_preview
-from stage_service.api.stage import (
+from stage_service.api.steering import By, OnStage, ResumeRequest
+from stage_service.jobs.records import Job
+from stage_service.plan.capture_plan import CapturePlan, PlanCost
+from stage_service.service import (
     Artifact,
     CaptureRequest,
     CaptureView,
     Health,
     JobRequest,
 )
-from stage_service.api.steering import By, OnStage, ResumeRequest
-from stage_service.jobs.records import Job
-from stage_service.plan import CapturePlan, PlanCost
 
 router = APIRouter()
 

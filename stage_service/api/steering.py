@@ -7,10 +7,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Query, Request, status
 from pydantic import BaseModel, ConfigDict, Field
 
-from stage_service.api.stage import Stage
-from stage_service.audit import Action
-from stage_service.control import Caller
-from stage_service.lease import Lease
+from stage_service.acquisition.control import Caller
+from stage_service.records.audit import Action
+from stage_service.records.lease import Lease
+from stage_service.service import Stage
 
 router = APIRouter()
 

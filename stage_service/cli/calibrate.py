@@ -71,8 +71,8 @@ def run_rig(args: argparse.Namespace, output: Output) -> int:
     """Calibrate a stage."""
     from reconstruction.calibration.compare import compare_rigs
     from reconstruction.calibration.solve import Targets, calibrate
-    from reconstruction.capture import Capture
-    from reconstruction.rig import Rig
+    from reconstruction.capture.folder import Capture
+    from reconstruction.geometry.rig import Rig
     from stage_service.config import load_rig_file
 
     if args.out.suffix != ".json":

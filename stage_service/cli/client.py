@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import httpx
 
-from reconstruction.report import Progress
+from reconstruction.report.report import Progress
 from stage_service.cli.output import BAD_INPUT, FAILED, UNREACHABLE, CommandError
 
 DEFAULT_URL = "http://127.0.0.1:8331"

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from reconstruction.rig import Rig
+from reconstruction.geometry.rig import Rig
 from stage_service.cli.children import Children, own_command, simulator_command
 from stage_service.cli.client import Service
 from stage_service.cli.demo_results import figures_table, gather

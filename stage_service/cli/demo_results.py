@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from appearance.fitted import FittedAppearance
-from appearance.hair_appearance import HairAppearance
-from appearance.longitudinal import colour_of_absorption, variance_of_roughness
-from reconstruction.capture import Capture
-from reconstruction.report import Progress
-from reconstruction.report_plots import plot_geometry
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
+from reconstruction.capture.folder import Capture
+from reconstruction.report.plots import plot_geometry
+from reconstruction.report.report import Progress
 from stage_service.jobs.geometry import evaluate_geometry
 
 GROUPS = ("held_out_lights", "held_out_camera")

@@ -57,10 +57,10 @@ def add(commands: Commands) -> None:
 
 def run_geometry(args: argparse.Namespace, output: Output) -> int:
     """Compare strands."""
-    from reconstruction.assessment import assess_strands
-    from reconstruction.capture import Capture
-    from reconstruction.mesh import read_obj
-    from reconstruction.strand_files import read_strands
+    from reconstruction.capture.folder import Capture
+    from reconstruction.evaluation.assessment import assess_strands
+    from reconstruction.files.strands import read_strands
+    from reconstruction.geometry.mesh import read_obj
 
     pred, true = read_strands(args.pred), read_strands(args.true)
     if not len(true):
@@ -78,8 +78,8 @@ def run_geometry(args: argparse.Namespace, output: Output) -> int:
         )
     figures = assessment.figures
     if args.out is not None:
-        from reconstruction.durable_files import write_whole
-        from reconstruction.error_pictures import draw_errors
+        from reconstruction.evaluation.error_pictures import draw_errors
+        from reconstruction.files.durable import write_whole
 
         pictures = draw_errors(assessment, args.out)
         figures = {**figures, "pictures": [str(p) for p in pictures]}

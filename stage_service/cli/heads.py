@@ -50,11 +50,11 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
     """Fit a head."""
     import numpy as np
 
-    from reconstruction.generic_head import generic_head
-    from reconstruction.head_fit import fit_head
-    from reconstruction.head_template import template
-    from reconstruction.mesh import read_obj, write_obj
-    from reconstruction.point_files import read_points
+    from reconstruction.files.points import read_points
+    from reconstruction.geometry.mesh import read_obj, write_obj
+    from reconstruction.head.fit import fit_head
+    from reconstruction.head.generic import generic_head
+    from reconstruction.head.template import template
 
     _require_obj(args.out)
     shape = generic_head() if args.mesh is None else template(read_obj(args.mesh))[0]
@@ -81,8 +81,8 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
 
 def run_mark(args: argparse.Namespace, output: Output) -> int:
     """Make a template."""
-    from reconstruction.head_template import template
-    from reconstruction.mesh import read_obj, write_obj
+    from reconstruction.geometry.mesh import read_obj, write_obj
+    from reconstruction.head.template import template
 
     _require_obj(args.out)
     mesh, fit = template(read_obj(args.mesh), up=args.up, above=args.above)

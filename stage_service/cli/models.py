@@ -64,9 +64,9 @@ def add(commands: Commands) -> None:
 
 def run_reconstruct(args: argparse.Namespace, output: Output) -> int:
     """Reconstruct strands."""
-    from reconstruction.capture import Capture
-    from reconstruction.report import Report
-    from reconstruction.strand_files import read_strands
+    from reconstruction.capture.folder import Capture
+    from reconstruction.files.strands import read_strands
+    from reconstruction.report.report import Report
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, reconstruct
 

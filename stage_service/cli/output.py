@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from reconstruction.report import Progress
+from reconstruction.report.report import Progress
 
 EXIT_CODES = {
     0: "done",

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance.metrics import Exposure, psnr, srgb, ssim
-from reconstruction.exr import read_exr
+from appearance.metrics.scores import Exposure, psnr, srgb, ssim
+from reconstruction.files.exr import read_exr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 

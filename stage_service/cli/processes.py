@@ -67,8 +67,8 @@ def run_serve(args: argparse.Namespace, output: Output) -> int:
     """Serve until a signal."""
     _log_to_stderr()
     from stage_service.api.app import serve
-    from stage_service.api.stage import Stage
     from stage_service.config import load_rig_file
+    from stage_service.service import Stage
 
     exit_on_sigterm()
     stage = Stage(load_rig_file(args.rig, args.devices), args.root)

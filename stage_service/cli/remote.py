@@ -87,7 +87,7 @@ def run_check(args: argparse.Namespace, output: Output, service: Service) -> int
         from pydantic import ValidationError
 
         from stage_service.config import load_rig_file
-        from stage_service.plan import CapturePlan
+        from stage_service.plan.capture_plan import CapturePlan
 
         try:
             plan = CapturePlan.model_validate(_read_json(args.plan))

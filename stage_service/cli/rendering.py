@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance.fitted import FittedAppearance
-from appearance.metrics import Exposure, srgb
-from appearance.pictures import write_png
-from appearance.relight import PROCEDURAL, three_quarter_view
+from appearance.metrics.pictures import write_png
+from appearance.metrics.scores import Exposure, srgb
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.model.relight import PROCEDURAL, three_quarter_view
 from appearance.render.environment import render_environment
 from appearance.render.environment_maps import load_environment
 from appearance.render.olat import render_olat
-from appearance.scene import HairScene, build_scene
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
-from reconstruction.exr import write_exr
-from reconstruction.fitted_head import model_head
-from reconstruction.report import Progress
-from reconstruction.strand_files import read_strands
+from appearance.scene.hair_scene import HairScene, build_scene
+from reconstruction.capture.folder import Capture
+from reconstruction.files.exr import write_exr
+from reconstruction.files.strands import read_strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.head.fitted import model_head
+from reconstruction.report.report import Progress
 
 SIZE = 512
 """Pixels across, where no camera of a rig says."""

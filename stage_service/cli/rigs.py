@@ -29,7 +29,7 @@ def run_check(args: argparse.Namespace, output: Output) -> int:
     """Check a rig file."""
     from reconstruction.light_planes.conditioning import condition
     from stage_service.config import load_rig_file
-    from stage_service.plan import CapturePlan
+    from stage_service.plan.capture_plan import CapturePlan
 
     rig_file = load_rig_file(args.file)
     rig = rig_file.rig

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from reconstruction.capture import Capture
-from reconstruction.report import Progress, silent
-from reconstruction.strands import Strands
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.strands import Strands
+from reconstruction.report.report import Progress, silent
 
 
 def evaluate_geometry(
@@ -27,11 +27,11 @@ def evaluate_geometry(
     masks that the reconstruction had: those of the cameras that are not held out.
     """
     from appearance.observations import model_mask
-    from reconstruction.controls import control_hull, hull_smooth_field, hull_vertical
-    from reconstruction.evaluation import compare_strands
-    from reconstruction.fitted_head import model_head
-    from reconstruction.strand_files import read_strands
-    from reconstruction.visibility import Visibility
+    from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical
+    from reconstruction.evaluation.matching import compare_strands
+    from reconstruction.evaluation.visibility import Visibility
+    from reconstruction.files.strands import read_strands
+    from reconstruction.head.fitted import model_head
 
     true = read_strands(truth)
     cameras, head = capture.rig.cameras, model_head(model, capture)

@@ -19,8 +19,9 @@ class JobOptions(BaseModel):
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
     against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`. `reconstruct`, `fit`,
     `stage1` and `assess` go to the step of that name: fields of
-    `reconstruction.pipeline.ReconstructOptions`, `appearance.fit.FitOptions`,
-    `appearance.stage1.pipeline.Stage1Request` and `appearance.assess.AssessOptions`.
+    `reconstruction.pipeline.ReconstructOptions`, `appearance.sun_fit.fit.FitOptions`,
+    `appearance.inverse_rendering.pipeline.Stage1Request`,
+    `appearance.model.assess.AssessOptions`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

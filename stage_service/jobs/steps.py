@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from reconstruction.capture import Capture
-from reconstruction.report import Progress
+from reconstruction.capture.folder import Capture
+from reconstruction.report.report import Progress
 from stage_service.jobs.records import JobOptions
 
 Figures = dict[str, Any]
@@ -36,7 +36,7 @@ def compress(context: StepContext) -> Figures:
     """Rewrite the capture's frames compressed, losslessly."""
     if not context.options.compress:
         return {"left_out": "switched off by the option 'compress'"}
-    from reconstruction.capture_compression import compress as run
+    from reconstruction.capture.compression import compress as run
 
     return {"bytes_saved": run(context.capture, context.progress)}
 
@@ -60,9 +60,9 @@ def reconstruct(context: StepContext) -> Figures:
 
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
-    from appearance.fit import FitOptions
-    from appearance.fit import fit as run
     from appearance.observations import HeldOut
+    from appearance.sun_fit.fit import FitOptions
+    from appearance.sun_fit.fit import fit as run
 
     run(
         Capture(context.capture),
@@ -80,8 +80,8 @@ def stage1(context: StepContext) -> Figures:
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
+    from appearance.inverse_rendering.pipeline import Stage1Request, fit_stage1
     from appearance.observations import HeldOut
-    from appearance.stage1.pipeline import Stage1Request, fit_stage1
 
     found = fit_stage1(
         Capture(context.capture),
@@ -96,8 +96,8 @@ def stage1(context: StepContext) -> Figures:
 
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
-    from appearance.assess import AssessOptions
-    from appearance.assess import assess as run
+    from appearance.model.assess import AssessOptions
+    from appearance.model.assess import assess as run
     from appearance.observations import HeldOut
 
     return run(
@@ -129,8 +129,8 @@ def evaluate(context: StepContext) -> Figures:
 
 def results(context: StepContext) -> Figures:
     """Gather every figure of the job in `results.json`, and draw the report's plots."""
-    from reconstruction.report import Report
-    from reconstruction.report_plots import plot_geometry, plot_report
+    from reconstruction.report.plots import plot_geometry, plot_report
+    from reconstruction.report.report import Report
 
     plots = context.model / "plots"
     plot_report(Report.load(context.model / "report.json"), plots)

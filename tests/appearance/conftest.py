@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light
-from reconstruction.mesh import Mesh
-from reconstruction.strands import Strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
 
 
 def plane(half: float = 0.5) -> Mesh:

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from reconstruction.projectors import Projector
-from simulators.faults import Fault, Faults
-from simulators.projector_controller import ProjectorController
-from simulators.serial_peer import SerialPeer
-from simulators.trigger_box import TriggerBox
+from reconstruction.geometry.projectors import Projector
+from simulators.peers.faults import Fault, Faults
+from simulators.peers.projector_controller import ProjectorController
+from simulators.peers.serial_peer import SerialPeer
+from simulators.peers.trigger_box import TriggerBox
 from stage_service.config import SerialConfig
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox

@@ -11,12 +11,12 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from reconstruction.cameras import Camera as Geometry
+from reconstruction.geometry.cameras import Camera as Geometry
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.device_set import Stage
 from stage_service.devices.errors import Cancelled, DeviceError
-from stage_service.devices.stage import Stage
 
 NEVER = threading.Event()
 WIDTH, HEIGHT = 16, 12

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from simulators.faults import Fault
+from simulators.peers.faults import Fault
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.projectors.interface import Pattern
 from stage_service.devices.trigger.interface import TableRow

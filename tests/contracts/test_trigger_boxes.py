@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from simulators.faults import Fault
+from simulators.peers.faults import Fault
 from stage_service.devices.errors import DeviceError, SafetyRefusal
 from stage_service.devices.trigger.interface import TableProgress, TableRow, TriggerStatus
 from stage_service.devices.trigger.serial_box import SerialTriggerBox

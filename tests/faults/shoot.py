@@ -13,11 +13,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from reconstruction.capture_writer import CaptureWriter
+from reconstruction.capture.writer import CaptureWriter
+from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
-from stage_service.devices.stage import Stage
-from stage_service.plan import CapturePlan
-from stage_service.sequencer import Sequencer
+from stage_service.devices.device_set import Stage
+from stage_service.plan.capture_plan import CapturePlan
 
 
 def stand_still(place: str, call: int) -> None:

@@ -8,12 +8,12 @@ import pytest
 
 import simulators.world
 import stage_service.devices.cameras.link
-from reconstruction.capture_verify import verify
-from reconstruction.capture_writer import CaptureWriter
-from stage_service.captures import CaptureManager
-from stage_service.devices.stage import Stage
-from stage_service.plan import CapturePlan
-from stage_service.sequencer import Sequencer
+from reconstruction.capture.verify import verify
+from reconstruction.capture.writer import CaptureWriter
+from stage_service.acquisition.captures import CaptureManager
+from stage_service.acquisition.sequencer import Sequencer
+from stage_service.devices.device_set import Stage
+from stage_service.plan.capture_plan import CapturePlan
 
 STEPPING = pytest.mark.parametrize("stepping", ["software", "hardware"])
 

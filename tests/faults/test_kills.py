@@ -11,41 +11,51 @@ from typing import Any
 
 import pytest
 
-from reconstruction.capture import Capture
-from reconstruction.capture_verify import verify
-from reconstruction.capture_writer import CaptureWriter
-from simulators.stage import DEVICES_FILE
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.verify import verify
+from reconstruction.capture.writer import CaptureWriter
+from simulators.peers.devices import DEVICES_FILE
+from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
-from stage_service.devices.stage import Stage
-from stage_service.plan import CapturePlan
-from stage_service.sequencer import Sequencer
+from stage_service.devices.device_set import Stage
+from stage_service.plan.capture_plan import CapturePlan
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
 STAGES = [
-    ("connecting", "after stage_service.devices.stage:Stage.connect", 1, "software"),
-    ("arming", "after stage_service.sequencer:Sequencer._arm", 1, "software"),
-    ("a lamp lit", "after stage_service.exposing:Exposing._light", 6, "software"),
-    ("all lamps lit", "after stage_service.exposing:Exposing._light", 2, "software"),
-    ("a scanline shown", "after stage_service.exposing:Exposing._light", 15, "software"),
-    ("after a pulse", "stage_service.exposing:Exposing._check_lamps", 5, "software"),
-    ("reading frames", "stage_service.sequencer:Sequencer._account", 9, "software"),
-    ("storing a frame", "reconstruction.durable_files:_write", 9, "software"),
-    ("after storing frames", "reconstruction.capture_writer:CaptureWriter.commit", 4, "software"),
+    ("connecting", "after stage_service.devices.device_set:Stage.connect", 1, "software"),
+    ("arming", "after stage_service.acquisition.sequencer:Sequencer._arm", 1, "software"),
+    ("a lamp lit", "after stage_service.acquisition.exposing:Exposing._light", 6, "software"),
+    ("all lamps lit", "after stage_service.acquisition.exposing:Exposing._light", 2, "software"),
+    (
+        "a scanline shown",
+        "after stage_service.acquisition.exposing:Exposing._light",
+        15,
+        "software",
+    ),
+    ("after a pulse", "stage_service.acquisition.exposing:Exposing._check_lamps", 5, "software"),
+    ("reading frames", "stage_service.acquisition.sequencer:Sequencer._account", 9, "software"),
+    ("storing a frame", "reconstruction.files.durable:_write", 9, "software"),
+    ("after storing frames", "reconstruction.capture.writer:CaptureWriter.commit", 4, "software"),
     (
         "after the journal",
-        "after reconstruction.capture_writer:CaptureWriter.commit",
+        "after reconstruction.capture.writer:CaptureWriter.commit",
         4,
         "software",
     ),
-    ("before the manifest", "reconstruction.capture_writer:CaptureWriter.finish", 1, "software"),
+    ("before the manifest", "reconstruction.capture.writer:CaptureWriter.finish", 1, "software"),
     (
         "a table armed",
         "after stage_service.devices.trigger.serial_box:SerialTriggerBox.load_table",
         1,
         "hardware",
     ),
-    ("a table running", "stage_service.hardware_run:HardwareRun._collect", 1, "hardware"),
+    (
+        "a table running",
+        "stage_service.acquisition.hardware_run:HardwareRun._collect",
+        1,
+        "hardware",
+    ),
 ]
 
 

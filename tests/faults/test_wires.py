@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from reconstruction.capture import Capture
-from reconstruction.capture_verify import verify
-from reconstruction.capture_writer import CaptureWriter
-from simulators.faults import Fault
-from stage_service.devices.stage import Stage
-from stage_service.plan import CapturePlan
-from stage_service.sequencer import Sequencer
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.verify import verify
+from reconstruction.capture.writer import CaptureWriter
+from simulators.peers.faults import Fault
+from stage_service.acquisition.sequencer import Sequencer
+from stage_service.devices.device_set import Stage
+from stage_service.plan.capture_plan import CapturePlan
 
 PULSE = 9
 LIGHTS = tuple(f"light_{i:03d}" for i in range(12))

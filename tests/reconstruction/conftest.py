@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
-from reconstruction.exr import write_exr
-from reconstruction.lights import Light
-from reconstruction.projectors import Projector
-from reconstruction.rig import Rig
+from reconstruction.capture.folder import Capture
+from reconstruction.files.exr import write_exr
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
 
 RADIUS = 0.1
 SIZE, ROWS = 64, 40

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
-from reconstruction.hair_features import light_contrast, line_strength, otsu, tell_apart
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.images.hair_features import light_contrast, line_strength, otsu, tell_apart
+from reconstruction.images.silhouettes import NoSilhouette, background_noise, silhouette
 from reconstruction.light_planes import PointCloud, triangulate
-from reconstruction.lights import Light, dome_positions
 from reconstruction.masks import (
     _threshold,
     distance_to,
     hair_masks,
     head_coverage,
 )
-from reconstruction.mesh import Mesh
-from reconstruction.silhouettes import NoSilhouette, background_noise, silhouette
 
 RADIUS = 0.1
 LIGHTS = [Light(f"l{i:02d}", p, np.ones(3)) for i, p in enumerate(dome_positions(40, 1.2, -60.0))]

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture, CaptureError
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.files.strands import read_strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.mesh import Mesh, write_obj
+from reconstruction.geometry.strands import Strands
 from reconstruction.light_planes import PointCloud
-from reconstruction.lights import Light, dome_positions
-from reconstruction.measure import MeasureOptions, light_groups, thinned
-from reconstruction.mesh import Mesh, write_obj
 from reconstruction.pipeline import ReconstructOptions, reconstruct
-from reconstruction.report import Report
-from reconstruction.strand_files import read_strands
-from reconstruction.strands import Strands
+from reconstruction.report.report import Report
+from reconstruction.tangents.estimate import MeasureOptions, light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(12, 1.2, 0.0))]

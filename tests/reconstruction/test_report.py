@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.report import LeftOut, Report, Series, Stage, silent
-from reconstruction.report_plots import plot_geometry, plot_report
+from reconstruction.report.plots import plot_geometry, plot_report
+from reconstruction.report.report import LeftOut, Report, Series, Stage, silent
 
 
 @pytest.fixture

@@ -14,16 +14,16 @@ import pytest
 import serial
 from pymodbus.client import ModbusTcpClient
 
-from reconstruction.cameras import Camera
-from reconstruction.lights import Light, dome_positions
-from reconstruction.projectors import Projector
-from reconstruction.rig import Rig
-from simulators.faults import Fault, Faults
-from simulators.frames import FrameMaker
-from simulators.lamps import Lamps
-from simulators.responses import Response
-from simulators.sensor import Sensor
-from simulators.stage import SimulatedStage
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
+from simulators.frames.frames import FrameMaker
+from simulators.frames.responses import Response
+from simulators.frames.sensor import Sensor
+from simulators.peers.devices import SimulatedStage
+from simulators.peers.faults import Fault, Faults
+from simulators.peers.lamps import Lamps
 from simulators.world import World
 
 

@@ -7,13 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from simulators.drift import Drift
-from simulators.faults import Faults
-from simulators.frames import FrameMaker, Snapshot
-from simulators.lamps import Lamps
-from simulators.projector_controller import Show
-from simulators.responses import Response
-from simulators.sensor import Sensor
+from simulators.frames.frames import FrameMaker, Snapshot
+from simulators.frames.responses import Response
+from simulators.frames.sensor import Sensor
+from simulators.peers.faults import Faults
+from simulators.peers.lamps import Lamps
+from simulators.peers.projector_controller import Show
+from simulators.subject.drift import Drift
 from simulators.world import World
 
 TRACKING, LINE = Show(32768), Show(65535, "proj", 2)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from reconstruction.rig import RigError
+from reconstruction.geometry.rig import RigError
 from stage_service.config import load_rig_file
 
 RIGS = Path(__file__).resolve().parents[2] / "deploy" / "rigs"

@@ -21,10 +21,10 @@ import httpx
 import numpy as np
 import pytest
 
-from reconstruction.mesh import Mesh, write_obj
-from reconstruction.rig import Rig
-from reconstruction.strand_files import write_strands
-from reconstruction.strands import Strands
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.mesh import Mesh, write_obj
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
 
 T = TypeVar("T")
 LIGHTS, CAMERAS, ROWS = 24, 3, 16

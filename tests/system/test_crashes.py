@@ -6,7 +6,7 @@ import re
 import time
 from pathlib import Path
 
-from reconstruction.capture import Capture
+from reconstruction.capture.folder import Capture
 
 
 def test_a_job_outlives_its_worker(stage):

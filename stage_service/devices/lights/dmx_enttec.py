@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 
 import serial
 
-from reconstruction.rig import RigError
+from reconstruction.geometry.rig import RigError
 from stage_service.config import DmxConfig
 from stage_service.devices.errors import DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit

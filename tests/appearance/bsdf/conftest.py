@@ -2,7 +2,7 @@
 
 import pytest
 
-from appearance.backend import ensure_backend
+from appearance.scene.backend import ensure_backend
 
 
 @pytest.fixture(scope="session", autouse=True)

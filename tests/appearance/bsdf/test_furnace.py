@@ -3,9 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-
-from appearance.bsdf import lobes
-from appearance.bsdf.measure import (
+from benchmarks.bsdf_integrals import (
     Case,
     array_types,
     cases,
@@ -14,6 +12,8 @@ from appearance.bsdf.measure import (
     known_direction,
     uniforms,
 )
+
+from appearance.bsdf import lobes
 
 
 def by_evaluation(case: Case, double: bool) -> np.ndarray:

@@ -5,11 +5,11 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from benchmarks.bsdf_integrals import Case, array_types, fibre, known_direction
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import absorption, lobes, reference
 from appearance.bsdf.corrective import rodrigues
-from appearance.bsdf.measure import Case, array_types, fibre, known_direction
 
 PARAMETERS = ("sigma_a", "beta_m", "beta_n", "eta", "tilt")
 INSIDE = [

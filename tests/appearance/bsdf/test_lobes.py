@@ -5,11 +5,11 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from benchmarks.bsdf_integrals import Case, array_types, cases, fibre, known_direction, uniforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appearance.bsdf import lobes, reference
-from appearance.bsdf.measure import Case, array_types, cases, fibre, known_direction, uniforms
 
 
 def scattered(case: Case, count: int = 300, seed: int = 0) -> np.ndarray:

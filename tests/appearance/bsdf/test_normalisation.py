@@ -3,9 +3,9 @@
 import drjit as dr
 import numpy as np
 import pytest
+from benchmarks.bsdf_integrals import Case, panels
 
 from appearance.bsdf import lobes, reference
-from appearance.bsdf.measure import Case, panels
 
 BETAS = [0.001, 0.003, 0.01, 0.1, 0.3, 0.6, 1.0]
 THETAS = np.radians([-89.99, -85.0, -45.0, 0.0, 10.0, 80.0, 89.9, 89.99])

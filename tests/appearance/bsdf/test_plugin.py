@@ -8,18 +8,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from benchmarks.bsdf_integrals import Case
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import reference
-from appearance.bsdf.measure import Case
 from appearance.bsdf.parameters import Place
 from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import strand_parameters
-from appearance.curves import spline_control_points
-from appearance.hair_appearance import HairAppearance
-from appearance.longitudinal import absorption_of_colour
-from appearance.scene import SCALE, build_scene
-from reconstruction.strands import Strands
+from appearance.scene.curves import spline_control_points
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import SCALE, build_scene
+from appearance.sun_fit.longitudinal import absorption_of_colour
+from reconstruction.geometry.strands import Strands
 
 HAIR = HairAppearance((0.2, 0.4, 0.8), 0.3, 0.3)
 
@@ -65,7 +65,7 @@ def evaluate(bsdf, si, wo):
 
 def test_importing_the_package_registers_the_plugin_before_and_after_a_variant():
     code = (
-        "import sys, appearance.backend as b; {first}import appearance; {then}"
+        "import sys, appearance.scene.backend as b; {first}import appearance; {then}"
         "import mitsuba as mi; print(mi.load_dict({{'type': 'extended_hair'}}).class_name())"
     )
     for first, then in (("b.ensure_backend(); ", ""), ("", "b.ensure_backend(); ")):

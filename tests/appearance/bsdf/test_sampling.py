@@ -4,10 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
-
-from appearance.bsdf import lobes, reference
-from appearance.bsdf.measure import (
+from benchmarks.bsdf_integrals import (
     Case,
     array_types,
     fibre,
@@ -16,6 +13,9 @@ from appearance.bsdf.measure import (
     panels,
     uniforms,
 )
+from scipy.stats import chi2
+
+from appearance.bsdf import lobes, reference
 
 SAMPLES = 100_000
 CELLS = 16

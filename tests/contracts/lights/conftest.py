@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from pyModbusTCP.server import DataHandler, ModbusServer
 
-from simulators.faults import Fault, Faults
-from simulators.lamps import Lamps
-from simulators.light_bank import light_bank
+from simulators.peers.faults import Fault, Faults
+from simulators.peers.lamps import Lamps
+from simulators.peers.light_bank import light_bank
 from stage_service.config import (
     DmxConfig,
     LightBankConfig,

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from reconstruction.capture import Capture
-from reconstruction.capture_writer import CaptureWriter
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.writer import CaptureWriter
+from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import LightBankConfig
-from stage_service.devices.stage import Stage
-from stage_service.plan import CapturePlan
-from stage_service.sequencer import Sequencer
+from stage_service.devices.device_set import Stage
+from stage_service.plan.capture_plan import CapturePlan
 
 WIRE_PAGE = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
 DMX = """[devices.lights]

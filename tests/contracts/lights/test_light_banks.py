@@ -7,7 +7,7 @@ import socket
 import numpy as np
 import pytest
 
-from reconstruction.rig import RigError
+from reconstruction.geometry.rig import RigError
 from stage_service.config import DmxConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceUnreachable
 from stage_service.devices.lights.dmx_enttec import DmxLightBank

@@ -10,8 +10,8 @@ import time
 
 import pytest
 
-from simulators.dmx_widget import DmxWidget
-from simulators.faults import Fault
+from simulators.peers.dmx_widget import DmxWidget
+from simulators.peers.faults import Fault
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 
 TCP, RTU, DMX = "simulated TCP", "simulated RTU", "simulated DMX"

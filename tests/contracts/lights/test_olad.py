@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulators.dmx_widget import DmxWidget
-from simulators.lamps import Lamps
+from simulators.peers.dmx_widget import DmxWidget
+from simulators.peers.lamps import Lamps
 
 LAMPS = 331
 OTHER_PLUGINS = [

@@ -12,14 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture, Step
-from reconstruction.lights import Light
-from reconstruction.projectors import Projector
-from reconstruction.rig import Rig
-from simulators.props import Prop, PropResponder, SphereProp, board_pose
-from simulators.sensor import Sensor
-from simulators.shooting import shoot
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
+from simulators.frames.sensor import Sensor
+from simulators.frames.shooting import shoot
+from simulators.subject.props import Prop, PropResponder, SphereProp, board_pose
 
 POSES = (0, 1, 2, 13, 14, 15, 16, 17, 31)
 AZIMUTHS = (-35, 5, 40)

@@ -12,9 +12,9 @@ from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.calibration.cameras import calibrate_cameras
 from reconstruction.calibration.compare import compare_rigs
 from reconstruction.calibration.errors import CalibrationError
-from reconstruction.cameras import Camera, facing
-from reconstruction.rig import Rig
-from simulators.props import BoardProp, board_pose
+from reconstruction.geometry.cameras import Camera, facing
+from reconstruction.geometry.rig import Rig
+from simulators.subject.props import BoardProp, board_pose
 
 Sightings = dict[str, dict[str, Sighting]]
 

@@ -12,9 +12,9 @@ from reconstruction.calibration.lamps import Glint, mirrored_lamps
 from reconstruction.calibration.shading import Shading, refine_centres, shaded_lamp
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
 from reconstruction.calibration.spheres import find_highlight, mirrored
-from reconstruction.capture import Capture
-from reconstruction.rig import Rig
-from simulators.props import SphereProp, reflection
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.rig import Rig
+from simulators.subject.props import SphereProp, reflection
 
 PLACES = ((0.0, 0.01, 0.02), (0.03, -0.05, -0.03))
 

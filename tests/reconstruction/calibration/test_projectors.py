@@ -16,11 +16,11 @@ from reconstruction.calibration.projectors import (
     projector_intensities,
     rows_on_board,
 )
-from reconstruction.calibration.rigid import Rigid
-from reconstruction.capture import Capture
-from reconstruction.projectors import Projector
-from reconstruction.rig import Rig
-from simulators.props import board_pose
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.rigid_motion import Rigid
+from simulators.subject.props import board_pose
 
 POSES = (0, 1, 16, 17, 14, 15)
 

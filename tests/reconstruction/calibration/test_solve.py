@@ -9,8 +9,8 @@ import pytest
 
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.solve import calibrate
-from reconstruction.capture import Capture
-from reconstruction.rig import Rig
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.rig import Rig
 from stage_service.cli import main
 from stage_service.config import load_rig_file
 

@@ -14,14 +14,14 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruction.array_backend import array_types
-from reconstruction.cameras import Camera
-from reconstruction.capture import Capture
-from reconstruction.exr import write_exr
+from reconstruction.capture.folder import Capture
+from reconstruction.files.exr import write_exr
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
 from reconstruction.light_codes.codes import code_map
 from reconstruction.light_codes.views import View, light_beside, line_vectors
-from reconstruction.lights import Light, dome_positions
-from reconstruction.rig import Rig
-from reconstruction.strands import Strands
 
 RADIUS = 0.03
 Bools = NDArray[np.bool_]

@@ -9,17 +9,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from benchmarks.light_codes import cut_to_ball, part_of, within_ball
 
-from reconstruction.bench_light_codes import cut_to_ball, part_of, within_ball
-from reconstruction.capture import Capture, CaptureError
-from reconstruction.evaluation import compare_strands
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.evaluation.matching import compare_strands
+from reconstruction.files.strands import read_strands
+from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.images.orientation import LogGaborBank
 from reconstruction.light_codes.options import LightCodeOptions
 from reconstruction.light_codes.search import SearchOptions
-from reconstruction.orientation import LogGaborBank
 from reconstruction.pipeline import ReconstructOptions, reconstruct
-from reconstruction.strand_files import read_strands
-from reconstruction.strands import Strands
-from reconstruction.visual_hull import VoxelGrid
 
 QUICK = ReconstructOptions(
     light_codes=LightCodeOptions(

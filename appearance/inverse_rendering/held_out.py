@@ -1,0 +1,96 @@
+"""Held-out frames beside what the fit makes of them: scores and error maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.metrics.pictures import Row, comparison_picture
+from appearance.metrics.scores import Exposure, mean_scores, relative_error, scores
+from appearance.observations import HeldOut, Observed, model_mask, observe
+from appearance.render.olat import render_olat
+from appearance.scene.hair_scene import HairScene
+from reconstruction.capture.folder import Capture
+
+Array = NDArray[np.float64]
+MAGNIFIED = 4.0
+"""Factor on the differences of displayed values in error maps."""
+
+
+def held_out_frames(
+    capture: Capture, model: Path, held_out: HeldOut, most: int, seed: int
+) -> list[Observed]:
+    """Held-out cameras under held-out lights; where one of them is missing, under all others."""
+    cameras = held_out.cameras or tuple(c.name for c in capture.rig.cameras)
+    lights = held_out.lights or tuple(capture.olat_lights())
+    if not (held_out.cameras or held_out.lights):
+        return []
+    out = []
+    for name in cameras[:2]:
+        there = [x for x in lights if capture.has_light(x, name)]
+        some = there[:: max(1, -(-len(there) // max(1, most // min(2, len(cameras)))))]
+        pixels = np.flatnonzero(model_mask(model, name, "hair", capture))
+        if len(pixels) and some:
+            out.append(observe(capture, name, some, pixels))
+    return out
+
+
+def judge(
+    picture: Path,
+    frames: Sequence[Observed],
+    scenes: Mapping[str, HairScene],
+    exposure: Exposure,
+    *,
+    spp: int,
+    max_depth: int,
+    seed: int = 0,
+) -> dict[str, dict[str, float]]:
+    """Mean `metrics.scores` and "relative_error" of each of `scenes` over lit `frames`; {} of none.
+
+    Writes a PNG: each frame as captured, as each scene renders it, and the last one's error map.
+    """
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in scenes}
+    rows: list[Row] = []
+    for k, o in enumerate(frames):
+        rendered = {
+            name: render_olat(
+                scene,
+                o.camera,
+                o.lights,
+                spp=spp,
+                max_depth=max_depth,
+                pixels=o.pixels,
+                seed=(seed << 8) + 91 + k,
+            )
+            for name, scene in scenes.items()
+        }
+        mask = np.zeros((o.camera.height, o.camera.width), bool)
+        mask.reshape(-1)[o.pixels] = True
+        for i, light in enumerate(o.lights):
+            true = _image(o.radiance[i], mask)
+            if not true[mask].max() > 0:
+                continue
+            wanted = exposure(true)
+            shown, captions = {"captured": wanted}, {}
+            for name, values in rendered.items():
+                image = _image(values[i], mask)
+                shown[name] = exposure(image)
+                score = scores(shown[name], wanted, mask)
+                captions[name] = f"{score['psnr']:.1f} dB"
+                found[name].append({**score, "relative_error": relative_error(image, true, mask)})
+            shown["error"] = MAGNIFIED * np.abs(shown[name] - wanted)
+            captions["error"] = f"of {name}, x {MAGNIFIED:g}"
+            rows.append((f"{o.camera.name}, {light.name}", shown, captions))
+    if not rows:
+        return {}
+    comparison_picture(picture, rows, ["captured", *scenes, "error"])
+    return {name: mean_scores(images) for name, images in found.items()}
+
+
+def _image(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> Array:
+    out = np.zeros((*mask.shape, 3))
+    out[mask] = values
+    return out

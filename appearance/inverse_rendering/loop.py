@@ -1,0 +1,393 @@
+"""The fit: what pictures alone tell first, then steps until the watched error no longer falls."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering.batches import Batch, Pairs
+from appearance.inverse_rendering.checkpoint import State
+from appearance.inverse_rendering.global_parameters import WIDE, solved
+from appearance.inverse_rendering.initial_absorption import cell_colours
+from appearance.inverse_rendering.problem import Effort, Problem, Watched
+from appearance.inverse_rendering.unknowns import Lamps, Raw, maps_of
+from reconstruction.report.report import Progress, silent
+
+Array = NDArray[np.float64]
+Shape = tuple[int, int, int]
+
+COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
+ROWS: dict[str, tuple[tuple[str, ...], bool]] = {
+    "original": (COLOUR, False),
+    "spatial": (COLOUR, True),
+    "correctives": ((*COLOUR, "rotation"), True),
+    "lights": ((*COLOUR, "rotation", "position", "turn", "profile", "gain"), True),
+}
+"""The ablations: what is free, and whether colour and correctives vary over the volume."""
+PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation": 0.2}
+"""Standard deviations about the calibration, and of correctives in radians."""
+_LATEST = 0.04
+"""Least weight of the latest step in the running mean, in which the steps' noise averages out; the
+mean is over about the latest quarter of the steps before that (Shamir & Zhang 2013)."""
+_SLOWED = 0.8
+"""Share of the pace that the later half of the steps gives up, for what noise moves in the end."""
+_ALTERNATIONS = 2
+"""Of shared numbers and cells, each with what it knows of the other."""
+_MORE_ROUNDS = 6
+PRIOR_WEIGHT = 1e-3
+"""Of half the mean squared prior deviation, beside the image loss."""
+
+
+@dataclass(frozen=True)
+class Stage1Options:
+    """How a fit is run.
+
+    `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
+    reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. With
+    `gauss_newton` the numbers that all hair shares and the lamps' intensities are solved for (see
+    `shared_numbers`), and steps are for what is left: correctives and the lamps' places, and
+    nothing in the rows before those. There are at most `steps`, of `images` pairs each: lights of
+    one view on shared paths, or pairs drawn one by one and rendered alone. `common_numbers` repeats
+    the same random numbers for a view in every step. `repeatable` gives the same bytes for the same
+    seed, with gradients in a single thread. The watched error is that of `watched_views` views,
+    every `check_every` steps; after `halvings` of the pace it has converged.
+    """
+
+    row: str = "lights"
+    tilt: bool = False
+    shape: Shape = (4, 8, 8)
+    levels: int = 3
+    cell_start: bool = True
+    gauss_newton: bool = True
+    steps: int = 60
+    images: int = 8
+    effort: Effort = field(default_factory=Effort)
+    loss: str = "squares"
+    lambda_sigma: float = 0.5
+    lambda_r: float = 10.0
+    residual_weighted: bool = True
+    shared_paths: bool = True
+    common_numbers: bool = False
+    repeatable: bool = True
+    check_every: int = 10
+    halvings: int = 2
+    watched_views: int = 3
+
+    def __post_init__(self) -> None:
+        if self.row not in ROWS:
+            raise ValueError(f"row must be one of {list(ROWS)}, got {self.row!r}")
+        if self.loss not in ("squares", "l1"):
+            raise ValueError(f"loss must be 'squares' or 'l1', got {self.loss!r}")
+        counts = (*self.shape, self.levels, self.steps, self.images, self.check_every)
+        if min(counts) < 1:
+            raise ValueError(
+                "shape, levels, steps, images and check_every must be positive, got "
+                f"{self.shape}, {self.levels}, {self.steps}, {self.images}, {self.check_every}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a fit found, and how it came to an end.
+
+    `ended` is "converged", "all steps taken", or why it ended early; `start_error` and `error` are
+    watched errors of the start and of the result, under fresh random numbers and alike for both.
+    `history` holds (seconds, step, watched error).
+    """
+
+    maps: HairMaps
+    lamps: Lamps
+    ended: str
+    start_error: float
+    error: float
+    steps: int
+    history: list[tuple[float, int, float]] = field(default_factory=list)
+
+
+def run(
+    problem: Problem,
+    maps: HairMaps,
+    lamps: Lamps | None = None,
+    *,
+    options: Stage1Options | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = silent,
+    snapshot: Callable[[float, HairMaps], None] | None = None,
+    seed: int = 0,
+) -> Outcome:
+    """Fit from `maps` and `lamps` (the calibration where None); never returns a worse guess.
+
+    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
+    data or options is replaced. The file stays: whoever starts the fit removes it. `snapshot` is
+    told the CPU seconds so far, without watching, and the maps: as they come, and in the end.
+    """
+    options = options or Stage1Options()
+    fit = _Fit(problem, maps, lamps, options, checkpoint, progress, seed)
+    if snapshot is not None:
+        fit.snapshot = snapshot
+    return fit.run()
+
+
+class _Fit:
+    def __init__(
+        self,
+        problem: Problem,
+        maps: HairMaps,
+        lamps: Lamps | None,
+        options: Stage1Options,
+        checkpoint: Path | None,
+        progress: Progress,
+        seed: int,
+    ) -> None:
+        self.problem, self.options, self.seed = problem, options, seed
+        self.checkpoint, self.progress = checkpoint, progress
+        self.start = maps
+        self.lamps = Lamps.calibrated(len(problem.lights)) if lamps is None else lamps
+        free, self.spatial = ROWS[options.row]
+        free = (*free, "tilt_deg") if options.tilt else free
+        self.solves = [n for n in free if n in WIDE] if options.gauss_newton else []
+        self.free = [n for n in free if n not in self.solves and n != "gain"]
+        if self.spatial and not options.cell_start and self.solves:
+            self.free.append("sigma_a")
+        self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
+        self.spread = problem.spread(self.pairs, options.watched_views, options.images)
+        self.series: list[tuple[float, int, float]] = []
+        self.snapshot: Callable[[float, HairMaps], None] = lambda seconds, maps: None
+
+    def run(self) -> Outcome:
+        self.begun, self.worked = time.perf_counter(), time.process_time()
+        if not self.pairs.used.any():
+            return self._unchanged("no pair of camera and light shows lit hair")
+        state = self._begun()
+        self.pairs.taught = state.tables["taught"]
+        ended = "all steps taken" if self.free else "converged"
+        while self.free and state.step < self.options.steps:
+            if state.step % self.options.check_every == 0:
+                state.history = [list(p) for p in self.series]
+                state.save(self.checkpoint, self._fingerprint)
+                share = 0.5 + 0.5 * state.step / self.options.steps
+                what = f"step {state.step}"
+                error = self._tell(state.average, state.gain, what, share, state.step)
+                if state.convergence.tell(error) and self._level(state.step) == self._last_level:
+                    ended = "converged"
+                    break
+            reason = self._step(state)
+            if reason:
+                ended = reason
+                break
+        self.snapshot(time.process_time() - self.worked, maps_of(state.average))
+        return self._judged(state, ended)
+
+    def _tell(self, raw: Raw, gain: Array, what: str, share: float, step: int = 0) -> float:
+        """Watch the error, tell it and note when it was; CPU time for that does not count."""
+        self.snapshot(time.process_time() - self.worked, maps_of(raw))
+        paused = time.process_time()
+        error = self._watch(raw, gain, self.seed)
+        self.series.append((time.perf_counter() - self.begun, step, error))
+        self.progress(f"{what}: error {max(error, 0.0) ** 0.5:.4f}", share)
+        self.worked += time.process_time() - paused
+        return error
+
+    def _begun(self) -> State:
+        state = State.load(self.checkpoint, self._fingerprint)
+        if state is not None:
+            self.series = [(s, int(k), e) for s, k, e in state.history]
+            self.begun -= self.series[-1][0] if self.series else 0.0
+            return state
+        raw, gain = self._first()
+        state = State(raw, _copied(raw), _copied(raw))
+        state.tables = {"taught": self.pairs.taught, "gain": gain}
+        state.convergence.halvings = self.options.halvings
+        return state
+
+    def _first(self) -> tuple[Raw, Array]:
+        """What pictures tell without a gradient: cells, shared numbers, and each again."""
+        one_colour = self.start.shape == (1, 1, 1)
+        cells = self.spatial and self.options.cell_start and one_colour
+        # maps that differ from cell to cell come from a row that has solved for all but the gains
+        solves = self.solves if one_colour or "gain" in self.solves else []
+        gain = self.lamps.gain
+        raw = self._raw(self.start.resized(self._shape(self._level(0))))
+        if cells or solves:
+            self._tell(raw, gain, "start", 0.0)
+        if cells:
+            raw = self._coloured(raw, gain, 12, 0)
+        rounds = (_ALTERNATIONS if cells else 1) if solves else 0
+        for k in range(rounds):
+            if cells:
+                self._tell(raw, gain, "cells", 0.5 * k / rounds)
+            raw, gain = solved(
+                self.problem,
+                raw,
+                gain,
+                solves,
+                self.spread,
+                self.options.effort,
+                progress=lambda what, share, k=k: self.progress(  # type: ignore[misc]
+                    what, 0.5 * (k + share) / rounds
+                ),
+                seed=(self.seed << 4) + k,
+            )
+            self._tell(raw, gain, "shared numbers", 0.5 * (k + 1) / rounds)
+            if cells:
+                raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
+        return raw, gain
+
+    def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
+        effort, seed = self.options.effort, (self.seed << 4) + number
+        return self._raw(cell_colours(self.problem, raw, gain, effort, rounds=rounds, seed=seed))
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        """Of everything that the course of a fit depends on."""
+        total = hashlib.sha256(repr((self.options, self.seed, self.problem.scale)).encode())
+        arrays: list[NDArray[Any]] = [
+            *self._raw(self.start).values(),
+            self.lamps.gain,
+            *(o.radiance for o in self.problem.views),
+        ]
+        for array in arrays:
+            total.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return total.hexdigest()
+
+    def _raw(self, maps: HairMaps) -> Raw:
+        return self.problem.raw_of(maps, self.lamps)
+
+    def _step(self, state: State) -> str | None:
+        """One step; why the fit must end, if it must."""
+        options = self.options
+        rng = np.random.default_rng([self.seed, state.step])
+        self._refine(state)
+        total: Raw = {}
+        for k, batch in enumerate(self._batches(rng)):
+            numbers = batch.view if options.common_numbers else state.step * options.images + k
+            first = (self.seed << 20) + 2 * numbers
+            slope = self.problem.slope(
+                state.raw,
+                state.gain,
+                self.free,
+                batch,
+                options.effort,
+                (first, first + 1),
+                rng,
+                loss=options.loss,
+                lambdas=(options.lambda_sigma, options.lambda_r) if k == 0 else (0.0, 0.0),
+                error=self.series[-1][2],
+                repeatable=options.repeatable,
+            )
+            if not all(np.isfinite(g).all() for g in slope.gradient.values()):
+                return f"step {state.step}: the gradient is not finite"
+            self.pairs.learn(batch, slope.seen)
+            for name, value in slope.gradient.items():
+                total[name] = total.get(name, 0.0) + value
+        self._pull_to_priors(state.raw, total)
+        late = max(0.0, 2 * state.step / options.steps - 1)
+        state.descent.step(state.raw, total, state.convergence.pace * (1 - _SLOWED * late))
+        state.step += 1
+        share = max(_LATEST, 4 / (state.step - state.level_began + 3))
+        for name, value in state.raw.items():
+            state.average[name] = state.average[name] + share * (value - state.average[name])
+        return None
+
+    def _batches(self, rng: np.random.Generator) -> list[Batch]:
+        images = self.options.images
+        if self.options.shared_paths:
+            return [self.pairs.draw(images, rng)]
+        alone = [self.pairs.draw(1, rng) for _ in range(images)]
+        return [replace(b, share=b.share / images) for b in alone]
+
+    def _pull_to_priors(self, raw: Raw, gradient: Raw) -> None:
+        for name, spread in PRIORS.items():
+            if name in gradient:
+                gradient[name] = gradient[name] + (
+                    PRIOR_WEIGHT * raw[name] / (raw[name].size * spread**2)
+                )
+
+    @property
+    def _last_level(self) -> int:
+        return self.options.levels - 1 if self.spatial else 0
+
+    def _level(self, step: int) -> int:
+        """Coarse levels take a sixth of the steps each; cells that differ already are kept."""
+        if self.options.cell_start or self.start.shape != (1, 1, 1):
+            return self._last_level
+        return min(step * 6 // self.options.steps, self._last_level)
+
+    def _shape(self, level: int) -> Shape:
+        if not self.spatial:
+            return 1, 1, 1
+        layers, columns, rows = self.options.shape
+        shrink = 2 ** (self._last_level - level)
+        return layers, max(1, columns // shrink), max(1, rows // shrink)
+
+    def _refine(self, state: State) -> None:
+        """Go over to a finer volume when its time has come."""
+        shape = self._shape(self._level(state.step))
+        if state.raw["sigma_a"].shape[:3] == shape:
+            return
+        for raw in (state.raw, state.average):
+            fine = self._raw(maps_of(raw).resized(shape))
+            raw |= {k: fine[k] for k in ("sigma_a", "rotation")}
+        for moments in (state.descent.first, state.descent.second):
+            for name in ("sigma_a", "rotation"):
+                moments.pop(name, None)
+        state.level_began = state.step
+        state.average = _copied(state.raw)
+
+    @cached_property
+    def _watched(self) -> Watched:
+        return self.problem.watched(
+            self._raw(self.start),
+            self.lamps.gain,
+            self.spread,
+            self.options.effort,
+            self.seed << 16,
+        )
+
+    def _watch(self, raw: Raw, gain: Array, seed: int) -> float:
+        return self.problem.error(raw, gain, self._watched, self.options.effort, seed << 16)
+
+    def _judged(self, state: State, ended: str) -> Outcome:
+        """The best of the result and of what it came from, by fresh random numbers."""
+        effort = self.options.effort
+        seed = (self.seed << 16) + (1 << 24)
+        start, found = self._raw(self.start.resized(state.first["sigma_a"].shape[:3])), state.gain
+        guesses = [(state.average, found, ended)]
+        if state.step:
+            guesses.append((state.first, found, f"{ended}; kept the first maps, which are better"))
+        if (found != self.lamps.gain).any():
+            guesses.append(
+                (start, found, f"{ended}; kept all but the intensities, which is better")
+            )
+        guesses.append((start, self.lamps.gain, f"{ended}; kept the start, which is better"))
+        errors = [
+            self.problem.error(raw, gain, self._watched, effort, seed) for raw, gain, _ in guesses
+        ]
+        best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
+        raw, gain, how = guesses[best]
+        self.series.append((time.perf_counter() - self.begun, state.step, errors[best]))
+        if best == len(errors) - 1:
+            # in cells, though all alike: the next row need not tell them apart again
+            maps = self.start.resized(raw["sigma_a"].shape[:3])
+            return Outcome(
+                maps, self.lamps, how, errors[best], errors[best], state.step, self.series
+            )
+        profile = np.exp(raw["profile"])[self.problem.profile_of]
+        lamps = Lamps(raw["position"], raw["turn"], gain, profile)
+        return Outcome(maps_of(raw), lamps, how, errors[-1], errors[best], state.step, self.series)
+
+    def _unchanged(self, reason: str) -> Outcome:
+        return Outcome(self.start, self.lamps, reason, 0.0, 0.0, 0)
+
+
+def _copied(raw: Raw) -> Raw:
+    return {k: v.copy() for k, v in raw.items()}

@@ -1,0 +1,59 @@
+"""Where inverse rendering starts from: Sun's roughness and colour, and groups of cells by colour.
+
+The homogeneous start is also the baseline that GroomLight calls HairInverse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.observations import Observed
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import HairScene
+from appearance.sun_fit.fit import BETA_N, FitOptions, SunFit
+from reconstruction.report.report import Progress, Stage, silent
+
+Array = NDArray[np.float64]
+GUESS = 0.3
+"""Longitudinal roughness where the pictures show no highlight to read it from."""
+
+
+def hair_inverse(
+    scene: HairScene,
+    hair: Sequence[Observed],
+    skin: Sequence[Observed] = (),
+    *,
+    options: FitOptions | None = None,
+    stage: Stage | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> tuple[HairAppearance, Array]:
+    """One roughness and one colour for all hair, and the skin's albedo `(3,)` (Sun 2021, §5).
+
+    Where too few samples lie near a mirror direction the roughness is `GUESS`, with a warning in
+    `stage`.
+    """
+    options, stage = options or FitOptions(), stage or Stage("start")
+    few = [_thinned(o, options.hair_pixels, seed) for o in hair]
+    base = scene.with_hair(HairAppearance((0.1, 0.1, 0.1), GUESS, BETA_N))
+    fitting = SunFit(base, few, skin, options, seed, progress)
+    try:
+        _, _, beta_m, first = fitting.roughness(stage)
+        start: Array | None = np.array(first.colour)
+        albedo = np.array(first.skin)
+    except ValueError as error:
+        stage.warn(f"the roughness is a guess, {GUESS}: {error}")
+        beta_m, start, albedo = GUESS, None, np.array(scene.skin)
+    colours = fitting.colour(beta_m, start, albedo, stage)
+    return colours.hair, np.array(colours.skin)
+
+
+def _thinned(o: Observed, most: int, seed: int) -> Observed:
+    if len(o.pixels) <= most:
+        return o
+    keep = np.zeros(len(o.pixels), bool)
+    keep[np.random.default_rng(seed).permutation(len(o.pixels))[:most]] = True
+    return o.where(keep)

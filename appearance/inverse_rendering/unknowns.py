@@ -1,0 +1,138 @@
+"""What is fitted, as unconstrained numbers, and the values of the renderer that they stand for.
+
+Absorption is the logit of a colour C with sigma = (log C / 6)²: black and white hair are both far
+away, and equal steps look about equally large. Roughness and index are logits of their ranges,
+correctives a tanh of theirs; all of them smooth, with finite derivatives everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.bsdf.maps import HairMaps
+from reconstruction.geometry.lights import Light
+
+Array = NDArray[np.float64]
+Raw = dict[str, Array]
+
+BRACKET = 6.0
+"""About Chiang's polynomial at beta_N = 0.3: here it only shapes the parametrisation."""
+RANGES = {"beta_m": (0.01, 0.99), "beta_n": (0.01, 0.99), "eta": (1.2, 2.2)}
+MOST_TURN = 0.6
+"""Radians of a corrective's component."""
+MOST_TILT = 10.0
+_PLUGIN = {"beta_m": "longitudinal_roughness", "beta_n": "azimuthal_roughness", "eta": "eta"}
+_FARTHEST = 16.0
+
+HAIR = ("sigma_a", "rotation", "beta_m", "beta_n", "eta", "tilt_deg")
+LAMPS = ("position", "turn", "profile")
+"""Offsets in metres, axis-angles in radians, logarithms of a factor for each lamp's profile."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lamps:
+    """How the lamps differ from their calibration, for all L lights of a fit.
+
+    `position (L, 3)` metres, `turn (L, 3)` radians about the lamp's centre in the world's frame,
+    `gain (L,)` and `profile (L,)` factors on the intensity; those of one profile share the latter.
+    """
+
+    position: Array
+    turn: Array
+    gain: Array
+    profile: Array
+
+    @classmethod
+    def calibrated(cls, count: int) -> Lamps:
+        """No difference."""
+        return cls(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count), np.ones(count))
+
+    def of(self, lights: Sequence[Light]) -> list[Light]:
+        """The lights as they are found to be."""
+        from scipy.spatial.transform import Rotation
+
+        out = []
+        for i, light in enumerate(lights):
+            turned = light.orientation
+            if turned is not None:
+                turned = turned @ Rotation.from_rotvec(self.turn[i]).as_matrix().T
+            out.append(
+                replace(
+                    light,
+                    position=light.position + self.position[i],
+                    intensity=light.intensity * self.gain[i] * self.profile[i],
+                    orientation=turned,
+                )
+            )
+        return out
+
+
+def raw_of(maps: HairMaps, lamps: Lamps, profile_of: NDArray[np.int64]) -> Raw:
+    """The unconstrained numbers of `maps` and `lamps`; `profile_of (L,)` numbers the profiles."""
+    raw = {
+        "sigma_a": _logit_of_colour(-BRACKET * np.sqrt(np.maximum(maps.sigma_a, 1e-12))),
+        "rotation": MOST_TURN * np.arctanh(np.clip(maps.rotation / MOST_TURN, -0.999, 0.999)),
+        "tilt_deg": np.array(
+            [MOST_TILT * np.arctanh(np.clip(maps.tilt_deg / MOST_TILT, -0.99, 0.99))]
+        ),
+        "position": lamps.position.copy(),
+        "turn": lamps.turn.copy(),
+        "profile": np.array(
+            [np.log(lamps.profile[profile_of == k][0]) for k in range(profile_of.max() + 1)]
+        ),
+    }
+    for name, (low, high) in RANGES.items():
+        share = np.clip((getattr(maps, name) - low) / (high - low), 1e-4, 1 - 1e-4)
+        raw[name] = np.array([np.log(share / (1 - share))])
+    return raw
+
+
+def hair_values(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """The BSDF's parameters by their names in `DifferentiableOlat`, from Dr.Jit tensors."""
+    import drjit as dr
+    import mitsuba as mi
+
+    values: dict[str, Any] = {
+        "hair.sigma_a": (_log_sigmoid(raw["sigma_a"]) * (1 / BRACKET)) ** 2,
+        "hair.rotation": MOST_TURN * dr.tanh(raw["rotation"] * (1 / MOST_TURN)),
+        "hair.scale_tilt": mi.Float((-MOST_TILT * dr.tanh(raw["tilt_deg"] / MOST_TILT)).array),
+    }
+    for name, (low, high) in RANGES.items():
+        share = 0.5 + 0.5 * dr.tanh(0.5 * raw[name])
+        values[f"hair.{_PLUGIN[name]}"] = mi.Float((low + (high - low) * share).array)
+    return values
+
+
+def maps_of(raw: Raw) -> HairMaps:
+    """The maps that the numbers stand for."""
+    scalars = {
+        name: float(low + (high - low) * (0.5 + 0.5 * np.tanh(0.5 * raw[name][0])))
+        for name, (low, high) in RANGES.items()
+    }
+    return HairMaps(
+        (np.logaddexp(0, -raw["sigma_a"]) / BRACKET) ** 2,
+        MOST_TURN * np.tanh(raw["rotation"] / MOST_TURN),
+        tilt_deg=float(MOST_TILT * np.tanh(raw["tilt_deg"][0] / MOST_TILT)),
+        **scalars,
+    )
+
+
+def _logit_of_colour(log_colour: Array) -> Array:
+    """logit C from log C, both ends kept: C to 1e-7 from 1 and down to any blackness."""
+    short = np.maximum(-np.expm1(log_colour), 1e-7)
+    return log_colour - np.log(short)
+
+
+def _log_sigmoid(x: Any) -> Any:
+    """log(1/(1 + exp(-x))), accurate for large x too."""
+    import drjit as dr
+
+    # 1 + e loses e below 1e-7; its series does not
+    e = dr.exp(-dr.abs(x))
+    log1p = dr.select(e < 1e-3, e * (1 - 0.5 * e), dr.log(1 + e))
+    return dr.minimum(x, 0) - log1p

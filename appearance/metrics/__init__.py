@@ -1,0 +1,1 @@
+"""How well rendered pictures agree with captured ones."""

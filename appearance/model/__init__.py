@@ -1,0 +1,1 @@
+"""A model's appearance, whole: rendered, relit, judged, edited, exported."""

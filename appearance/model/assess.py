@@ -1,0 +1,277 @@
+"""Rendered against captured: held-out lights, a held-out camera, beside trivial baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.metrics.pictures import comparison_picture
+from appearance.metrics.scores import (
+    mean_scores,
+    psnr,
+    relative_error,
+    scores,
+    scores_unavailable,
+    ssim,
+)
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.model.relight import relight_model
+from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
+from appearance.render.smoothed import olat_smoothed
+from appearance.scene.hair_appearance import DiffuseHair
+from appearance.scene.hair_scene import HairScene, build_scene
+from appearance.sun_fit.roughness_and_colour import fit_diffuse
+from reconstruction.capture.folder import Capture
+from reconstruction.files.strands import read_strands
+from reconstruction.geometry.lights import Light
+from reconstruction.head.fitted import model_head
+from reconstruction.report.report import Progress, Report, Stage, silent
+
+Array = NDArray[np.floating]
+METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
+COLUMNS = ("captured", "ours", "diffuse", "three_nearest")
+
+
+@dataclass(frozen=True)
+class AssessOptions:
+    """How much is compared: cameras and lights are spread evenly over what is there."""
+
+    cameras: int = 2
+    lights: int = 5
+    spp: int = 49
+    max_depth: int = 16
+    baseline_pixels: int = 100
+    baseline_lights: int = 48
+    relit_size: int = 320
+    relit_spp: int = 36
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """One frame by every method, radiance `(H, W, 3)`, and where the hair is."""
+
+    camera: str
+    light: str
+    frames: dict[str, Array]
+    mask: NDArray[np.bool_]
+
+
+def assess(
+    capture: Capture,
+    model: Path,
+    *,
+    held_out: HeldOut,
+    environment: str | Path | None = None,
+    options: AssessOptions | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Compare a fitted model with the frames it was not fitted to.
+
+    Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}}, "held_out_camera":
+    …}` with the methods "ours", "mean_colour" (one colour: the mean over training frames and hair
+    pixels), "diffuse" (Lambertian fibres on our strands whose albedo reproduces that mean) and
+    "three_nearest" (the camera's own captured frames under the three nearest other training
+    lights, interpolated: a control that needs the camera's frames, also where that camera is held
+    out). Means over images, each over the captured hair mask. A group with nothing held out is left
+    out. "lpips" is a score like the others where its weights are given
+    (`appearance.metrics.lpips`), and a reason beside the groups where not.
+
+    Writes `comparison.png`, `relit.png` and `relit.exr` (see `relight_model` for `environment`)
+    into the folder `model`, and the stage "images" into its report.
+    """
+    options = options or AssessOptions()
+    held_out.check(capture)
+    fitted = FittedAppearance.load(model)
+    strands = read_strands(model / "strands.npz")
+    report = Report.load(model / "report.json")
+    with report.stage("images") as stage:
+        head = model_head(model, capture)
+        scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
+        progress("fitting the baselines", 0.0)
+        training = _training(capture, model, held_out, options, seed)
+        colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
+        albedo = fit_diffuse(scene, training, seed=seed)
+        diffuse = scene.with_hair(DiffuseHair(albedo))
+        groups: dict[str, list[_Compared]] = {}
+        for group, views in _views(capture, held_out, options).items():
+            groups[group] = []
+            for i, (camera, lights) in enumerate(views):
+                progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
+                mask = model_mask(model, camera, "hair", capture)
+                groups[group] += _compared(
+                    capture, camera, lights, held_out, (scene, diffuse), colour, mask, options, seed
+                )
+        result: dict[str, Any] = {
+            group: {name: _scores(images, name, fitted) for name in METHODS}
+            for group, images in groups.items()
+        }
+        judge(result, stage)
+        stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
+        progress("relighting", 0.8)
+        comparison_picture(model / "comparison.png", _rows(groups, fitted), COLUMNS)
+        relight_model(
+            model,
+            head,
+            environment=environment,
+            size=options.relit_size,
+            spp=options.relit_spp,
+            seed=seed,
+        )
+    report.save(model / "report.json")
+    progress("images compared", 1.0)
+    return {**result, **scores_unavailable()}
+
+
+def _training(
+    capture: Capture, model: Path, held_out: HeldOut, options: AssessOptions, seed: int
+) -> list[Observed]:
+    """Hair pixels of the training cameras under some of the training lights."""
+    rng = np.random.default_rng(seed)
+    lights = _spread(held_out.training_lights(capture), options.baseline_lights)
+    out = []
+    for camera in held_out.training_cameras(capture):
+        pixels = chosen(model_mask(model, camera, "hair", capture), options.baseline_pixels, rng)
+        if len(pixels):
+            out.append(observe(capture, camera, lights, pixels))
+    if not out:
+        raise ValueError(f"{model}: the hair masks of the training cameras are all empty")
+    return out
+
+
+def _views(
+    capture: Capture, held_out: HeldOut, options: AssessOptions
+) -> dict[str, list[tuple[str, list[str]]]]:
+    """Which cameras to compare under which lights, by group."""
+    new = _spread(list(held_out.lights), options.lights)
+    training = held_out.training_lights(capture)
+    views: dict[str, list[tuple[str, list[str]]]] = {}
+    if new:
+        cameras = _spread(held_out.training_cameras(capture), options.cameras)
+        views["held_out_lights"] = [(camera, new) for camera in cameras]
+    if held_out.cameras:
+        both = _spread(training, max(options.lights - len(new) // 2, 1)) + _spread(
+            new, len(new) // 2
+        )
+        views["held_out_camera"] = [
+            (camera, both) for camera in _spread(list(held_out.cameras), options.cameras)
+        ]
+    return views
+
+
+def _compared(
+    capture: Capture,
+    camera: str,
+    names: Sequence[str],
+    held_out: HeldOut,
+    scenes: tuple[HairScene, HairScene],
+    colour: Array,
+    mask: NDArray[np.bool_],
+    options: AssessOptions,
+    seed: int,
+) -> list[_Compared]:
+    """The frames of one camera under the lights `names`, by every method."""
+    names = [n for n in names if capture.has_light(n, camera)]
+    if not names or not mask.any():
+        return []
+    lights = [capture.rig.light(n) for n in names]
+    device = capture.rig.camera(camera)
+    ours, diffuse = (
+        olat_smoothed(s, device, lights, spp=options.spp, max_depth=options.max_depth, seed=seed)
+        for s in scenes
+    )
+    out = []
+    for i, name in enumerate(names):
+        captured = capture.light(name, camera)[0]
+        near = three_nearest(capture, camera, capture.rig.light(name), held_out)
+        frames = {
+            "captured": captured,
+            "ours": ours[i],
+            "mean_colour": np.broadcast_to(colour, captured.shape),
+            "diffuse": diffuse[i],
+            "three_nearest": near,
+        }
+        out.append(_Compared(camera, name, frames, mask))
+    return out
+
+
+def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut) -> Array:
+    """`camera`'s captured frames under the three training lights nearest to `light`, mixed.
+
+    Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
+    distance to what `light` would give. `light` itself is never among the three.
+    """
+    others = [
+        capture.rig.light(n)
+        for n in held_out.training_lights(capture)
+        if n != light.name and capture.has_light(n, camera)
+    ]
+    positions = np.array([o.position for o in others])
+    distance = np.linalg.norm(positions, axis=1)
+    own = float(np.linalg.norm(light.position))
+    cosine = positions @ light.position / (distance * own)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    nearest = np.argsort(angle)[:3]
+    weights = 1.0 / np.maximum(angle[nearest], 1e-6)
+    weights /= weights.sum()
+    total = np.zeros(1)
+    for k, weight in zip(nearest, weights, strict=True):
+        here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
+        gain = here / np.maximum(there, 1e-12)
+        gain *= (distance[k] / own) ** 2
+        total = total + weight * gain * capture.light(others[k].name, camera)[0]
+    return np.asarray(total)
+
+
+def _scores(images: Sequence[_Compared], method: str, fitted: FittedAppearance) -> dict[str, float]:
+    """Means over `images` of a method's `metrics.scores` and relative error on the hair."""
+    found = []
+    for image in images:
+        radiance, truth = image.frames[method], image.frames["captured"]
+        shown, true = fitted.exposure(radiance), fitted.exposure(truth)
+        relative = relative_error(radiance, truth, image.mask)
+        found.append({**scores(shown, true, image.mask), "relative_error": relative})
+    return mean_scores(found)
+
+
+def judge(result: dict[str, Any], stage: Stage) -> None:
+    """Warn where a trivial baseline is not beaten."""
+    for group, rows in result.items():
+        for baseline in ("mean_colour", "diffuse"):
+            for figure in ("psnr", "ssim"):
+                if rows["ours"][figure] <= rows[baseline][figure]:
+                    stage.warn(f"{group}: the baseline {baseline} is not beaten in {figure}")
+
+
+def _rows(
+    groups: dict[str, list[_Compared]], fitted: FittedAppearance
+) -> list[tuple[str, dict[str, Array], dict[str, str]]]:
+    """Two rows a group for the picture: a label, pictures by column, and their scores."""
+    rows: list[tuple[str, dict[str, Array], dict[str, str]]] = []
+    for group, images in groups.items():
+        # the frames that show most: brightly lit hair, and from different cameras where there are
+        ranked = sorted(images, key=lambda c: -float(c.frames["captured"][c.mask].mean()))
+        picked = ranked[:1]
+        picked += [c for c in ranked if c.camera != picked[0].camera][:1] or ranked[1:2]
+        for c in picked:
+            shown: dict[str, Array] = {k: fitted.exposure(v) for k, v in c.frames.items()}
+            captions = {
+                k: f"{psnr(v, shown['captured'], c.mask):.1f} dB  "
+                f"{ssim(v, shown['captured'], c.mask):.2f}"
+                for k, v in shown.items()
+                if k != "captured"
+            }
+            rows.append((f"{group.replace('_', ' ')}\n{c.camera}, {c.light}", shown, captions))
+    return rows
+
+
+def _spread(items: Sequence[str], most: int) -> list[str]:
+    """`most` of `items`, evenly spread, or all where there are fewer."""
+    if len(items) <= most:
+        return list(items)
+    return [items[int((i + 0.5) * len(items) / most)] for i in range(most)]

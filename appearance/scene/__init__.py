@@ -1,0 +1,1 @@
+"""Scenes of hair for Mitsuba."""

@@ -1,0 +1,198 @@
+"""The Mitsuba scene of strands on a head, and the materials on it.
+
+The scene is in centimetres: Mitsuba offsets secondary rays by more than a fibre's radius when its
+unit is a metre (10 to 12 % too dark, measured). Radiance has no length in it, so a light of
+intensity I in W/sr becomes one of I · SCALE² and everything that a renderer returns is in
+W/(sr m²) without further ado.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from appearance.scene.backend import ensure_backend
+from appearance.scene.curves import spline_control_points
+from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
+from reconstruction.array_backend import for_kernels
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+
+SCALE = 100.0
+"""Scene units per metre."""
+
+
+@dataclass(frozen=True, eq=False)
+class HairScene:
+    """Geometry with its acceleration structure, and the materials that renderers put on it.
+
+    `mi_scene` is a `mitsuba.Scene` without emitters or sensors, in centimetres. `hair_bsdf` is a
+    `mitsuba.BSDF`, or None for `DiffuseHair`. The materials are not looked up through the scene's
+    shapes, so `with_hair` and `with_skin` share the geometry and cost nothing.
+    """
+
+    mi_scene: Any
+    hair_shape: Any | None
+    head_shape: Any | None
+    hair: HairAppearance | DiffuseHair
+    skin: tuple[float, float, float]
+    hair_bsdf: Any | None
+
+    def with_hair(
+        self, hair: HairAppearance | DiffuseHair, *, bsdf: str = "extended_hair"
+    ) -> HairScene:
+        """The same geometry with another hair material; nothing is rebuilt.
+
+        `bsdf` is the plugin of a `HairAppearance`: ours, or Mitsuba's `"hair"` for comparisons.
+        """
+        return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair, bsdf))
+
+    def material_shapes(self) -> dict[str, Any]:
+        """The shapes with their materials attached, as Mitsuba's own integrators expect them.
+
+        For comparisons with Mitsuba: the shapes are shared with this scene and keep the materials
+        of the latest call. The head gets a two-sided `diffuse`.
+        """
+        import mitsuba as mi
+
+        shapes: dict[str, Any] = {}
+        if self.hair_shape is not None:
+            bsdf = self.hair_bsdf
+            if isinstance(self.hair, DiffuseHair):
+                bsdf = mi.load_dict(_diffuse(self.hair.albedo))
+            self.hair_shape.set_bsdf(bsdf)
+            shapes["hair"] = self.hair_shape
+        if self.head_shape is not None:
+            skin = {"type": "twosided", "material": _diffuse(self.skin)}
+            self.head_shape.set_bsdf(mi.load_dict(skin))
+            shapes["head"] = self.head_shape
+        return shapes
+
+    def with_skin(self, skin: ArrayLike) -> HairScene:
+        """The same geometry with another diffuse albedo `skin (3,)` on the head."""
+        return replace(self, skin=_albedo(skin))
+
+
+def build_scene(
+    strands: Strands,
+    head: Mesh | None,
+    *,
+    hair: HairAppearance | DiffuseHair,
+    skin: ArrayLike = (0.35, 0.25, 0.2),
+) -> HairScene:
+    """Build the scene of `strands` on `head`; either may be empty or absent.
+
+    Strands become round cubic curves through their points (see `appearance.scene.curves`); the
+    head is a two-sided Lambertian surface of albedo `skin (3,)` in [0, 1] with flat faces. Raises
+    `ValueError` for albedos out of range.
+    """
+    ensure_backend()
+    import mitsuba as mi
+
+    albedo = _albedo(skin)
+    parts: dict[str, Any] = {"type": "scene"}
+    hair_shape = _curves(strands) if len(strands) else None
+    head_shape = _mesh(head) if head is not None and len(head.faces) else None
+    if hair_shape is not None:
+        parts["hair"] = hair_shape
+    if head_shape is not None:
+        parts["head"] = head_shape
+    return HairScene(mi.load_dict(parts), hair_shape, head_shape, hair, albedo, _hair_bsdf(hair))
+
+
+def mitsuba_hair(hair: HairAppearance, bsdf: str = "extended_hair") -> dict[str, Any]:
+    """The plugin `extended_hair` or Mitsuba's `hair`: the one place that knows their conventions.
+
+    Mitsuba's curves run along +y of the shading frame, from root to tip, and a positive
+    `scale_tilt` moves R towards the tip: the opposite of ours and of Blender's.
+    """
+    return {
+        "type": bsdf,
+        "longitudinal_roughness": hair.beta_m,
+        "azimuthal_roughness": hair.beta_n,
+        "scale_tilt": -hair.tilt_deg,
+        "int_ior": hair.eta,
+        "ext_ior": 1.0,
+        "sigma_a": {"type": "rgb", "value": list(hair.sigma_a)},
+    }
+
+
+def _hair_bsdf(hair: HairAppearance | DiffuseHair, bsdf: str = "extended_hair") -> Any | None:
+    if isinstance(hair, DiffuseHair):
+        return None
+    import mitsuba as mi
+
+    return mi.load_dict(mitsuba_hair(hair, bsdf))
+
+
+def _diffuse(albedo: tuple[float, float, float]) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}}
+
+
+def _albedo(skin: ArrayLike) -> tuple[float, float, float]:
+    values = np.asarray(skin, float)
+    if values.shape != (3,) or not ((values >= 0) & (values <= 1)).all():
+        raise ValueError(f"skin must be an albedo of 3 numbers in [0, 1], got {values}")
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _curves(strands: Strands) -> Any:
+    """A `bsplinecurve` of `strands`.
+
+    The plugin reads its curves from a text file only: it gets one short curve, and the real
+    arrays replace that one through its parameters.
+    """
+    import mitsuba as mi
+
+    points, segments = _guarded(*spline_control_points(strands))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "curve.txt"
+        file.write_text("0 0 0 1\n0 0 1 1\n0 0 2 1\n0 0 3 1\n")
+        shape = mi.load_dict({"type": "bsplinecurve", "filename": str(file)})
+    parameters = mi.traverse(shape)
+    parameters["control_point_count"] = len(points)
+    parameters["segment_indices"] = mi.UInt32(for_kernels(segments, np.uint32))
+    parameters["control_points"] = mi.Float(for_kernels((points * SCALE).ravel()))
+    parameters.update()
+    return shape
+
+
+def _guarded(
+    points: NDArray[np.float64], segments: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The curves and copies of their last segment, thin inside it, where no ray meets them.
+
+    Mitsuba finds a hit's segment back from one float32 coordinate over all segments. Rounding
+    takes a hit near the end of the last one past the end of its array (seen at a million segments:
+    a read out of bounds); it now finds the copy, which has the same axis.
+    """
+    copies = 1 + int(np.ceil(len(segments) * np.finfo(np.float32).eps))
+    last = points[segments[-1] : segments[-1] + 4] * (1, 1, 1, 1e-3)
+    return (
+        np.concatenate([points, last]),
+        np.concatenate([segments, np.full(copies, len(points))]),
+    )
+
+
+def _mesh(head: Mesh) -> Any:
+    import mitsuba as mi
+
+    mesh = mi.Mesh("head", len(head.vertices), len(head.faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(for_kernels((head.vertices * SCALE).ravel()))
+    parameters["faces"] = mi.UInt32(for_kernels(head.faces.ravel(), np.uint32))
+    parameters.update()
+    return mesh
+
+
+def light_arrays(lights: Sequence[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Positions and intensities `(L, 3)` of `lights` in the scene's units."""
+    position = np.array([light.position for light in lights], float).reshape(-1, 3) * SCALE
+    intensity = np.array([light.intensity for light in lights], float).reshape(-1, 3) * SCALE**2
+    return position.astype(np.float32), intensity.astype(np.float32)

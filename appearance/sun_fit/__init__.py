@@ -1,0 +1,1 @@
+"""Roughness and colour of hair from OLAT frames (Sun et al. 2021, §5)."""

@@ -1,0 +1,324 @@
+"""Fit the appearance of a reconstructed model to the OLAT frames of its capture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.metrics.scores import Exposure
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import HairScene, build_scene
+from appearance.sun_fit.longitudinal import (
+    absorption_of_colour,
+    roughness_of_variance,
+    variance_of_roughness,
+)
+from appearance.sun_fit.mirror_samples import MirrorSamples, binned, mirror_lights, mirror_samples
+from appearance.sun_fit.roughness_and_colour import (
+    Colours,
+    Lobe,
+    fit_colour,
+    fit_lobe,
+    fit_lobe_as_printed,
+    match_roughness,
+)
+from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
+from reconstruction.capture.folder import Capture
+from reconstruction.files.strands import read_strands
+from reconstruction.head.fitted import model_head
+from reconstruction.report.report import Progress, Report, Series, Stage, silent
+
+BETA_N = 0.2
+"""Azimuthal roughness, fixed as in Sun §5.1."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How much of a capture a fit looks at: pixels a camera, and samples a pixel when rendering."""
+
+    hair_pixels: int = 1000
+    skin_pixels: int = 200
+    roughness_cameras: int = 4
+    roughness_spp: int = 12
+    colour_spp: int = 16
+    iterations: int = 5
+    max_depth: int = 16
+
+
+def fit(
+    capture: Capture,
+    model: Path,
+    *,
+    held_out: HeldOut | None = None,
+    options: FitOptions | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> Report:
+    """Fit roughness, hair colour and skin colour (Sun 2021, §5) and write `appearance.json`.
+
+    Reads `strands.npz` and `masks/` of the folder `model` and the OLAT frames of `capture` that are
+    not `held_out`. The stages "samples", "roughness" and "colour" go into the model's `report.json`
+    and the report is returned. Raises `CaptureError` or `ValueError` naming what is missing.
+    """
+    held_out, options = held_out or HeldOut(), options or FitOptions()
+    held_out.check(capture)
+    strands = read_strands(model / "strands.npz")
+    if len(strands) == 0:
+        raise ValueError(f"{model / 'strands.npz'} has no strands: there is no hair to fit")
+    report = Report.load(model / "report.json")
+    with report.stage("samples") as stage:
+        progress("reading hair pixels", 0.0)
+        hair, skin = _observed(capture, model, held_out, options, stage, progress, seed)
+        exposure = Exposure.of([o.radiance[o.valid] for o in hair])
+        hair, skin = _reached(capture, hair, skin, exposure, stage)
+    start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
+    head = model_head(model, capture)
+    scene = build_scene(strands, head, hair=start)
+    fitting = SunFit(scene, hair, skin, options, seed, progress)
+    with report.stage("roughness") as stage:
+        plain, printed, corrected, first = fitting.roughness(stage)
+    with report.stage("colour") as stage:
+        colours = fitting.colour(corrected, np.array(first.colour), np.array(first.skin), stage)
+        if head is None:
+            stage.leave_out("skin colour", "there is no head mesh", "its renderings")
+        elif not skin:
+            stage.warn("no camera sees skin: its colour is a guess")
+    fitted = FittedAppearance(
+        colours.hair,
+        colours.colour,
+        colours.skin,
+        exposure,
+        float(variance_of_roughness(corrected)),
+        plain.v,
+        printed,
+    )
+    fitted.save(model)
+    report.save(model / "report.json")
+    progress("appearance fitted", 1.0)
+    return report
+
+
+def _observed(
+    capture: Capture,
+    model: Path,
+    held_out: HeldOut,
+    options: FitOptions,
+    stage: Stage,
+    progress: Progress,
+    seed: int,
+) -> tuple[list[Observed], list[Observed]]:
+    """Hair and skin pixels of the training cameras under the training lights."""
+    rng = np.random.default_rng(seed)
+    cameras, lights = held_out.training_cameras(capture), held_out.training_lights(capture)
+    hair, skin, seen = [], [], 0
+    has_head = model_head(model, capture) is not None
+    for i, name in enumerate(cameras):
+        progress("reading hair pixels", 0.3 * i / len(cameras))
+        mask = model_mask(model, name, "hair", capture)
+        bare = model_mask(model, name, "skin", capture) & ~mask
+        seen += int(mask.sum())
+        wanted = chosen(mask, options.hair_pixels, rng)
+        beside = chosen(bare if has_head else bare & False, options.skin_pixels, rng)
+        both = observe(capture, name, lights, np.concatenate([wanted, beside]))
+        is_hair = np.arange(len(both.pixels)) < len(wanted)
+        if len(wanted):
+            hair.append(both.where(is_hair))
+        if len(beside) >= 10:
+            skin.append(both.where(~is_hair))
+        if missing := int((~both.valid.any(axis=1)).sum()):
+            stage.warn(f"{name}: {missing} of {len(lights)} lights have no usable frame")
+    if not hair:
+        raise ValueError(f"{model}: the hair masks of the cameras {cameras} are all empty")
+    kept = sum(len(o.pixels) for o in hair)
+    stage.figures |= {"cameras": len(cameras), "lights": len(lights), "hair_pixels": kept}
+    if kept < seen:
+        stage.leave_out(
+            f"{seen - kept} of {seen} hair pixels",
+            "means and lobes are known to a per cent from the others",
+            f"{1 - kept / seen:.0%} of the renderings",
+        )
+    return hair, skin
+
+
+def _reached(
+    capture: Capture,
+    hair: list[Observed],
+    skin: list[Observed],
+    exposure: Exposure,
+    stage: Stage,
+) -> tuple[list[Observed], list[Observed]]:
+    """Leave out the lights that reach no hair pixel of any camera."""
+    noise = 0.0
+    for o in hair[:1]:
+        for step in capture.of_kind("dark"):
+            if capture.has(step, o.camera.name):
+                frame = capture.frame(step, o.camera.name).reshape(-1, 3)[o.pixels]
+                noise = max(noise, float(frame.std()))
+    threshold = max(5 * noise, 1e-3 / exposure.scale)
+    peak = np.max([np.where(o.valid[..., None], o.radiance, 0).max((1, 2)) for o in hair], axis=0)
+    lit = np.flatnonzero(peak > threshold)
+    if len(lit) < len(peak):
+        names = [hair[0].lights[i].name for i in np.flatnonzero(peak <= threshold)]
+        stage.leave_out(
+            f"{len(names)} of {len(peak)} lights: {', '.join(names[:5])} …",
+            "they reach no hair pixel",
+            f"{len(names) / len(peak):.0%} of the shadow rays",
+        )
+    if len(lit) == 0:
+        raise ValueError(f"{capture.path}: no light reaches a hair pixel")
+    stage.figures["lights_that_reach_hair"] = len(lit)
+    return [_under(o, lit) for o in hair], [_under(o, lit) for o in skin]
+
+
+def _under(o: Observed, lights: NDArray[np.int64]) -> Observed:
+    names = tuple(o.lights[i] for i in lights)
+    return replace(o, lights=names, radiance=o.radiance[lights], valid=o.valid[lights])
+
+
+class SunFit:
+    """The observations and the geometry that the two fits share."""
+
+    def __init__(
+        self,
+        scene: HairScene,
+        hair: Sequence[Observed],
+        skin: Sequence[Observed],
+        options: FitOptions,
+        seed: int,
+        progress: Progress,
+    ) -> None:
+        self.scene, self.hair, self.skin = scene, hair, skin
+        self.options, self.seed, self.progress = options, seed, progress
+
+    def roughness(self, stage: Stage) -> tuple[Lobe, float, float, Colours]:
+        """The plain lobe, Eq. 10's variance, the corrected β_M and a first colour."""
+        start = time.perf_counter()
+        self.progress("measuring the highlight", 0.3)
+        step = max(1, len(self.hair) // self.options.roughness_cameras)
+        views = self._views(self.hair[::step][: self.options.roughness_cameras])
+        if len(views) < len(self.hair):
+            stage.leave_out(
+                f"{len(self.hair) - len(views)} of {len(self.hair)} cameras",
+                "the highlight is the same from all of them",
+                f"{1 - len(views) / len(self.hair):.0%} of the renderings",
+            )
+        views = [(o, f) for o, f in views if len(o.lights)]
+        if not views:
+            raise ValueError("no light lies near a mirror direction of any hair pixel")
+        mean = sum(o.radiance.mean((0, 1)) for o, _ in views)
+        channel = int(np.argmin(mean))
+        plain, printed, count = self._read(views, channel)
+        self.progress("a first colour", 0.4)
+        first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"), 2)
+        series = Series("roughness", "|log β_M measured − log β_M of the rendering|")
+        stage.series.append(series)
+
+        def rendered(beta: float) -> float:
+            self.progress("matching the highlight", 0.5 + 0.05 * len(series.points))
+            lit = self.scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
+            found = self._read([(self._render(lit, o), f) for o, f in views], channel)[0].beta_m
+            error = abs(float(np.log(found / plain.beta_m)))
+            series.points.append((time.perf_counter() - start, error))
+            return found
+
+        corrected, pairs = match_roughness(plain.beta_m, rendered, plain.beta_m)
+        stage.figures |= {
+            "samples": count,
+            "channel": "RGB"[channel],
+            "sun_v": plain.v,
+            "sun_beta_m": plain.beta_m,
+            "sun_v_as_printed": printed,
+            "sun_beta_m_as_printed": float(roughness_of_variance(printed)),
+            "lobe_residual": plain.residual,
+            "beta_m": corrected,
+            "v": float(variance_of_roughness(corrected)),
+            "rendered_against_read": [list(p) for p in pairs],
+        }
+        if plain.gain <= 0 or plain.residual > 0.4:
+            stage.warn("no clear highlight: the roughness is poorly determined")
+        return plain, printed, corrected, first
+
+    def colour(
+        self,
+        beta_m: float,
+        start: NDArray[np.float64] | None,
+        skin: NDArray[np.float64],
+        stage: Stage,
+        iterations: int | None = None,
+    ) -> Colours:
+        """Hair and skin colour at a roughness; errors against run time go into `stage`."""
+        began = time.perf_counter()
+        series = Series("hair colour", "relative error of the mean colour under uniform light")
+        stage.series.append(series)
+
+        def told(error: float) -> None:
+            series.points.append((time.perf_counter() - began, error))
+            self.progress("matching the colour", min(0.7 + 0.05 * len(series.points), 0.95))
+
+        base = HairAppearance((0.1, 0.1, 0.1), beta_m, BETA_N)
+        result = fit_colour(
+            self.scene.with_hair(base).with_skin(skin),
+            self.hair,
+            self.skin,
+            start=start,
+            iterations=iterations or self.options.iterations,
+            spp=self.options.colour_spp,
+            max_depth=self.options.max_depth,
+            seed=self.seed,
+            told=told,
+        )
+        stage.figures |= {
+            "colour": list(result.colour),
+            "sigma_a": list(result.hair.sigma_a),
+            "sigma_a_of_first_guess": absorption_of_colour(result.first, BETA_N).tolist(),
+            "skin": list(result.skin),
+            "relative_error": min(result.errors),
+        }
+        if min(result.errors) > 0.05:
+            stage.warn(
+                f"the mean colour is off by {min(result.errors):.0%}: is the geometry whole?"
+            )
+        return result
+
+    def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:
+        """Observed pixels with their fibres, under the lights near a mirror direction."""
+        out = []
+        for o in hair:
+            fibres = visible_fibres(self.scene, o.camera, o.pixels, seed=self.seed)
+            near = mirror_lights(o, fibres, tilt_deg=self._tilt)
+            out.append((_under(o, near), fibres))
+        return out
+
+    def _read(
+        self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
+    ) -> tuple[Lobe, float, int]:
+        bins = binned(
+            MirrorSamples.joined(
+                [mirror_samples(o, f, tilt_deg=self._tilt, channel=channel) for o, f in views]
+            )
+        )
+        return fit_lobe(bins), fit_lobe_as_printed(bins), int(bins.count.sum())
+
+    def _render(self, scene: HairScene, o: Observed) -> Observed:
+        radiance = render_olat(
+            scene,
+            o.camera,
+            o.lights,
+            spp=self.options.roughness_spp,
+            max_depth=self.options.max_depth,
+            seed=self.seed,
+            pixels=o.pixels,
+        )
+        return replace(o, radiance=radiance)
+
+    @property
+    def _tilt(self) -> float:
+        return getattr(self.scene.hair, "tilt_deg", 0.0)

@@ -1,0 +1,179 @@
+"""BSDF samples near the mirror direction of hair fibres (Sun et al. 2021, Eq. 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.observations import Observed
+from appearance.sun_fit.longitudinal import longitudinal
+from appearance.sun_fit.visible_fibres import VisibleFibres
+
+Array = NDArray[np.float64]
+
+WINDOW = np.pi / 6
+"""Sun Eq. 9: how far from the mirror direction samples are taken, both ways."""
+BINS = 32
+_PAIRS = 96  # directions kept a bin, each with all its pixel's fibres, to average the model over
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorSamples:
+    """Hair pixels under lights near their mirror direction, `n` samples in `K` rays a pixel.
+
+    `deviation (n,)` is θ_i + θ_o + 2 tilt, signed, at the pixel's mean tangent; `value (n,)` is
+    radiance over the light's irradiance across the ray, 1/sr. `theta_i`, `theta_o (n, K)` are the
+    inclinations at each ray's fibre, the tilt already added to `theta_o`; `hair (n, K)` marks the
+    rays that met one.
+    """
+
+    deviation: Array
+    value: Array
+    theta_i: Array
+    theta_o: Array
+    hair: NDArray[np.bool_]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The samples of several views as one."""
+        names = [f.name for f in fields(cls)]
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class LobeBins:
+    """Mean BSDF values over the deviation from the mirror direction; empty bins are not kept.
+
+    `deviation`, `value (B,)` and its standard error `error (B,)`; `count (B,)` samples. `theta_i`,
+    `theta_o (B, S, K)` are the inclinations of S of them; `weight (B, S, K)` sums to 1 a bin.
+    """
+
+    deviation: Array
+    value: Array
+    error: Array
+    count: NDArray[np.int64]
+    theta_i: Array
+    theta_o: Array
+    weight: Array
+
+    def lobe(self, v: float) -> Array:
+        """Sun's Eq. 8 with variance `v` in each bin `(B,)`, over the tangents that pixels mix."""
+        return np.asarray((longitudinal(self.theta_i, self.theta_o, v) * self.weight).sum((1, 2)))
+
+
+def mirror_samples(
+    observed: Observed,
+    fibres: VisibleFibres,
+    *,
+    tilt_deg: float,
+    channel: int,
+    least_share: float = 0.9,
+    most_spread: float = 0.06,
+) -> MirrorSamples:
+    """Samples of one view with |θ_i + θ_o + 2 tilt| and |φ_i − φ_o| below π/6 (Eq. 9).
+
+    `channel` is the colour channel to take: the darkest
+    has the least light from inside the fibres. Pixels with less hair than `least_share`, or whose
+    tangents vary by more than `most_spread` rad², are left out.
+    """
+    near, theta, towards, squared = _near_mirror(
+        observed, fibres, tilt_deg, least_share, most_spread
+    )
+    light, pixel = np.nonzero(near)
+    middle = _middle(fibres)
+    shines = np.array([lamp.intensity_towards(middle)[:, channel] for lamp in observed.lights])
+    tangent = fibres.tangent[pixel].astype(float)
+    intensity = np.maximum(shines[light, pixel], 1e-12)
+    value = observed.radiance[light, pixel, channel] * squared[light, pixel] / intensity
+    to_camera = _unit(observed.camera.center - middle)
+    theta_o = _angle(np.einsum("pi,pki->pk", to_camera, fibres.tangent)) + 2 * np.radians(tilt_deg)
+    return MirrorSamples(
+        theta[light, pixel],
+        value / fibres.share[pixel],
+        _angle(np.einsum("ni,nki->nk", towards[light, pixel], tangent)),
+        theta_o[pixel],
+        fibres.hair[pixel],
+    )
+
+
+def mirror_lights(
+    observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, least: float = 0.03
+) -> NDArray[np.int64]:
+    """Indices of the lights that are near the mirror direction of a share `least` of the pixels."""
+    near = _near_mirror(observed, fibres, tilt_deg, 0.9, 0.06)[0]
+    return np.flatnonzero(near.sum(axis=1) > least * near.shape[1])
+
+
+def binned(samples: MirrorSamples, *, seed: int = 0) -> LobeBins:
+    """Average the samples in 32 bins of |deviation| up to π/6 (Sun §5.1).
+
+    Raises `ValueError` where under 100 samples in 8 bins are left: the lights are too few, or the
+    hair's directions unknown.
+    """
+    inside = np.abs(samples.deviation) < WINDOW
+    bin_of = np.where(inside, (np.abs(samples.deviation) / WINDOW * BINS).astype(int), BINS)
+    counts = np.bincount(bin_of, minlength=BINS + 1)[:BINS]
+    keep = np.flatnonzero(counts >= 5)
+    if counts.sum() < 100 or len(keep) < 8:
+        raise ValueError(
+            f"only {counts.sum()} samples in {len(keep)} of {BINS} bins lie near the mirror "
+            "direction: the roughness needs more lights, or more hair pixels of one direction"
+        )
+    rng = np.random.default_rng(seed)
+    by_bin = np.split(np.argsort(bin_of, kind="stable"), np.cumsum(counts))
+    members = [by_bin[b] for b in keep]
+    take = np.array([rng.choice(m, _PAIRS) for m in members])
+    weight = samples.hair[take].astype(float)
+    return LobeBins(
+        deviation=np.array([np.abs(samples.deviation[m]).mean() for m in members]),
+        value=np.array([samples.value[m].mean() for m in members]),
+        error=np.array([samples.value[m].std() / np.sqrt(len(m)) for m in members]),
+        count=counts[keep],
+        theta_i=samples.theta_i[take],
+        theta_o=samples.theta_o[take],
+        weight=weight / weight.sum(axis=(1, 2), keepdims=True),
+    )
+
+
+def _near_mirror(
+    observed: Observed,
+    fibres: VisibleFibres,
+    tilt_deg: float,
+    least_share: float,
+    most_spread: float,
+) -> tuple[NDArray[np.bool_], Array, Array, Array]:
+    """Which samples to take `(L, P)`, their deviations, and the way to the light and its square."""
+    middle = _middle(fibres)
+    mean = _unit(fibres.tangent.sum(axis=1, dtype=float))
+    to_camera = _unit(observed.camera.center - middle)
+    positions = np.array([light.position for light in observed.lights])
+    towards = positions[:, None] - middle
+    squared = (towards**2).sum(axis=-1)
+    towards /= np.sqrt(squared)[..., None]
+    sin_o, sin_i = (to_camera * mean).sum(-1), (towards * mean).sum(-1)
+    across_o = _unit(to_camera - sin_o[:, None] * mean)
+    across_i = _unit(towards - sin_i[..., None] * mean)
+    deviation = _angle(sin_i) + _angle(sin_o) + 2 * np.radians(tilt_deg)
+    near = (np.abs(deviation) < WINDOW) & observed.valid
+    near &= (across_i * across_o).sum(-1) > np.cos(WINDOW)
+    near &= (fibres.share >= least_share) & (fibres.spread() <= most_spread)
+    near &= np.array([(light.intensity > 0).all() for light in observed.lights])[:, None]
+    return near, deviation, towards, squared
+
+
+def _middle(fibres: VisibleFibres) -> Array:
+    """Mean of the points that a pixel's rays met `(P, 3)`."""
+    count = np.maximum(fibres.hair.sum(axis=1), 1)
+    return np.asarray(fibres.point.sum(axis=1, dtype=float) / count[:, None])
+
+
+def _angle(sine: Array) -> Array:
+    return np.arcsin(np.clip(sine, -1.0, 1.0))
+
+
+def _unit(a: Array) -> Array:
+    return np.asarray(a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-12))

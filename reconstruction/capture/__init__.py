@@ -1,0 +1,1 @@
+"""Capture folders: read, written, verified, compressed, imported, and views of them."""

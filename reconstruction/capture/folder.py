@@ -1,0 +1,270 @@
+"""Capture folders: what the stage shot, and with which commands.
+
+capture/
+  rig.json        calibrated geometry (`Rig.to_dict`)
+  plan.json       {"steps": [Step, ...], ...}: the commanded sequence
+  journal.jsonl   append-only, fsynced: one line per frame, shot or missing; whoever writes or
+                  compresses the capture holds its lock
+  frames/00012/cam_00.exr    (cam_00.zip.exr once compressed)
+  masks/cam_00.png    hair masks from the user, optional
+  head.obj            the digitised head, optional
+  manifest.json   written last: state, outcome, counts, checksums of the small files and of the
+                  journal, whose lines hold the frames' checksums
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.files.exr import read_exr
+from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.rig import Rig
+
+T = TypeVar("T")
+StepKind = Literal["dark", "all_on", "olat", "scanline", "tracking"]
+
+
+class CaptureError(ValueError):
+    """A capture folder that cannot be used as asked; the message names file and field."""
+
+
+class MissingFrame(CaptureError):
+    """A frame that was planned but never arrived."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One commanded exposure of every camera.
+
+    `level` scales the lamps (`olat`, `all_on`) or the projector (`scanline`, `tracking`: all
+    projectors on), 0 to 1; `exposure` is in seconds.
+    """
+
+    index: int
+    kind: StepKind
+    exposure: float
+    level: float = 1.0
+    light: str | None = None
+    projector: str | None = None
+    row: int | None = None
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Step:
+        """Read one entry of `plan.json`; raises `CaptureError` naming the field that is wrong."""
+        unknown = set(data) - {f.name for f in fields(cls)}
+        if unknown:
+            raise CaptureError(f"plan.json: step has unknown fields {sorted(unknown)}: {data}")
+        try:
+            step = cls(**data)
+        except TypeError as error:
+            raise CaptureError(f"plan.json: step {data}: {error}") from error
+        if step.kind not in get_args(StepKind):
+            raise CaptureError(f"plan.json: step {step.index}: unknown kind {step.kind!r}")
+        return step
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready description without the fields that are None."""
+        return {k: v for k, v in asdict(self).items() if v is not None}
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One line of the journal: a frame that was written, or a frame that never came.
+
+    `file` is relative to the capture folder, None for a missing frame; `pulse` is the trigger
+    box's count, `block_id` and `timestamp` the camera's; `reason` says why a frame is missing.
+    """
+
+    step: int
+    camera: str
+    file: str | None
+    sha256: str | None = None
+    pulse: int | None = None
+    block_id: int | None = None
+    timestamp: float | None = None
+    attempt: int = 0
+    recorded: str = ""
+    reason: str | None = None
+
+
+class Capture:
+    """A capture folder, read. See the module's docstring for its layout."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not (self.path / "rig.json").is_file() or not (self.path / "plan.json").is_file():
+            raise CaptureError(f"{self.path} is not a capture: expected rig.json and plan.json")
+        self.rig = Rig.load(self.path / "rig.json")
+        self.plan: dict[str, Any] = json.loads((self.path / "plan.json").read_text())
+        self.steps = tuple(Step.from_dict(s) for s in self.plan["steps"])
+        self.records = dict(self._journal())
+
+    def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:
+        """Records by (step, camera); later lines win. A torn last line is what a crash leaves."""
+        path = self.path / "journal.jsonl"
+        lines = path.read_text().splitlines() if path.is_file() else []
+        for number, line in enumerate(lines, 1):
+            try:
+                record = FrameRecord(**json.loads(line))
+            except (json.JSONDecodeError, TypeError) as error:
+                if number == len(lines):
+                    return
+                raise CaptureError(f"{path}, line {number}: {error}") from error
+            yield (record.step, record.camera), record
+
+    @cached_property
+    def manifest(self) -> dict[str, Any] | None:
+        """The manifest, or None while the capture is not finished."""
+        path = self.path / "manifest.json"
+        return json.loads(path.read_text()) if path.is_file() else None
+
+    def has(self, step: Step, camera: str) -> bool:
+        """Whether the frame was written."""
+        record = self.records.get((step.index, camera))
+        return record is not None and record.file is not None
+
+    def frame(self, step: Step, camera: str) -> NDArray[np.float32]:
+        """Scene-linear radiance `(H, W, 3)`, W/(sr m²), as exposed: at the step's lamp level.
+
+        Noise may push dark pixels below zero. Raises `MissingFrame`.
+        """
+        return self._read(step, camera)[0]
+
+    def response(self, step: Step, camera: str) -> NDArray[np.float32]:
+        """`frame` divided by the step's level: the answer to the lamp at full intensity."""
+        image = self.frame(step, camera)
+        return image if step.level in (0, 1) else image / np.float32(step.level)
+
+    def saturated(self, step: Step, camera: str) -> NDArray[np.bool_]:
+        """Pixels `(H, W)` with a channel at the sensor's full scale."""
+        return self.response_and_saturated(step, camera)[1]
+
+    def response_and_saturated(
+        self, step: Step, camera: str
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """`response` and `saturated` of one frame for the price of reading it once."""
+        image, attributes = self._read(step, camera)
+        full_scale = float(attributes.get("fullScale", np.inf))
+        saturated = np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))
+        return (image if step.level in (0, 1) else image / np.float32(step.level)), saturated
+
+    def count_scale(self, step: Step, camera: str) -> float:
+        """Radiance of one count of the sensor in this frame; 0 where it was not quantised."""
+        return float(self._read(step, camera)[1].get("countScale", 0.0))
+
+    def has_light(self, light: str, camera: str) -> bool:
+        """Whether a frame of this light alone was written, at any exposure."""
+        return any(self.has(s, camera) for s in self._of_light.get(light, ()))
+
+    def light(self, light: str, camera: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Response `(H, W, 3)` to one light alone, and where `(H, W)` it is saturated.
+
+        Where the light was shot with several exposures, their mean with the weight of exposure
+        (the photons counted), without saturated pixels; saturated is what even the shortest
+        exposure saturates. Raises `MissingFrame` where none of them came.
+        """
+        steps = self._of_light.get(light)
+        if steps is None:
+            raise MissingFrame(f"{self.path}: the plan has no frame for the light {light!r}")
+        steps = [s for s in steps if self.has(s, camera)] or steps[:1]
+        if len(steps) == 1:
+            return self.response_and_saturated(steps[0], camera)
+        total = np.zeros((*self._shape(camera), 3), np.float32)
+        weight = np.zeros(self._shape(camera), np.float32)
+        by_exposure = sorted(steps, key=lambda s: s.exposure)
+        shortest, clipped = self.response_and_saturated(by_exposure[0], camera)
+        for step in by_exposure:
+            image, saturated = self.response_and_saturated(step, camera)
+            used = np.float32(step.exposure) * ~saturated
+            total += used[..., None] * image
+            weight += used
+        merged = total / np.maximum(weight, np.finfo(np.float32).tiny)[..., None]
+        return np.where(weight[..., None] > 0, merged, shortest), clipped
+
+    @cached_property
+    def _of_light(self) -> dict[str, list[Step]]:
+        out: dict[str, list[Step]] = {}
+        for step in self.of_kind("olat"):
+            assert step.light is not None
+            out.setdefault(step.light, []).append(step)
+        return out
+
+    def read_file(self, step: Step, camera: str, read: Callable[[Path], T]) -> T:
+        """What `read` makes of a frame's file; raises what it raises, and `MissingFrame`.
+
+        Compression may put another file in its place at any moment: where it has gone, the
+        journal is read anew.
+        """
+        file = self._file(step, camera)
+        while True:
+            try:
+                return read(file)
+            except (OSError, ValueError):
+                if file.exists():
+                    raise
+                self.records = dict(self._journal())
+                gone, file = file, self._file(step, camera)
+                if file == gone:
+                    raise
+
+    def _file(self, step: Step, camera: str) -> Path:
+        record = self.records.get((step.index, camera))
+        if record is None or record.file is None:
+            why = record.reason if record is not None else "it was never shot"
+            raise MissingFrame(f"{self.path}: step {step.index} ({step.kind}), {camera}: {why}")
+        return self.path / record.file
+
+    def _read(self, step: Step, camera: str) -> tuple[NDArray[np.float32], dict[str, float | str]]:
+        return self.read_file(step, camera, read_exr)
+
+    def of_kind(self, kind: StepKind) -> tuple[Step, ...]:
+        """Steps of one kind in the order they were shot."""
+        return tuple(s for s in self.steps if s.kind == kind)
+
+    def olat(self, camera: str, lights: list[str] | None = None) -> NDArray[np.float32]:
+        """Responses `(L, H, W, 3)` to single lights, in the order of `lights` (default: rig order).
+
+        Raises `MissingFrame` when one of them was not shot.
+        """
+        names = self.olat_lights() if lights is None else lights
+        absent = [n for n in names if n not in self._of_light]
+        if absent:
+            raise MissingFrame(f"{self.path}: the plan has no frame for the lights {absent[:5]}")
+        out = np.empty((len(names), *self._shape(camera), 3), np.float32)
+        for i, name in enumerate(names):
+            out[i] = self.light(name, camera)[0]
+        return out
+
+    def olat_lights(self) -> list[str]:
+        """Names of the lights that were shot one at a time, in rig order."""
+        return [light.name for light in self.rig.lights if light.name in self._of_light]
+
+    def mask(self, camera: str) -> NDArray[np.bool_] | None:
+        """The user's hair mask `(H, W)` (half grey and above), or None when there is none."""
+        path = self.path / "masks" / f"{camera}.png"
+        if not path.is_file():
+            return None
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None or image.shape != self._shape(camera):
+            found = None if image is None else image.shape
+            raise CaptureError(f"{path}: expected a {self._shape(camera)} grey PNG, got {found}")
+        return np.asarray(image >= 128)
+
+    @cached_property
+    def head(self) -> Mesh | None:
+        """The digitised head, or None when the capture has none."""
+        path = self.path / "head.obj"
+        return read_obj(path) if path.is_file() else None
+
+    def _shape(self, camera: str) -> tuple[int, int]:
+        c = self.rig.camera(camera)
+        return c.height, c.width

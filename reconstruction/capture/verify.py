@@ -1,0 +1,152 @@
+"""Re-reading a whole capture folder and saying what is wrong with it."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from reconstruction.capture.folder import Capture, FrameRecord
+from reconstruction.capture.writer import sha256
+from reconstruction.files.exr import read_exr
+from reconstruction.report.report import Progress, silent
+
+
+def verify(path: str | Path, progress: Progress = silent) -> list[str]:
+    """Re-read every file of a capture; returns one sentence per problem, none for a sound one.
+
+    Checked: the small files and the journal against the manifest, every frame against its
+    checksum, that it decodes and has its camera's size, that no planned frame is missing, and
+    that no file lies among the frames that is none.
+    """
+    path = Path(path)
+    try:
+        capture = Capture(path)
+    except (ValueError, KeyError, OSError) as error:
+        return [f"The capture cannot be read: {error}"]
+    problems = _journal(path) + _manifest(capture)
+    recorded = [r for r in capture.records.values() if r.file is not None]
+    for i, record in enumerate(recorded):
+        problems += _frame(capture, _now(capture, record))
+        progress("verifying frames", (i + 1) / len(recorded))
+    return problems + _absent(capture) + _left_over(path)
+
+
+def _journal(path: Path) -> list[str]:
+    journal = path / "journal.jsonl"
+    if not journal.is_file():
+        return ["journal.jsonl is missing: no frame can be accounted for."]
+    data = journal.read_bytes()
+    if data and not data.endswith(b"\n"):
+        return [
+            "journal.jsonl ends in a torn line, as a crash while shooting leaves it: the frame it "
+            "was about is not accounted for."
+        ]
+    return []
+
+
+def _manifest(capture: Capture) -> list[str]:
+    try:
+        manifest = capture.manifest
+    except json.JSONDecodeError as error:
+        return [f"manifest.json is not JSON: {error}."]
+    if manifest is None:
+        return ["manifest.json is missing: the capture was not finished."]
+    problems = []
+    if manifest.get("outcome") != "completed":
+        problems.append(f"The capture's outcome is {manifest.get('outcome')!r}, not 'completed'.")
+    files: dict[str, str] = manifest.get("files", {})
+    for name, expected in files.items():
+        file = capture.path / name
+        if not file.is_file():
+            problems.append(f"{name} is missing; the manifest lists it.")
+        elif sha256(file) != expected:
+            problems.append(f"{name} does not match its checksum in the manifest.")
+    return problems + _journal_checksum(capture.path / "journal.jsonl", manifest.get("journal", {}))
+
+
+def _journal_checksum(journal: Path, known: dict[str, Any]) -> list[str]:
+    if not journal.is_file():
+        return []
+    data = journal.read_bytes()
+    if len(data) < known.get("bytes", 0):
+        return [f"journal.jsonl has {len(data)} bytes, fewer than the manifest's {known['bytes']}."]
+    if hashlib.sha256(data[: known.get("bytes", 0)]).hexdigest() != known.get("sha256"):
+        return ["journal.jsonl does not match its checksum in the manifest."]
+    return []
+
+
+def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
+    """The record as it is now, where compression has put another file in its place."""
+    assert record.file is not None
+    if (capture.path / record.file).exists():
+        return record
+    now = Capture(capture.path).records[record.step, record.camera]
+    return record if now.file is None else now
+
+
+def _left_over(path: Path) -> list[str]:
+    """Files that an interrupted write or compression left; none can be told while one goes on."""
+    journal = path / "journal.jsonl"
+    if not journal.is_file():
+        return []
+    with journal.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return []
+        known = {path / r.file for r in Capture(path).records.values() if r.file is not None}
+        found = {p for p in path.glob("frames/**/*") if p.is_file()}
+    strangers = sorted(str(p.relative_to(path)) for p in found - known)
+    if not strangers:
+        return []
+    return [
+        f"{len(strangers)} files among the frames are in no line of the journal, left by a write "
+        f"or a compression that was interrupted; the first is {strangers[0]}."
+    ]
+
+
+def _frame(capture: Capture, record: FrameRecord) -> list[str]:
+    assert record.file is not None
+    what = f"{record.file} (step {record.step}, {record.camera})"
+    try:
+        camera = capture.rig.camera(record.camera)
+    except KeyError:
+        return [f"{what}: the rig has no such camera."]
+    file = capture.path / record.file
+    if not file.is_file():
+        return [f"{what} is missing; the journal lists it."]
+    if sha256(file) != record.sha256:
+        return [f"{what} does not match its checksum in the journal."]
+    try:
+        image, _ = read_exr(file)
+    except ValueError as error:
+        return [f"{what} does not decode: {error}."]
+    if image.shape != (camera.height, camera.width, 3):
+        expected = (camera.height, camera.width, 3)
+        return [f"{what} has the shape {image.shape}, its camera's is {expected}."]
+    return []
+
+
+def _absent(capture: Capture) -> list[str]:
+    problems, never = [], []
+    for step in capture.steps:
+        for camera in capture.rig.cameras:
+            if capture.has(step, camera.name):
+                continue
+            record = capture.records.get((step.index, camera.name))
+            if record is None:
+                never.append((step, camera.name))
+            else:
+                problems.append(
+                    f"Step {step.index} ({step.kind}), {camera.name} is missing: {record.reason}."
+                )
+    if never:
+        step, name = never[0]
+        problems.append(
+            f"{len(never)} planned frames were never shot; the first is step {step.index} "
+            f"({step.kind}), {name}."
+        )
+    return problems

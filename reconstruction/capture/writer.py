@@ -1,0 +1,367 @@
+"""Writing capture folders: frames first, then their journal lines, the manifest last.
+
+A crash at any moment leaves every frame that the journal names whole: a frame's file is flushed
+and renamed before its line is appended and flushed. `reopen` continues such a folder. A full disk
+raises `DiskFull`, before that while there is still room to `finish`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from io import FileIO
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture.folder import Capture, CaptureError, FrameRecord, Step
+from reconstruction.files.durable import (
+    RESERVE,
+    append_whole,
+    flush,
+    part,
+    replace_durably,
+    require_free,
+    write_pages,
+    write_whole,
+)
+from reconstruction.files.exr import UncompressedExr
+from reconstruction.geometry.mesh import Mesh, write_obj
+from reconstruction.geometry.rig import Rig
+
+
+class JournalInUse(CaptureError):
+    """Somebody else is writing the capture."""
+
+
+class CaptureWriter:
+    """Writes one capture folder; `write_frame` and `record_missing` may be called from any thread.
+
+    Get one from `create` or `reopen`; `reconstruction.capture.folder` describes the layout. It has
+    the folder for itself until `finish` or `close`; `reserve` bytes of the disk stay free.
+    """
+
+    def __init__(self, capture: Capture, journal: FileIO) -> None:
+        self.reserve = RESERVE
+        self.path = capture.path
+        self.rig = capture.rig
+        self.steps = capture.steps
+        self.records: dict[tuple[int, str], FrameRecord] = dict(capture.records)
+        self._known = {s.index: s for s in capture.steps}
+        self._lock = threading.Lock()
+        self._journal = journal
+        self._stored: set[Path] = set()
+        self._of_thread = threading.local()
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        rig: Rig,
+        plan: dict[str, Any],
+        *,
+        masks: dict[str, NDArray[Any]] | None = None,
+        head: Mesh | None = None,
+    ) -> Self:
+        """Start a capture in the new or empty folder `path`.
+
+        `plan["steps"]` lists `Step.to_dict()`s (or `Step`s); what else the plan holds is kept.
+        `masks` maps camera names to hair masks `(H, W)`, boolean or 0..255. Raises `CaptureError`.
+        """
+        path = Path(path)
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise CaptureError(f"{path}: a capture needs a new or empty folder")
+        if "steps" not in plan:
+            raise CaptureError("plan.json: the field 'steps' is missing")
+        steps = [s if isinstance(s, Step) else Step.from_dict(s) for s in plan["steps"]]
+        indices = [s.index for s in steps]
+        if len(set(indices)) != len(indices):
+            twice = sorted({i for i in indices if indices.count(i) > 1})[:5]
+            raise CaptureError(f"plan.json: step indices must be distinct, twice: {twice}")
+        images = {name: _mask(rig, name, mask) for name, mask in (masks or {}).items()}
+
+        (path / "frames").mkdir(parents=True)
+        write_json(path / "rig.json", rig.to_dict())
+        if images:
+            (path / "masks").mkdir()
+        for name, image in images.items():
+            done, png = cv2.imencode(".png", image)
+            if not done:
+                raise CaptureError(f"masks/{name}.png: cannot be written")
+            write_whole(path / "masks" / f"{name}.png", png.tobytes())
+        if head is not None:
+            write_obj(path / "head.obj.part", head)
+            replace_durably(path / "head.obj.part", path / "head.obj")
+        journal = open_journal(path)
+        write_json(path / "plan.json", {**plan, "steps": [s.to_dict() for s in steps]})
+        flush(path)
+        return cls(Capture(path), journal)
+
+    @classmethod
+    def reopen(cls, path: str | Path) -> Self:
+        """Continue a capture that was interrupted: a torn last journal line is cut off, the
+        manifest, if there is one, is removed until `finish` writes it anew. Raises `CaptureError`
+        where there is no capture, or another process writes or compresses it."""
+        Capture(path)
+        journal = open_journal(Path(path))
+        capture = Capture(path)
+        (capture.path / "manifest.json").unlink(missing_ok=True)
+        for left_over in capture.path.glob("frames/*/*.part"):
+            left_over.unlink()
+        return cls(capture, journal)
+
+    def missing(self) -> list[tuple[Step, str]]:
+        """The frames (step, camera) that are not there yet, in the plan's order."""
+        return [(s, c.name) for s in self.steps for c in self.rig.cameras if not self._has(s, c)]
+
+    def counts(self) -> tuple[int, int]:
+        """Frames written, and frames recorded as missing, so far."""
+        with self._lock:
+            written = sum(r.file is not None for r in self.records.values())
+            return written, len(self.records) - written
+
+    def write_frame(
+        self,
+        step: Step,
+        camera: str,
+        radiance: NDArray[np.floating],
+        *,
+        full_scale: float = math.inf,
+        count_scale: float = 0.0,
+        pulse: int | None = None,
+        block_id: int | None = None,
+        timestamp: float | None = None,
+        attempt: int = 0,
+    ) -> FrameRecord:
+        """Write one frame durably and append its journal line: `store_frame`, then `commit`.
+
+        `radiance (H, W, 3)` is scene-linear, W/(sr m²), as exposed at the step's level;
+        `full_scale` is the radiance at which a channel saturates (inf: never), `count_scale` the
+        radiance of one count (0: not quantised). Raises `CaptureError` for a frame of the wrong
+        size, with numbers that are not finite, of an unknown step, or written before.
+        """
+        record = self.store_frame(
+            step, camera, radiance, full_scale=full_scale, count_scale=count_scale
+        )
+        record = replace(
+            record, pulse=pulse, block_id=block_id, timestamp=timestamp, attempt=attempt
+        )
+        self.commit([record])
+        return record
+
+    def store_frame(
+        self,
+        step: Step,
+        camera: str,
+        radiance: NDArray[np.floating],
+        *,
+        full_scale: float = math.inf,
+        count_scale: float = 0.0,
+    ) -> FrameRecord:
+        """Write a frame's file; `commit` makes it durable and a part of the capture.
+
+        Several threads may store side by side. Arguments and errors as `write_frame`, `DiskFull`
+        where the disk has no room for it beside the reserve.
+        """
+        self._check(step, camera)
+        expected = (self.rig.camera(camera).height, self.rig.camera(camera).width, 3)
+        if radiance.shape != expected:
+            raise CaptureError(
+                f"step {step.index}, {camera}: expected an image {expected}, got {radiance.shape}"
+            )
+        if not np.isfinite(radiance).all():
+            raise CaptureError(f"step {step.index}, {camera}: the frame is not finite everywhere")
+        attributes: dict[str, float | str] = {"exposureTime": float(step.exposure)}
+        if math.isfinite(full_scale):
+            attributes["fullScale"] = float(full_scale)
+        if count_scale > 0:
+            attributes["countScale"] = float(count_scale)
+        file = self.path / "frames" / f"{step.index:05d}" / f"{camera}.exr"
+        whole = self._buffer(radiance.shape).fill(radiance, attributes)
+        require_free(self.path, len(whole), self.reserve)
+        file.parent.mkdir(exist_ok=True)
+        write_pages(part(file), whole)
+        with self._lock:
+            self._stored.add(part(file))
+        name, checksum = str(file.relative_to(self.path)), hashlib.sha256(whole).hexdigest()
+        return FrameRecord(step.index, camera, name, checksum, recorded=utc_now())
+
+    def commit(self, records: Sequence[FrameRecord]) -> None:
+        """Make the records part of the capture: flush the files, their names, then the journal.
+
+        A disk flushes many files together as fast as one: commit what has gathered.
+        """
+        files = [self.path / r.file for r in records if r.file is not None]
+        for file in files:
+            replace_durably(part(file), file)
+        folders = {file.parent for file in files}
+        for folder in folders | {folder.parent for folder in folders}:
+            flush(folder)
+        with self._lock:
+            append_lines(self._journal, records)
+            self.records.update({(r.step, r.camera): r for r in records})
+            self._stored.difference_update(part(file) for file in files)
+
+    def _buffer(self, shape: tuple[int, ...]) -> UncompressedExr:
+        """A file in memory of this thread's own, made once."""
+        buffer: UncompressedExr | None = getattr(self._of_thread, "buffer", None)
+        if buffer is None or buffer.shape != shape:
+            buffer = self._of_thread.buffer = UncompressedExr(shape[0], shape[1])
+        return buffer
+
+    def record_missing(
+        self,
+        step: Step,
+        camera: str,
+        *,
+        reason: str,
+        pulse: int | None = None,
+        block_id: int | None = None,
+        timestamp: float | None = None,
+        attempt: int = 0,
+    ) -> FrameRecord:
+        """Journal that a frame did not come and why; a later `write_frame` of it still counts."""
+        self._check(step, camera)
+        record = FrameRecord(
+            step.index,
+            camera,
+            None,
+            pulse=pulse,
+            block_id=block_id,
+            timestamp=timestamp,
+            attempt=attempt,
+            recorded=utc_now(),
+            reason=reason,
+        )
+        self.commit([record])
+        return record
+
+    def withdraw(self, step: Step, camera: str, *, reason: str) -> None:
+        """Take a frame back that was written: it counts as missing, and may be written again."""
+        record = self.records.get((step.index, camera))
+        if record is None or record.file is None:
+            return
+        gone = replace(record, file=None, sha256=None, recorded=utc_now(), reason=reason)
+        self.commit([gone])
+        (self.path / record.file).unlink()
+
+    def finish(self, outcome: str, extra: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Write `manifest.json`, close the journal and return the manifest.
+
+        It holds `state` ("done"), `outcome`, frame counts, checksums of the small files and of the
+        journal, whose lines hold the frames' checksums, and whatever `extra` adds. Frames that
+        were stored and never committed are removed. Raises `OSError` where even that finds no room.
+        """
+        self.close()
+        manifest = {
+            **(extra or {}),
+            "state": "done",
+            "outcome": outcome,
+            "finished": utc_now(),
+            "frames": {
+                "planned": len(self.steps) * len(self.rig.cameras),
+                "written": self.counts()[0],
+                "missing": len(self.missing()),
+            },
+            **checksums(self.path),
+        }
+        write_json(self.path / "manifest.json", manifest)
+        flush(self.path)
+        return manifest
+
+    def close(self) -> None:
+        """Close the journal without a manifest: the folder stays an interrupted capture."""
+        with self._lock:
+            self._journal.close()
+            for file in self._stored:
+                file.unlink(missing_ok=True)
+            self._stored.clear()
+
+    def _has(self, step: Step, camera: Any) -> bool:
+        record = self.records.get((step.index, camera.name))
+        return record is not None and record.file is not None
+
+    def _check(self, step: Step, camera: str) -> None:
+        if self._known.get(step.index) != step:
+            raise CaptureError(f"step {step.index}: {step} is not in this capture's plan")
+        if self._has(step, self.rig.camera(camera)):
+            raise CaptureError(f"step {step.index}, {camera}: this frame is written already")
+
+
+def open_journal(path: Path) -> FileIO:
+    """Open the journal of the capture at `path` to append to it, for this process alone.
+
+    What a crash or a full disk left of a last line is cut off. Raises `CaptureError` where
+    another process (or another writer of this one) has it open.
+    """
+    journal = (path / "journal.jsonl").open("ab", buffering=0)
+    try:
+        fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        journal.close()
+        raise JournalInUse(f"{path}: it is being written or compressed; wait for that") from None
+    data = (path / "journal.jsonl").read_bytes()
+    journal.truncate(data.rfind(b"\n") + 1)
+    return journal
+
+
+def append_lines(journal: FileIO, records: Sequence[FrameRecord]) -> None:
+    """Append records to an open journal and flush it to disk; all of them or none."""
+    lines = []
+    for record in records:
+        line = {k: v for k, v in asdict(record).items() if v is not None}
+        line.setdefault("file", None)
+        lines.append(json.dumps(line, allow_nan=False) + "\n")
+    append_whole(journal, "".join(lines).encode())
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def utc_now() -> str:
+    """The time as UTC ISO 8601, with milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def checksums(path: Path) -> dict[str, Any]:
+    """Checksums of the small files, and of the journal as long as it is now.
+
+    Compression appends to the journal before it renews the manifest; the length lets `verify`
+    check the part that the manifest knows.
+    """
+    small = [path / n for n in ("rig.json", "plan.json", "head.obj")]
+    small += sorted((path / "masks").glob("*.png"))
+    journal = path / "journal.jsonl"
+    return {
+        "files": {str(f.relative_to(path)): sha256(f) for f in small if f.is_file()},
+        "journal": {"bytes": journal.stat().st_size, "sha256": sha256(journal)},
+    }
+
+
+def _mask(rig: Rig, camera: str, mask: NDArray[Any]) -> NDArray[np.uint8]:
+    try:
+        c = rig.camera(camera)
+    except KeyError as error:
+        raise CaptureError(f"masks: {error.args[0]}") from error
+    if mask.shape != (c.height, c.width):
+        raise CaptureError(
+            f"mask of {camera}: expected shape {(c.height, c.width)}, got {mask.shape}"
+        )
+    grey = mask * np.uint8(255) if mask.dtype == bool else mask
+    return np.asarray(grey, np.uint8)
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())

@@ -1,0 +1,1 @@
+"""Strands beside the truth: matching, visibility, connectivity, regions, baselines."""

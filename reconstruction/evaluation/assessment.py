@@ -1,0 +1,211 @@
+"""Everything there is to say of strands beside the true ones; `hairstage evaluate geometry`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.evaluation.connectivity import (
+    Followed,
+    connectivity_figures,
+    length_figures,
+    spread,
+)
+from reconstruction.evaluation.matching import Comparison, draw, scores
+from reconstruction.evaluation.oriented_points import Block, Drawn, OrientedPoints
+from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
+from reconstruction.evaluation.visibility import Visibility
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.closest_point import ClosestPoint
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+from reconstruction.report.report import Progress, silent
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+ROOTED = 5e-3
+"""Metres: a strand that ends this near the scalp reaches it."""
+
+OTHER_UNITS = 10.0
+"""Sizes that differ by this factor are hardly those of one head."""
+
+
+class Nearest:
+    """The nearest point of the other set to each of the `drawn (n,)` points.
+
+    `distance (n,)` in metres, `cosine (n,)` between the tangents, `strand (n,)` that it lies on;
+    infinite, 0 and -1 where nothing was shown.
+    """
+
+    def __init__(self, drawn: Drawn) -> None:
+        count = len(drawn.points)
+        self.drawn = drawn
+        self.distance = np.full(count, np.inf)
+        self.cosine = np.zeros(count)
+        self.strand = np.full(count, -1)
+
+    def look(self, block: Block) -> None:
+        """Keep the points of `block` that are nearer than those so far."""
+        distance, j = block.tree.query(self.drawn.points, workers=-1)
+        closer = np.flatnonzero(distance < self.distance)
+        j = j[closer]
+        self.distance[closer] = distance[closer]
+        self.cosine[closer] = (self.drawn.tangents[closer] * block.tangents[j]).sum(axis=1)
+        self.strand[closer] = block.strand[j]
+
+    @property
+    def angle_deg(self) -> Array:
+        """Between the tangents as lines, 0 to 90 `(n,)`."""
+        return np.degrees(np.arccos(np.minimum(np.abs(self.cosine), 1.0)))
+
+    def figures(self) -> dict[str, Any]:
+        """Spread of distance and angle; the share whose nearest point runs the other way."""
+        return {
+            "distance_mm": spread(1e3 * self.distance),
+            "angle_deg": spread(self.angle_deg),
+            "reversed": float((self.cosine < 0).mean()),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """`figures` are JSON-ready; the rest is what pictures are made of."""
+
+    figures: dict[str, Any]
+    pred: Nearest
+    true: Nearest
+    lengths_mm: tuple[Array, Array]
+
+
+def assess_strands(
+    pred: Strands,
+    true: Strands,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    head: Mesh | None = None,
+    seed: int = 0,
+    samples: int | None = 40_000,
+    progress: Progress = silent,
+) -> Assessment:
+    """Score predicted strands against the true ones, in every way this project knows.
+
+    The figures are those of `compare_strands` and, beside them,
+
+    - `errors.{pred,true}`: distance and angle between each point and the nearest of the other set
+      (mean and percentiles), and the share whose nearest point runs the other way;
+    - `lengths` (`length_figures`), `connectivity` (`connectivity_figures`);
+    - `roots.{pred,true}`: the share of strands whose root is within 5 mm of the scalp (`rooted`)
+      and of those whose tip is and the root is not (`upside_down`). The scalp is what the head
+      marks as such, or else the true roots (`roots.scalp` says which);
+    - `regions.scalp` and `regions.depth`: precision, recall and F of the parts of the hair. A true
+      point belongs to where its strand grows from, a predicted one to where its nearest true one
+      does. The hair that lies 5 mm and more below the hair's surface is `inner`;
+    - `warnings`: sentences about what looks wrong with the input.
+
+    Raises as `compare_strands` does.
+    """
+    predicted, truth = OrientedPoints(pred), OrientedPoints(true)
+    progress("what the cameras see", 0.0)
+    visibility = Visibility(cameras, true, head) if cameras is not None and len(true) else None
+    comparison = draw(predicted, truth, seed=seed, samples=samples, visibility=visibility)
+    of_pred, of_true = (Nearest(matches.drawn) for matches in comparison.all)
+    follow_pred = Followed(predicted, seed) if len(pred) else None
+    follow_true = Followed(truth, seed)
+    progress("predicted points among the true ones", 0.2)
+    truth.show(*comparison.of_predicted, of_pred, *([follow_pred] if follow_pred else []))
+    progress("true points among the predicted ones", 0.5)
+    predicted.show(*comparison.of_truth, of_true, follow_true)
+    warnings = input_warnings(pred, true)
+    sphere = HeadSphere.of(true)
+    if sphere is None:
+        warnings.append("the true roots do not lie on a head: there are no figures by scalp region")
+    progress("parts of the hair", 0.8)
+    errors = {"pred": of_pred.figures(), "true": of_true.figures()} if len(pred) else {}
+    regions = _region_figures(true, truth, comparison, of_pred, head, sphere)
+    figures = {
+        **comparison.figures(),
+        "errors": errors,
+        "lengths": length_figures(pred, true),
+        "connectivity": connectivity_figures(follow_pred, follow_true),
+        "roots": root_figures(pred, true, head),
+        "regions": regions,
+        "warnings": warnings,
+    }
+    progress("judged", 1.0)
+    return Assessment(figures, of_pred, of_true, (1e3 * pred.lengths(), 1e3 * true.lengths()))
+
+
+def input_warnings(pred: Strands, true: Strands) -> list[str]:
+    """What looks wrong with two sets of strands that should be of one head."""
+    if not len(pred):
+        return ["there are no predicted strands: precision is given as 0"]
+    out = []
+    boxes = [np.percentile(s.points, (1, 99), axis=0) for s in (pred, true)]
+    mine, theirs = (float(np.linalg.norm(high - low)) for low, high in boxes)
+    if max(mine, theirs) > OTHER_UNITS * min(mine, theirs):
+        out.append(
+            f"the predicted strands span {mine:.3g} m and the true ones {theirs:.3g} m: are both "
+            "in metres?"
+        )
+    elif (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any():
+        out.append("the predicted strands lie beside the true ones: are both in one frame?")
+    still = int((pred.lengths() == 0).sum())
+    if still:
+        out.append(f"{still} of {len(pred)} predicted strands have no length, and so no direction")
+    return out
+
+
+def root_figures(pred: Strands, true: Strands, head: Mesh | None = None) -> dict[str, Any]:
+    """Which strands reach the scalp, as `assess_strands` says."""
+    marked = head is not None and head.scalp is not None and bool(head.scalp.any())
+    out: dict[str, Any] = {"scalp": "marked" if marked else "true roots"}
+    if head is not None and marked:
+        closest = ClosestPoint(head, 5e-3, head.scalp)
+    else:
+        tree = cKDTree(true.roots)
+    for name, strands in (("pred", pred), ("true", true)):
+        if not len(strands):
+            continue
+        ends = (strands.roots, strands.points[strands.offsets[1:] - 1])
+        distance = [closest(e)[2] if marked else tree.query(e)[0] for e in ends]
+        root, tip = (d <= ROOTED for d in distance)
+        out[name] = {"rooted": float(root.mean()), "upside_down": float((tip & ~root).mean())}
+    return out
+
+
+def _region_figures(
+    true: Strands,
+    truth: OrientedPoints,
+    comparison: Comparison,
+    of_pred: Nearest,
+    head: Mesh | None,
+    sphere: HeadSphere | None,
+) -> dict[str, Any]:
+    precision, recall = comparison.all
+    depth = HairDepth(truth, head if head is not None else sphere)
+    kinds: dict[str, tuple[Sequence[str], Int, Int]] = {}
+    if sphere is not None:
+        grows = sphere.scalp_regions(true.roots)
+        kinds["scalp"] = SCALP, grows[of_pred.strand], grows[recall.drawn.strand]
+    kinds["depth"] = (
+        DEPTHS,
+        depth.regions(precision.drawn.points),
+        depth.regions(recall.drawn.points),
+    )
+    return {
+        kind: {
+            name: {
+                **scores(precision, recall, predicted=mine == k, true=theirs == k),
+                "points": {"pred": int((mine == k).sum()), "true": int((theirs == k).sum())},
+            }
+            for k, name in enumerate(names)
+            if (theirs == k).any()
+        }
+        for kind, (names, mine, theirs) in kinds.items()
+    }

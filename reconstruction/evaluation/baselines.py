@@ -1,0 +1,108 @@
+"""Strands that no method made: what any reconstruction has to beat.
+
+A table of precision and recall says little beside an empty page. These two controls know the masks
+and the head and nothing else, and fill the hull so densely that a true point in it always has a
+line within 1 mm: what they lose, they lose by direction and by the hull's excess over the hair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.visual_hull import VoxelGrid, mesh_silhouette, trim_edges, visual_hull
+from reconstruction.growth.envelope import carve, inside_mesh, mesh_depth
+from reconstruction.growth.field import solve_field
+
+Bool = NDArray[np.bool_]
+
+SPACING = np.sqrt(2) * 1e-3
+"""Metres between neighbouring lines: no point between them is over 1 mm from the nearest."""
+
+RADIUS = 3.5e-4
+
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def control_hull(
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Bool],
+    head: Mesh | None = None,
+    *,
+    spacing: float = 2e-3,
+) -> VoxelGrid:
+    """Where hair can be by `masks[camera.name] (H, W)` of the hair, and a head if there is one.
+
+    The visual hull of hair and head together, less the head's inside, and less what would stand in
+    front of a pixel that shows no hair. Without a head it is the visual hull of the masks alone.
+    """
+    if head is None:
+        return visual_hull(cameras, masks, spacing=spacing)
+    used = [c for c in cameras if c.name in masks]
+    both = {
+        c.name: trim_edges(masks[c.name] | mesh_silhouette(c, head), masks[c.name]) for c in used
+    }
+    hull = visual_hull(used, both, spacing=spacing)
+    hull = replace(hull, inside=hull.inside & ~inside_mesh(hull, head))
+    first = {c.name: np.where(masks[c.name], 0.0, mesh_depth(c, head)) for c in used}
+    return carve(hull, used, first)
+
+
+def hull_vertical(hull: VoxelGrid, *, spacing: float = SPACING) -> Strands:
+    """The hull filled with vertical lines, `spacing` metres apart, upper ends first."""
+    low = hull.origin - hull.spacing / 2
+    size = hull.spacing * np.array(hull.inside.shape)
+    x, y = (low[a] + np.arange(spacing / 2, size[a], spacing) for a in (0, 1))
+    columns = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    i, j = hull.index(np.column_stack([columns, np.full(len(columns), low[2])])).T[:2]
+    inside = np.pad(hull.inside[i, j], ((0, 0), (1, 1))).astype(np.int8)
+    column, bottom = np.nonzero(np.diff(inside, axis=1) == 1)
+    top = np.nonzero(np.diff(inside, axis=1) == -1)[1]
+    ends = np.empty((len(column), 2, 3))
+    ends[:, :, :2] = columns[column][:, None]
+    ends[:, 0, 2] = low[2] + hull.spacing * top
+    ends[:, 1, 2] = low[2] + hull.spacing * bottom
+    return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
+
+
+def hull_smooth_field(
+    hull: VoxelGrid, head: Mesh | None = None, *, spacing: float = SPACING
+) -> Strands:
+    """The hull filled with the smooth field of its own surface, in pieces `spacing` metres long.
+
+    On the outer surface the direction is that of steepest descent, gravity's part in the surface;
+    inwards it is spread as measured orientations are (`solve_field`). Where the hull touches the
+    `head` is no outer surface. Raises `ValueError` for an empty hull.
+    """
+    points, tangents = _descent(hull, inside_mesh(hull, head) if head is not None else None)
+    field, _ = solve_field(hull, points, tangents)
+    low = hull.origin - hull.spacing / 2
+    size = hull.spacing * np.array(hull.inside.shape)
+    axes = [low[a] + np.arange(spacing / 2, size[a], spacing) for a in range(3)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    lattice = lattice[hull.contains(lattice)]
+    direction, there = field.sample(lattice, np.broadcast_to(DOWN, lattice.shape))
+    center, half = lattice[there], direction[there] * spacing / 2
+    ends = np.stack([center - half, center + half], axis=1)
+    return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
+
+
+def _descent(hull: VoxelGrid, head: Bool | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres `(N, 3)` of the outer surface's voxels and unit directions `(N, 3)` of descent."""
+    solid = np.pad(hull.inside if head is None else hull.inside | head, 4)
+    surface = solid & ~ndimage.binary_erosion(solid)
+    smooth = ndimage.gaussian_filter(solid.astype(np.float32), 2.0)
+    index = np.argwhere(surface[4:-4, 4:-4, 4:-4] & hull.inside)
+    normal = -np.stack([g[tuple(index.T + 4)] for g in np.gradient(smooth)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    tangent = DOWN - (normal @ DOWN)[:, None] * normal
+    slope = np.linalg.norm(tangent, axis=1)
+    keep = slope > 0.1  # flatter than 6 degrees, the way down is the voxels' noise
+    return hull.centers(index[keep]), tangent[keep] / slope[keep, None]

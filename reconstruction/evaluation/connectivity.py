@@ -1,0 +1,165 @@
+"""How strands of two sets go together: what of one lies on one of the other, in how many pieces."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.evaluation.matching import THRESHOLDS
+from reconstruction.evaluation.oriented_points import Block, OrientedPoints, near_pairs
+from reconstruction.geometry.strands import Strands
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LIES_ON = THRESHOLDS[1]
+"""A point lies on a strand that has a point within this distance and (undirected) angle of it."""
+
+MOST_STRANDS, MOST_POINTS = 1_000, 60_000
+"""Strands that are followed, and their points: drawn at random from more."""
+
+PERCENTILES = (5, 25, 50, 75, 95)
+
+
+def spread(values: Array) -> dict[str, float]:
+    """Mean and percentiles of `values (n,)`, n > 0: `mean`, `p5`, `p25`, `p50`, `p75`, `p95`."""
+    marks = np.percentile(values, PERCENTILES)
+    return {
+        "mean": float(values.mean()),
+        **{f"p{p}": float(v) for p, v in zip(PERCENTILES, marks, strict=True)},
+    }
+
+
+def length_figures(pred: Strands, true: Strands) -> dict[str, Any]:
+    """Strand lengths of both sets, in millimetres.
+
+    `{"pred": {"strands", "total_m", "mean", "p5", …, "p95"}, "true": the same, "distance_mm"}`:
+    the distance is the first Wasserstein distance of the two distributions, which is the area
+    between their cumulative curves; the spread and the distance are missing without strands.
+    """
+    from scipy.stats import wasserstein_distance
+
+    lengths = {name: 1e3 * s.lengths() for name, s in (("pred", pred), ("true", true))}
+    out: dict[str, Any] = {
+        name: {
+            "strands": len(values),
+            "total_m": float(values.sum()) * 1e-3,
+            **(spread(values) if len(values) else {}),
+        }
+        for name, values in lengths.items()
+    }
+    if all(len(v) for v in lengths.values()):
+        out["distance_mm"] = float(wasserstein_distance(lengths["pred"], lengths["true"]))
+    return out
+
+
+class Followed:
+    """Strands drawn from one set, and which strands of the other lie along each."""
+
+    def __init__(self, points: OrientedPoints, seed: int = 0) -> None:
+        order = np.random.default_rng(seed).permutation(len(points.offsets) - 1)[:MOST_STRANDS]
+        total = np.cumsum(np.diff(points.offsets)[order])
+        self.strands = np.sort(order[: max(1, int((total <= MOST_POINTS).sum()))])
+        self.complete = len(self.strands) == len(points.offsets) - 1
+        self._block = points.of_strands(self.strands)
+        self._counts = np.diff(points.offsets)[self.strands]
+        self._point: list[Int] = []
+        self._other: list[Int] = []
+
+    def look(self, block: Block) -> None:
+        """Take a block of the other set into account; each of its strands is in one block only."""
+        least = np.cos(np.radians(LIES_ON.angle))
+        for i, j in near_pairs(self._block.points, block, LIES_ON.distance):
+            cosine = np.einsum("nk,nk->n", self._block.tangents[i], block.tangents[j])
+            hit = np.abs(cosine) > least
+            # a point beside several points of one strand lies on it once
+            first, count = block.strand[0], block.strand[-1] - block.strand[0] + 1
+            pair = np.unique(i[hit] * count + (block.strand[j[hit]] - first))
+            self._point.append(pair // count)
+            self._other.append(pair % count + first)
+
+    def shares(self) -> Array:
+        """The largest share of each followed strand that lies on one other strand `(n,)`."""
+        which, _, count = self._pairs()
+        best = np.zeros(len(self.strands))
+        np.maximum.at(best, which, count)
+        return best / self._counts
+
+    def covered(self) -> Array:
+        """The share of each followed strand that lies on any other strand `(n,)`."""
+        on_any = np.zeros(len(self._block.points))
+        on_any[np.concatenate([*self._point, np.zeros(0, np.int64)])] = 1.0
+        starts = np.cumsum(self._counts) - self._counts
+        return np.asarray(np.add.reduceat(on_any, starts) / self._counts)
+
+    def covering(self) -> Array:
+        """How many other strands lie along each followed strand, if only at a point `(n,)`."""
+        which, _, _ = self._pairs()
+        return np.bincount(which, minlength=len(self.strands)).astype(float)
+
+    def fragments(self) -> Array:
+        """How few other strands cover what of each followed one is covered `(n,)`, 0 for nothing.
+
+        Always the one next that covers most of what is left.
+        """
+        point, other = self._incidences()
+        owner = np.repeat(np.arange(len(self.strands)), self._counts)[point]
+        ends = np.searchsorted(owner, np.arange(len(self.strands) + 1))
+        out = np.zeros(len(self.strands))
+        for k, (a, b) in enumerate(pairwise(ends)):
+            left, (_, by) = point[a:b], np.unique(other[a:b], return_inverse=True)
+            while len(left):
+                best = left[by == np.bincount(by).argmax()]
+                keep = ~np.isin(left, best)
+                left, by = left[keep], by[keep]
+                out[k] += 1
+        return out
+
+    def _incidences(self) -> tuple[Int, Int]:
+        """Points of the followed strands and strands that they lie on, by point."""
+        point = np.concatenate([*self._point, np.zeros(0, np.int64)])
+        order = np.argsort(point, kind="stable")
+        return point[order], np.concatenate([*self._other, np.zeros(0, np.int64)])[order]
+
+    def _pairs(self) -> tuple[Int, Int, Int]:
+        """Followed strand (its place), other strand, and how many points of the first lie on it."""
+        point, other = self._incidences()
+        owner = np.repeat(np.arange(len(self.strands)), self._counts)[point]
+        width = int(other.max(initial=0)) + 1
+        pair, count = np.unique(owner * width + other, return_counts=True)
+        return pair // width, pair % width, count
+
+
+def connectivity_figures(pred: Followed | None, true: Followed) -> dict[str, Any]:
+    """How whole the predicted strands are, by strands of both sets that were followed.
+
+    `pred.on_one`: the largest share of a predicted strand that lies on one true strand: 1 for one
+    that never changes hairs. `true.by_one`: the largest share of a true strand that one predicted
+    strand covers; `true.covered`: that all of them cover together; `true.covering`: how many lie
+    along it; `true.fragments`: how few of them are enough, over the true strands that are covered
+    at all. Each with mean, percentiles and the mean's standard error.
+    """
+    out: dict[str, Any] = {"lies_on": LIES_ON.name, "true": {"followed": len(true.strands)}}
+    fragments = true.fragments()
+    for name, values in (
+        ("by_one", true.shares()),
+        ("covered", true.covered()),
+        ("covering", true.covering()),
+        ("fragments", fragments[fragments > 0]),
+    ):
+        if len(values):
+            out["true"][name] = {**spread(values), "error": _error(values, true.complete)}
+    if pred is not None:
+        shares = pred.shares()
+        on_one = {**spread(shares), "error": _error(shares, pred.complete)}
+        out["pred"] = {"followed": len(pred.strands), "on_one": on_one}
+    return out
+
+
+def _error(values: Array, complete: bool) -> float:
+    if complete or len(values) < 2:
+        return 0.0
+    return float(values.std(ddof=1) / np.sqrt(len(values)))

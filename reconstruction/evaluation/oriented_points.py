@@ -1,0 +1,183 @@
+"""Strands as points with tangents at equal steps, a block of whole strands at a time.
+
+A head of 100,000 strands of 20 cm is 20 million points at 1 mm: they are made when they are looked
+at and then forgotten, so that memory does not grow with the hair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.evaluation.visibility import Visibility
+from reconstruction.geometry.strands import Resampling, Strands
+
+Single = NDArray[np.float32]
+Int = NDArray[np.int64]
+
+STEP = 1e-3
+"""Metres between the points."""
+
+BLOCK = 250_000
+"""Points that are made together, whole strands: a longer one makes a longer block."""
+
+MOST_POINTS = 300_000_000
+"""Four times what 150,000 strands of half a metre have: more is another unit of length."""
+
+MOST_OF_ONE = 1_000_000
+"""Points of one strand, which are in memory together."""
+
+MOST_PAIRS = 4_000_000
+"""Neighbour pairs that are looked at together: bounds the memory, not the answer."""
+
+OVERSAMPLING = 5
+"""Points that are tested for visibility, for each visible one that is wanted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """`points (n, 3)`, the `strand (n,)` of each, and its unit `tangents (n, 3)`, root to tip.
+
+    Where a strand has no length, the tangent is 0.
+    """
+
+    points: Single
+    tangents: Single
+    strand: Int
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The points, to be found by."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn(Block):
+    """Points to score, and whether they are all that there are to score."""
+
+    complete: bool
+
+
+class Looker(Protocol):
+    """Learns something about drawn points from all points of the other set."""
+
+    def look(self, block: Block) -> None:
+        """Take one block of the other set into account."""
+
+
+class OrientedPoints:
+    """`strands` as `count` points, `STEP` apart.
+
+    Raises `ValueError` where there are more of them than any hair has.
+    """
+
+    def __init__(self, strands: Strands) -> None:
+        self._at = Resampling(strands, STEP)
+        self.offsets = self._at.offsets
+        self.count = int(self.offsets[-1])
+        if self.count > MOST_POINTS:
+            raise ValueError(
+                f"the {len(strands)} strands are {self.count * STEP / 1e3:,.0f} km long together, "
+                f"at most {MOST_POINTS * STEP / 1e3:,.0f} km are compared: are they in metres?"
+            )
+        longest = int(np.diff(self.offsets).max(initial=0))
+        if longest > MOST_OF_ONE:
+            raise ValueError(
+                f"the longest strand is {longest * STEP:,.0f} m long, at most "
+                f"{MOST_OF_ONE * STEP:,.0f} m are compared: are the strands in metres?"
+            )
+        ends = [0]
+        while ends[-1] < len(strands):
+            fits = np.searchsorted(self.offsets, self.offsets[ends[-1]] + BLOCK, side="right") - 1
+            ends.append(max(int(fits), ends[-1] + 1))
+        self._ends = ends
+        self._only: Block | None = None
+
+    def blocks(self) -> Iterator[Block]:
+        """All points, strand by strand; a set of one block is made only once."""
+        if self._only is not None:
+            yield self._only
+            return
+        for first, last in pairwise(self._ends):
+            strand = np.arange(first, last)
+            index = np.arange(self.offsets[first], self.offsets[last])
+            owner = np.repeat(strand, np.diff(self.offsets[first : last + 1]))
+            points, _ = self._at(index)
+            before, after = (beside - index[0] for beside in self._beside(index, owner))
+            block = Block(points, _directions(points[before], points[after]), owner)
+            if len(self._ends) == 2:
+                self._only = block
+            yield block
+
+    def show(self, *lookers: Looker) -> None:
+        """Show every block to all `lookers`."""
+        for block in self.blocks():
+            for looker in lookers:
+                looker.look(block)
+
+    def draw(
+        self, samples: int | None, rng: np.random.Generator, sees: Visibility | None = None
+    ) -> Drawn:
+        """At most `samples` of the points, or of those that `sees` says are visible."""
+        if samples is None:
+            samples = self.count
+        tried = self.count if sees is None else min(self.count, OVERSAMPLING * samples)
+        chosen = np.arange(self.count)
+        if tried < self.count:
+            chosen = np.sort(rng.choice(self.count, tried, replace=False))
+        if sees is not None:
+            chosen = chosen[sees(self._at(chosen)[0])]
+        complete = tried == self.count and len(chosen) <= samples
+        if len(chosen) > samples:
+            chosen = np.sort(rng.choice(chosen, samples, replace=False))
+        block = self._make(chosen, np.searchsorted(self.offsets, chosen, side="right") - 1)
+        return Drawn(block.points, block.tangents, block.strand, complete)
+
+    def of_strands(self, which: Int) -> Block:
+        """All points of the strands `which`, in that order."""
+        counts = np.diff(self.offsets)[which]
+        strand = np.repeat(which, counts)
+        place = np.arange(len(strand)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self._make(self.offsets[strand] + place, strand)
+
+    def _make(self, index: Int, strand: Int) -> Block:
+        before, after = self._beside(index, strand)
+        tangents = _directions(self._at(before)[0], self._at(after)[0])
+        return Block(self._at(index)[0], tangents, strand)
+
+    def _beside(self, index: Int, strand: Int) -> tuple[Int, Int]:
+        """The points before and after each on its strand; an end stands in for what is not."""
+        first, last = self.offsets[strand], self.offsets[strand + 1] - 1
+        return np.maximum(index - 1, first), np.minimum(index + 1, last)
+
+
+def _directions(before: Single, after: Single) -> Single:
+    """Unit vectors `(n, 3)`; 0 where both points coincide."""
+    d = after.astype(float) - before
+    norm = np.linalg.norm(d, axis=1, keepdims=True)
+    return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
+
+
+def near_pairs(points: Single, other: Block, reach: float) -> Iterator[tuple[Int, Int]]:
+    """Indices `(n,)`, `(n,)` of points and points of `other` at most `reach` metres apart.
+
+    They come in parts of about `MOST_PAIRS`, those of one point together.
+    """
+    if len(points) == 0:
+        return
+    near = other.tree.query_ball_point(points, reach, return_length=True, workers=-1)
+    part = np.cumsum(near) // MOST_PAIRS
+    for k in np.unique(part):
+        chunk = np.flatnonzero((part == k) & (near > 0))
+        if len(chunk):
+            pairs = cKDTree(points[chunk]).sparse_distance_matrix(
+                other.tree, reach, output_type="ndarray"
+            )
+            yield chunk[pairs["i"]], pairs["j"]

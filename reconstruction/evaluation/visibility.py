@@ -1,0 +1,135 @@
+"""Which points the cameras see past strands and head: z-buffers from points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Resampling, Strands
+from reconstruction.growth.envelope import surface_samples
+
+Single = NDArray[np.float32]
+Points = NDArray[np.floating]
+Bool = NDArray[np.bool_]
+
+NARROWEST, WIDEST = 5e-4, 1e-3
+"""Limits, in metres, of the width that a strand hides with."""
+
+MOST_PIXELS = 64_000_000
+CHUNK = 200_000
+
+
+class Visibility:
+    """What each of `cameras` sees past `strands` and `head`.
+
+    A camera sees a point that falls on its image and that lies at most the tolerance (along the
+    camera's axis) behind the nearest part of strands and head in the same pixel of a z-buffer. The
+    z-buffers are made for this: whatever the cameras' own resolution, their pixels span one strand
+    width (twice the median radius, 0.5 to 1 mm) at the strands' median depth.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], strands: Strands, head: Mesh | None = None):
+        width = 2 * float(np.median(strands.radius)) if len(strands) else NARROWEST
+        pixel = float(np.clip(width, NARROWEST, WIDEST))
+        dense = Resampling(strands, pixel)
+        count = int(dense.offsets[-1])
+        some, _ = dense(np.arange(0, count, max(1, count // 500_000)))
+        self._buffers = [_DepthBuffer(camera, some, pixel) for camera in cameras]
+        for first in range(0, count if self._buffers else 0, CHUNK):
+            points, _ = dense(np.arange(first, min(first + CHUNK, count)))
+            for buffer in self._buffers:
+                buffer.splat(points)
+        if head is None or not self._buffers:
+            return
+        covering = np.any([b.over(head) for b in self._buffers], axis=0)
+        if covering.any():
+            spacing = 0.7 * min(b.span for b in self._buffers)  # under √3/2: no pixel is missed
+            part = Mesh(head.vertices, head.faces[covering])
+            samples = surface_samples(part, spacing)[0].astype(np.float32)
+            for buffer in self._buffers:
+                buffer.splat(samples)
+
+    def __call__(self, points: Points, tolerance: float = 1e-3) -> Bool:
+        """Whether at least one camera sees each of `points (N, 3)`; returns `(N,)`."""
+        out = np.zeros(len(points), bool)
+        for buffer in self._buffers:
+            todo = np.flatnonzero(~out)
+            out[todo] = buffer.sees(points[todo], tolerance)
+        return out
+
+
+class _DepthBuffer:
+    """The nearest depth behind every pixel of a finer image of the part that shows the strands."""
+
+    def __init__(self, camera: Camera, strands: Points, pixel: float) -> None:
+        self.camera = camera
+        pixels, depth = camera.project(strands)
+        front = depth > 1e-6
+        self.scale, self.low, self.shape, self.span = 1.0, np.zeros(2), (1, 1), pixel
+        if front.any():
+            focal = max(camera.K[0, 0], camera.K[1, 1])
+            self.scale = float(np.median(depth[front])) / (focal * pixel)
+            end = np.array([camera.width, camera.height]) - 0.5
+            self.low = np.clip(pixels[front].min(axis=0), -0.5, end)
+            extent = np.clip(pixels[front].max(axis=0), -0.5, end) - self.low
+            wanted = float(np.prod(extent * self.scale + 2))
+            self.scale *= min(1.0, float(np.sqrt(MOST_PIXELS / wanted)))
+            width, height = np.ceil(extent * self.scale).astype(int) + 1
+            self.shape = (int(height), int(width))
+            # what is nearer than the median is imaged larger: samples there must lie closer
+            self.span = float(np.quantile(depth[front], 0.02)) / (focal * self.scale)
+        self.depth = np.full(self.shape[0] * self.shape[1], np.inf, np.float32)
+        # world to homogeneous buffer pixels; the third row gives the depth
+        to_buffer = np.array(
+            [
+                [self.scale, 0, -self.scale * self.low[0]],
+                [0, self.scale, -self.scale * self.low[1]],
+                [0, 0, 1],
+            ]
+        )
+        self.A = (to_buffer @ camera.K @ camera.R).astype(np.float32)
+        self.b = (to_buffer @ camera.K @ camera.t).astype(np.float32)[:, None]
+        corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
+        self.image = (corners - self.low) * self.scale
+
+    def _project(self, points: Points) -> Iterator[tuple[slice, Single, Single, Single]]:
+        """Chunk by chunk: which points, column, row and depth; behind the camera column is -inf."""
+        for first in range(0, len(points), CHUNK):
+            part = slice(first, first + CHUNK)
+            x, y, z = self.A @ points[part].astype(np.float32).T + self.b
+            front = z > 1e-6
+            x = np.divide(x, z, out=np.full_like(x, -np.inf), where=front)
+            y = np.divide(y, z, out=y, where=front)
+            yield part, x, y, z
+
+    def splat(self, points: Points) -> None:
+        height, width = self.shape
+        for _, x, y, z in self._project(points):
+            on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+            flat = y[on].astype(np.int64) * width + x[on].astype(np.int64)
+            np.minimum.at(self.depth, flat, z[on])
+
+    def sees(self, points: Points, tolerance: float) -> Bool:
+        out = np.zeros(len(points), bool)
+        height, width = self.shape
+        (left, top), (right, bottom) = self.image
+        for part, x, y, z in self._project(points):
+            seen = (x >= left) & (y >= top) & (x < right) & (y < bottom)
+            on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+            flat = y[on].astype(np.int64) * width + x[on].astype(np.int64)
+            seen[on] &= z[on] <= self.depth[flat] + np.float32(tolerance)
+            out[part] = seen
+        return out
+
+    def over(self, mesh: Mesh) -> Bool:
+        """Which faces `(F,)` may cover the buffer: before the camera and over its rectangle."""
+        pixels, depth = self.camera.project(mesh.vertices)
+        front = (depth[mesh.faces] > 1e-6).all(axis=1)
+        corners = (pixels[mesh.faces] - self.low) * self.scale
+        size = np.array(self.shape[::-1])
+        over = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) < size).all(axis=1)
+        return np.asarray(front & over)

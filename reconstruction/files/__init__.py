@@ -1,0 +1,1 @@
+"""Files whole on the disk or not there: EXR, points, strands."""

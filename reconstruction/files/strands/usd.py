@@ -1,0 +1,122 @@
+"""USD `BasisCurves` through `usd-core`.
+
+Linear curves are written: `curveVertexCounts`, `points`, `widths` (twice the radius), z up, one
+unit a metre. Every linear `BasisCurves` of a stage is read, in the world's frame, turned to z up
+and scaled to metres by what the stage says of itself. Cubic curves are refused: taking their
+control points for points on the hair would be wrong by up to a control segment.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Tf, Usd, UsdGeom, Vt
+
+from reconstruction.files.durable import replace_durably
+from reconstruction.files.strands.errors import StrandFileError, strands_of
+from reconstruction.geometry.strands import Strands
+
+_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def read_usd(path: Path) -> Strands:
+    """Read all linear `BasisCurves` of a stage at its default time, in metres with z up."""
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise StrandFileError(f"{path}: cannot be read as USD ({_first_line(error)})") from error
+    turn = float(UsdGeom.GetStageMetersPerUnit(stage)) * np.eye(3)
+    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
+        turn = _Y_UP_TO_Z_UP @ turn
+    cache = UsdGeom.XformCache()
+    found = [
+        _curves(path, prim, cache, turn)
+        for prim in stage.Traverse()
+        if prim.IsA(UsdGeom.BasisCurves)
+    ]
+    if not found:
+        raise StrandFileError(f"{path}: no BasisCurves in this stage")
+    points, counts, radius = (np.concatenate(part) for part in zip(*found, strict=True))
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    if len(radius) == 0:
+        return strands_of(path, points, offsets)
+    same = bool((radius == radius[0]).all())
+    return strands_of(path, points, offsets, float(radius[0]) if same else radius)
+
+
+def _curves(
+    path: Path, prim: Any, cache: Any, turn: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+    """Points in metres, vertex counts and per-point radii of one prim."""
+    curves = UsdGeom.BasisCurves(prim)
+    where = f"{path}: {prim.GetPath()}"
+    if curves.GetTypeAttr().Get() != UsdGeom.Tokens.linear:
+        raise StrandFileError(f"{where}: only linear curves can be read; convert the cubic ones")
+    if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
+        raise StrandFileError(f"{where}: closed (periodic) curves are no strands")
+    points = np.asarray(curves.GetPointsAttr().Get() or [], np.float64).reshape(-1, 3)
+    counts = np.asarray(curves.GetCurveVertexCountsAttr().Get() or [], np.int64)
+    if (counts < 2).any() or counts.sum() != len(points):
+        raise StrandFileError(
+            f"{where}: curveVertexCounts must be at least 2 and sum to the {len(points)} points, "
+            f"they sum to {counts.sum()}"
+        )
+    to_world = np.asarray(cache.GetLocalToWorldTransform(prim))  # row vectors: p' = p @ M
+    linear = to_world[:3, :3] @ turn.T
+    world = points @ linear + to_world[3, :3] @ turn.T
+    scale = abs(np.linalg.det(linear)) ** (1 / 3)
+    widths = np.asarray(curves.GetWidthsAttr().Get() or [], np.float64) * scale
+    if len(widths) == 0:
+        widths = np.full(len(points), 8e-5)
+    elif len(widths) == 1:
+        widths = np.repeat(widths, len(points))
+    elif len(widths) == len(counts) and len(counts) != len(points):
+        widths = np.repeat(widths, counts)
+    elif len(widths) != len(points):
+        raise StrandFileError(
+            f"{where}: {len(widths)} widths for {len(counts)} curves with {len(points)} points"
+        )
+    return world.astype(np.float32), counts, (widths / 2).astype(np.float32)
+
+
+def write_usd(path: Path, strands: Strands) -> None:
+    """Write one linear `BasisCurves` prim, `/hair`, the stage's default prim."""
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    curves = UsdGeom.BasisCurves.Define(stage, "/hair")
+    stage.SetDefaultPrim(curves.GetPrim())
+    curves.CreateTypeAttr(UsdGeom.Tokens.linear)
+    curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
+    curves.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(strands.points))
+    counts = np.diff(strands.offsets).astype(np.int32)
+    curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
+    width = 2 * np.atleast_1d(np.asarray(strands.radius, np.float32))
+    curves.CreateWidthsAttr(Vt.FloatArray.FromNumpy(width))
+    vary = isinstance(strands.radius, np.ndarray)
+    curves.SetWidthsInterpolation(UsdGeom.Tokens.vertex if vary else UsdGeom.Tokens.constant)
+    if len(strands):
+        reach = width.max() / 2
+        low, high = strands.points.min(axis=0) - reach, strands.points.max(axis=0) + reach
+        corners = [Gf.Vec3f(*map(float, corner)) for corner in (low, high)]
+        curves.CreateExtentAttr(Vt.Vec3fArray(corners))
+    temporary = path.with_name(path.stem + ".part" + path.suffix)
+    try:
+        stage.GetRootLayer().Export(str(temporary))
+    except Tf.ErrorException as error:
+        raise StrandFileError(f"{path}: cannot be written ({_first_line(error)})") from error
+    replace_durably(temporary, path)
+
+
+def open_curves(path: Path) -> tuple[Any, Any]:
+    """The stage of a file that `write_usd` wrote and its curves, to add primvars to."""
+    stage = Usd.Stage.Open(str(path))
+    return stage, UsdGeom.BasisCurves(stage.GetDefaultPrim())
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

@@ -1,0 +1,288 @@
+"""IES photometric files (ANSI/IES LM-63 of 1986, 1991, 1995, 2002 and 2019)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.geometry.light_profiles import LampProfile, Photometry, Unit
+
+Array = NDArray[np.float64]
+
+VERSIONS = {
+    "IESNA91": 1991,
+    "IESNA:LM-63-1991": 1991,
+    "IESNA:LM-63-1995": 1995,
+    "IESNA:LM-63-2002": 2002,
+    "IES:LM-63-2019": 2019,
+}
+"""First lines and the edition they stand for; a file of 1986 has none."""
+METRES_PER_FOOT = 0.3048
+_PHOTOMETRY: dict[int, Photometry] = {1: "C", 2: "B", 3: "A"}
+_MILLIWATTS = re.compile(r"\bmw\s*/\s*sr\b|\bmilliwatts?\b", re.IGNORECASE)
+
+
+class IesError(ValueError):
+    """A file that is not LM-63; the message names the file, the line and what was expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class IesFile:
+    """What an LM-63 file says.
+
+    `profile` is the whole distribution, in candela or W/sr, multiplied by the file's multiplier and
+    ballast factors (and its tilt factor). `keywords` keeps the label lines; `opening_m` is the
+    luminous opening (width, length, height), negative for round ones; `lumens` is the rated flux
+    per lamp, or None for absolute photometry. `tilt` holds angles (degrees) and factors `(T, 2)`.
+    """
+
+    version: int
+    keywords: dict[str, str]
+    lamps: int
+    lumens: float | None
+    opening_m: tuple[float, float, float]
+    watts: float
+    tilt: Array | None
+    profile: LampProfile
+
+
+def read_ies(
+    path: str | Path, *, unit: Literal["cd", "mW/sr"] | None = None, tilt_deg: float = 0.0
+) -> IesFile:
+    """Read an LM-63 file of any edition, photometry of type A, B or C.
+
+    LM-63 knows candela only. Makers of infrared, ultraviolet and single-colour lamps write mW/sr in
+    the same places: `unit` says which it is; without it a label line that names `mW/sr` or
+    milliwatts (such as `[OTHER] values in mW/sr`) does. `tilt_deg` is the lamp's tilt, at which
+    the factor of `TILT=INCLUDE` is taken. Raises `IesError` naming file and line.
+    """
+    if unit not in (None, "cd", "mW/sr"):
+        raise ValueError(f"unit must be 'cd' or 'mW/sr', got {unit!r}")
+    path = Path(path)
+    try:
+        lines = path.read_bytes().decode("latin-1").splitlines()
+    except OSError as error:
+        raise IesError(f"{path}: cannot be read: {error.strerror}") from error
+    start, version, keywords = _labels(path, lines)
+    numbers = _Numbers(path, lines, start + 1)
+    how = lines[start].split("=", 1)[1].strip().upper()
+    tilt = _tilt(numbers) if how == "INCLUDE" else None
+    if how not in ("NONE", "INCLUDE"):
+        raise IesError(
+            f"{path}, line {start + 1}: TILT={how}: tilt files are not looked up; "
+            "put the table into the file (TILT=INCLUDE) or use TILT=NONE"
+        )
+    lamps = numbers.count("number of lamps")
+    lumens = numbers.take("lumens per lamp")
+    multiplier = numbers.take("multiplier", 0.0)
+    sizes = [numbers.count(f"number of {k} angles") for k in ("vertical", "horizontal")]
+    kind = numbers.one_of("photometric type (1 C, 2 B, 3 A)", (1, 2, 3))
+    metres = 1.0 if numbers.one_of("units (1 feet, 2 metres)", (1, 2)) == 2 else METRES_PER_FOOT
+    opening = [numbers.take(f"opening's {k}") * metres for k in ("width", "length", "height")]
+    multiplier *= numbers.take("ballast factor", 0.0)
+    photometric_factor = numbers.take("ballast-lamp photometric factor", 0.0)
+    if version <= 1995:  # later editions keep the place for something that is no factor
+        multiplier *= photometric_factor
+    watts = numbers.take("input watts")
+    if tilt is not None:
+        multiplier *= float(np.interp(tilt_deg, tilt[:, 0], tilt[:, 1]))
+    photometry = _PHOTOMETRY[kind]
+    vertical, horizontal = _angles(numbers, photometry, sizes)
+    values = numbers.many("candela values", sizes[0] * sizes[1], 0.0).reshape(sizes[1], sizes[0])
+    numbers.end()
+    radiometric = unit == "mW/sr" or (
+        unit is None and any(_MILLIWATTS.search(f"{k} {v}") for k, v in keywords.items())
+    )
+    value_unit: Unit = "W/sr" if radiometric else "cd"
+    values = values * (multiplier * (1e-3 if radiometric else 1.0))
+    profile = (
+        _type_c(path.stem, vertical, horizontal, values, value_unit)
+        if photometry == "C"
+        else _type_a_or_b(path.stem, vertical, horizontal, values, photometry, value_unit)
+    )
+    return IesFile(
+        version,
+        keywords,
+        lamps,
+        None if lumens < 0 else lumens,
+        (opening[0], opening[1], opening[2]),
+        watts,
+        tilt,
+        profile,
+    )
+
+
+def _labels(path: Path, lines: list[str]) -> tuple[int, int, dict[str, str]]:
+    """Index of the TILT= line, edition and label lines."""
+    tilt = next((i for i, s in enumerate(lines) if s.strip().upper().startswith("TILT=")), None)
+    if tilt is None:
+        raise IesError(f"{path}, line {len(lines)}: no line starts with TILT=: not an LM-63 file")
+    first = lines[0].strip().upper() if tilt else ""
+    version = VERSIONS.get(first, 1986)
+    if version == 1986 and re.match(r"IES(NA)?:?\s*(LM-63|\d\d)", first):
+        raise IesError(f"{path}, line 1: edition {first!r} is unknown; known are {list(VERSIONS)}")
+    keywords: dict[str, str] = {}
+    last = ""
+    for number, line in enumerate(lines[:tilt], 1):
+        if number == 1 and version != 1986:
+            continue
+        found = re.match(r"\s*\[([^\]]*)\]\s*(.*)", line)
+        if found is None:
+            if version != 1986 and line.strip():
+                raise IesError(
+                    f"{path}, line {number}: expected a [KEYWORD] line or TILT=, got {line!r}"
+                )
+            keywords[f"line {number}"] = line.strip()
+        elif found[1].upper() == "MORE" and last:
+            keywords[last] += "\n" + found[2].strip()
+        else:
+            last = found[1].upper()
+            said = found[2].strip()
+            keywords[last] = f"{keywords[last]}\n{said}" if last in keywords else said
+    return tilt, version, keywords
+
+
+class _Numbers:
+    """The numbers after TILT=, in order, whatever the lines they stand on."""
+
+    def __init__(self, path: Path, lines: list[str], start: int) -> None:
+        self._path = path
+        self._words = [
+            (number, word)
+            for number, line in enumerate(lines[start:], start + 1)
+            for word in line.replace(",", " ").split()
+        ]
+        self._next = 0
+        self._last_line = len(lines)
+
+    def take(self, what: str, least: float = -np.inf) -> float:
+        """The next number; errors call it `what`."""
+        if self._next == len(self._words):
+            raise IesError(f"{self._path}, line {self._last_line}: the file ends before {what}")
+        line, word = self._words[self._next]
+        self._next += 1
+        try:
+            value = float(word)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value) or value < least:
+            bound = "" if least == -np.inf else f" >= {least:g}"
+            raise self.wrong(f"{what}: expected a number{bound}, got {word!r}", line)
+        return value
+
+    def many(self, what: str, count: int, least: float = -np.inf) -> Array:
+        """The next `count` numbers."""
+        left = len(self._words) - self._next
+        if left < count:
+            raise IesError(
+                f"{self._path}, line {self._last_line}: expected {count} {what}, "
+                f"but the file ends after {left}"
+            )
+        return np.array([self.take(what, least) for _ in range(count)])
+
+    def count(self, what: str) -> int:
+        """A whole number from 1 on."""
+        value = self.take(what)
+        if value != int(value) or value < 1:
+            raise self.wrong(f"{what}: expected a whole number from 1 on, got {value:g}")
+        return int(value)
+
+    def one_of(self, what: str, allowed: tuple[int, ...]) -> int:
+        """One of a few whole numbers."""
+        value = self.take(what)
+        if value not in allowed:
+            raise self.wrong(f"{what}: expected one of {allowed}, got {value:g}")
+        return int(value)
+
+    def end(self) -> None:
+        """Refuse numbers that nothing asked for."""
+        if self._next < len(self._words):
+            line, word = self._words[self._next]
+            left = len(self._words) - self._next
+            raise self.wrong(f"expected the end of the file, got {word!r}, {left} words left", line)
+
+    def wrong(self, text: str, line: int | None = None) -> IesError:
+        """An error about the word that was taken last, or about `line`."""
+        if line is None:
+            line = self._words[self._next - 1][0]
+        return IesError(f"{self._path}, line {line}: {text}")
+
+
+def _tilt(numbers: _Numbers) -> Array:
+    """Angles and factors `(T, 2)` of TILT=INCLUDE."""
+    numbers.one_of("lamp-to-luminaire geometry", (1, 2, 3))
+    count = numbers.count("number of tilt angles")
+    angles = numbers.many("tilt angles", count)
+    if not (np.diff(angles) > 0).all():
+        raise numbers.wrong("tilt angles must ascend")
+    return np.stack([angles, numbers.many("tilt factors", count, 0.0)], axis=1)
+
+
+def _angles(numbers: _Numbers, photometry: Photometry, sizes: list[int]) -> tuple[Array, Array]:
+    """Vertical and horizontal angles, ascending and in the range of their type."""
+    found = []
+    for name, count in zip(("vertical", "horizontal"), sizes, strict=True):
+        low, high = -90.0, 90.0
+        if photometry == "C":
+            low, high = 0.0, 180.0 if name == "vertical" else 360.0
+        angles = numbers.many(f"{name} angles", count)
+        if not (np.diff(angles) > 0).all():
+            raise numbers.wrong(f"{name} angles must ascend, got {angles.tolist()}")
+        if angles[0] < low or angles[-1] > high:
+            raise numbers.wrong(
+                f"{name} angles of type {photometry} must lie in [{low:g}, {high:g}], "
+                f"got {angles[0]:g} to {angles[-1]:g}"
+            )
+        least = 2 if name == "vertical" or photometry != "C" else 1
+        if count < least:
+            raise numbers.wrong(f"type {photometry} needs {least} or more {name} angles")
+        found.append(angles)
+    vertical, horizontal = found
+    if photometry == "C" and (horizontal[0], horizontal[-1]) != (90.0, 270.0):
+        last = horizontal[-1]
+        if horizontal[0] != 0 or not (last in (0, 90, 180) or last > 180):
+            raise numbers.wrong(
+                "horizontal angles of type C must go from 0 to 0, 90, 180 or beyond, or from "
+                f"90 to 270, got {horizontal[0]:g} to {last:g}"
+            )
+    return vertical, horizontal
+
+
+def _type_c(
+    name: str, vertical: Array, horizontal: Array, values: Array, unit: Unit
+) -> LampProfile:
+    """All round, by the symmetry that the range of the horizontal angles stands for."""
+    h, v = horizontal, values
+    if (h[0], h[-1]) == (90, 270):
+        h, v = np.append(h, 540 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
+    if h[-1] == 0:
+        h, v = np.array([0.0, 360.0]), np.repeat(v, 2, axis=0)
+    if h[-1] == 90:
+        h, v = np.append(h, 180 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
+    if h[-1] == 180:
+        h, v = np.append(h, 360 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
+    if h[-1] - h[0] < 360:
+        h, v = np.append(h, 360), np.append(v, v[:1], axis=0)
+    return LampProfile(name, h, vertical, v, "C", unit)
+
+
+def _type_a_or_b(
+    name: str,
+    vertical: Array,
+    horizontal: Array,
+    values: Array,
+    photometry: Photometry,
+    unit: Unit,
+) -> LampProfile:
+    """Both sides of the vertical plane where only one is given; dark beyond the table."""
+    if horizontal[0] == 0:
+        horizontal = np.append(-horizontal[:0:-1], horizontal)
+        values = np.append(values[:0:-1], values, axis=0)
+    if photometry == "A":
+        return LampProfile(name, horizontal, vertical + 90, values, photometry, unit)
+    return LampProfile(name, vertical, horizontal + 90, values.T, photometry, unit)

@@ -1,0 +1,272 @@
+"""The calibrated geometry of a stage, read from a rig file."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from reconstruction.geometry.cameras import Camera, Pinhole, facing
+from reconstruction.geometry.ies import read_ies
+from reconstruction.geometry.light_profiles import LampProfile
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.projectors import Projector
+
+P = TypeVar("P", bound=Pinhole)
+
+
+class RigError(ValueError):
+    """A rig file that cannot be used; the message names the file, the table and the field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras, lights and projectors of one stage, in one world frame (metres, z up)."""
+
+    name: str
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    projectors: tuple[Projector, ...] = ()
+
+    def __post_init__(self) -> None:
+        for kind in ("cameras", "lights", "projectors"):
+            names = [item.name for item in getattr(self, kind)]
+            twice = {n for n in names if names.count(n) > 1}
+            if twice:
+                raise RigError(f"rig {self.name}: {kind} must have distinct names, twice: {twice}")
+        kept = self.profiles
+        for profile in (x.profile for x in self.lights if x.profile is not None):
+            if kept[profile.name] is not profile:
+                raise RigError(f"rig {self.name}: two profiles are called {profile.name!r}")
+
+    @property
+    def profiles(self) -> dict[str, LampProfile]:
+        """The profiles of the lights, by name."""
+        return {x.profile.name: x.profile for x in self.lights if x.profile is not None}
+
+    def camera(self, name: str) -> Camera:
+        """The camera called `name`; KeyError names the ones there are."""
+        return _named(self.cameras, name, "camera")
+
+    def light(self, name: str) -> Light:
+        """The light called `name`; KeyError names the ones there are."""
+        return _named(self.lights, name, "light")
+
+    def projector(self, name: str) -> Projector:
+        """The projector called `name`; KeyError names the ones there are."""
+        return _named(self.projectors, name, "projector")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Rig:
+        """Read a rig from TOML (explicit devices, `look_at` poses, domes) or from JSON.
+
+        Raises `RigError` naming file, table and field when something is missing or wrong.
+        """
+        path = Path(path)
+        try:
+            data = (
+                json.loads(path.read_text())
+                if path.suffix == ".json"
+                else tomllib.loads(path.read_text())
+            )
+        except FileNotFoundError:
+            raise RigError(f"{path}: no such rig file") from None
+        except (json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
+            raise RigError(f"{path}: {error}") from error
+        try:
+            return cls.from_dict(data, path.parent)
+        except (RigError, ValueError, TypeError) as error:
+            raise RigError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any], folder: Path = Path()) -> Rig:
+        """Build a rig from the tables of a rig file; the device tables are not looked at.
+
+        Files that it names, such as IES profiles, are looked for in `folder`.
+        """
+        cameras = tuple(_pinholes(Camera, data, "cameras"))
+        if not cameras:
+            raise RigError("a rig needs at least one [[cameras]] table")
+        projectors = tuple(_pinholes(Projector, data, "projectors"))
+        lights = tuple(_lights(data, cameras, _profiles(data, folder)))
+        return cls(str(data.get("name", "rig")), cameras, lights, projectors)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready description with every pose explicit; `from_dict` reads it back exactly."""
+        profiles = {"profiles": {k: p.to_dict() for k, p in self.profiles.items()}}
+        return {
+            **(profiles if self.profiles else {}),
+            "name": self.name,
+            "cameras": [c.to_dict() for c in self.cameras],
+            "lights": [light.to_dict() for light in self.lights],
+            "projectors": [p.to_dict() for p in self.projectors],
+        }
+
+
+T = TypeVar("T", Camera, Light, Projector)
+
+
+def _named(items: tuple[T, ...], name: str, kind: str) -> T:
+    for item in items:
+        if item.name == name:
+            return item
+    raise KeyError(f"no {kind} {name!r} in this rig; it has {[i.name for i in items]}")
+
+
+def _take(table: dict[str, Any], field: str, where: str) -> Any:
+    if field not in table:
+        raise RigError(f"{where}: the field {field!r} is missing")
+    return table[field]
+
+
+_OWN_FIELDS: dict[type[Pinhole], tuple[str, ...]] = {
+    Camera: ("distortion", "filter_sigma"),
+    Projector: ("intensity", "line_sigma"),
+}
+
+
+def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
+    """Pinholes from explicit `K, R, t` or from `position, target, fov_deg[, roll_deg]`."""
+    out: list[P] = []
+    for i, table in enumerate(data.get(key, [])):
+        where = f"[[{key}]] number {i + 1} ({table.get('name', 'unnamed')})"
+        name = str(_take(table, "name", where))
+        width, height = (int(_take(table, f, where)) for f in ("width", "height"))
+        own = _OWN_FIELDS[kind]
+        more: dict[str, Any] = {f: table[f] for f in own if f in table}
+        allowed = {
+            *("name", "width", "height", "K", "R", "t"),
+            *("position", "target", "fov_deg", "roll_deg", *own),
+        }
+        unknown = set(table) - allowed
+        if unknown:
+            raise RigError(
+                f"{where}: unknown fields {sorted(unknown)}; known are {sorted(allowed)}"
+            )
+        try:
+            if "K" in table:
+                K, R, t = (_take(table, f, where) for f in ("K", "R", "t"))
+                out.append(kind(name, width, height, K, R, t, **more))
+            else:
+                position, target, fov = (
+                    _take(table, f, where) for f in ("position", "target", "fov_deg")
+                )
+                roll = float(table.get("roll_deg", 0.0))
+                out.append(kind.look_at(name, width, height, position, target, fov, roll, **more))
+        except (ValueError, TypeError) as error:
+            raise error if isinstance(error, RigError) else RigError(f"{where}: {error}") from error
+    return out
+
+
+def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LampProfile]:
+    """`[profiles.NAME]`: an IES `file` with a `unit`, or the table of `LampProfile.to_dict`."""
+    out = {}
+    for name, table in data.get("profiles", {}).items():
+        where = f"[profiles.{name}]"
+        try:
+            if "file" not in table:
+                out[name] = LampProfile.from_dict({**table, "name": name})
+                continue
+            if unknown := set(table) - {"file", "unit", "tilt_deg"}:
+                raise RigError(f"unknown fields {sorted(unknown)}")
+            unit = table.get("unit")
+            of_file = None if unit == "relative" else unit
+            read = read_ies(
+                folder / table["file"], unit=of_file, tilt_deg=float(table.get("tilt_deg", 0.0))
+            )
+            profile = read.profile.relative() if unit == "relative" else read.profile
+            out[name] = replace(profile, name=name)
+        except (ValueError, TypeError) as error:
+            raise RigError(f"{where}: {error}") from error
+    return out
+
+
+_LIGHT_FIELDS = {
+    *("name", "position", "intensity", "beside"),
+    *("orientation", "aim", "roll_deg", "profile", "radius", "size"),
+}
+
+
+def _light(table: dict[str, Any], where: str, profiles: dict[str, LampProfile]) -> Light:
+    """A lamp; `aim` (a direction) and `roll_deg` stand for `orientation`."""
+    if unknown := set(table) - _LIGHT_FIELDS:
+        raise RigError(
+            f"{where}: unknown fields {sorted(unknown)}; known are {sorted(_LIGHT_FIELDS)}"
+        )
+    name, position, intensity = (_take(table, f, where) for f in ("name", "position", "intensity"))
+    more: dict[str, Any] = {
+        f: table[f] for f in ("beside", "orientation", "radius", "size") if f in table
+    }
+    if "profile" in table:
+        if table["profile"] not in profiles:
+            raise RigError(
+                f"{where}: no [profiles.{table['profile']}]; there are {sorted(profiles)}"
+            )
+        more["profile"] = profiles[table["profile"]]
+    try:
+        if "aim" in table:
+            if "orientation" in more:
+                raise RigError("give orientation or aim, not both")
+            aim = np.asarray(table["aim"], float)
+            if aim.shape != (3,) or not np.isfinite(aim).all() or not aim.any():
+                raise RigError(f"aim must be a direction of 3 numbers, got {table['aim']}")
+            more["orientation"] = facing(aim, float(table.get("roll_deg", 0.0)))
+        return Light(name, position, intensity, **more)
+    except (ValueError, TypeError) as error:
+        raise RigError(f"{where}: {error}") from error
+
+
+def _lights(
+    data: dict[str, Any], cameras: tuple[Camera, ...], profiles: dict[str, LampProfile]
+) -> list[Light]:
+    """Explicit `[[lights]]`, then the `[dome]`: the nearest dome lamp moves beside each camera.
+
+    The dome's lamps are all alike and aim at the origin.
+    """
+    lights = [
+        _light(table, f"[[lights]] number {i + 1}", profiles)
+        for i, table in enumerate(data.get("lights", []))
+    ]
+    dome = data.get("dome")
+    if dome is None:
+        return lights
+    count = int(_take(dome, "lights", "[dome]"))
+    intensity = _take(dome, "intensity", "[dome]")
+    positions = dome_positions(
+        count, float(_take(dome, "radius", "[dome]")), float(dome.get("lowest_deg", -90.0))
+    )
+    beside: dict[int, str] = {}
+    offset = float(dome.get("beside_cameras_at", 0.0))
+    if offset > 0:
+        for camera in cameras:
+            distance = np.linalg.norm(positions - camera.center, axis=1)
+            distance[list(beside)] = np.inf
+            nearest = int(distance.argmin())
+            beside[nearest] = camera.name
+            positions[nearest] = camera.center - offset * camera.R[1]
+    shared = {f: dome[f] for f in ("profile", "size", "roll_deg") if f in dome}
+    if "lamp_radius" in dome:  # the dome's own `radius` is how far out the lamps stand
+        shared["radius"] = dome["lamp_radius"]
+    if "profile" in shared or "size" in shared:
+        aims = [{"aim": -p} for p in positions]
+    else:
+        aims = [{} for _ in positions]
+    return lights + [
+        _light(
+            {
+                "name": f"light_{i:03d}",
+                "position": positions[i],
+                "intensity": intensity,
+                "beside": beside.get(i),
+                **shared,
+                **aims[i],
+            },
+            "[dome]",
+            profiles,
+        )
+        for i in range(count)
+    ]

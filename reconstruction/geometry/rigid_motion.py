@@ -1,0 +1,76 @@
+"""Rigid motions, and the one that brings calibrated devices into another's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from reconstruction.geometry.cameras import Pinhole
+
+Array = NDArray[np.float64]
+P = TypeVar("P", bound=Pinhole)
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """x -> rotation @ x + translation."""
+
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def identity(cls) -> Self:
+        """The motion that leaves everything where it is."""
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_vector(cls, vector: ArrayLike) -> Self:
+        """From a rotation vector and a translation `(6,)`."""
+        v = np.asarray(vector, float)
+        return cls(Rotation.from_rotvec(v[:3]).as_matrix(), v[3:])
+
+    def vector(self) -> Array:
+        """Rotation vector and translation `(6,)`."""
+        turn = Rotation.from_matrix(self.rotation).as_rotvec()
+        return np.concatenate([turn, self.translation])
+
+    def inverse(self) -> Rigid:
+        """The motion back."""
+        return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, first: Rigid) -> Rigid:
+        return Rigid(self.rotation @ first.rotation, self(first.translation))
+
+    def __call__(self, points: ArrayLike) -> Array:
+        """Points `(..., 3)` moved."""
+        return np.asarray(points, float) @ self.rotation.T + self.translation
+
+    def seen_by(self, device: P) -> P:
+        """`device` in the frame that this motion leads from: it sees x as it saw the moved x."""
+        return device.moved(self.rotation, self.translation)
+
+
+def fit_rigid(source: ArrayLike, target: ArrayLike) -> Rigid:
+    """The rigid motion that brings `source (N, 3)` nearest to `target (N, 3)` (Kabsch 1976)."""
+    a, b = np.asarray(source, float), np.asarray(target, float)
+    u, _, vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    keep = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ keep @ vt
+    return Rigid(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
+
+
+def align_devices(found: Sequence[Pinhole], wanted: Sequence[Pinhole]) -> Rigid:
+    """The rigid motion from the world of `found` to that of `wanted`, device for device.
+
+    By their centres and by points half a metre along their axes, so that one device suffices.
+    """
+
+    def points(devices: Sequence[Pinhole]) -> Array:
+        return np.concatenate([[d.center, *(d.center + 0.5 * d.R)] for d in devices])
+
+    return fit_rigid(points(found), points(wanted))

@@ -1,0 +1,1 @@
+"""From tangents to strands: envelope, orientation field, growth, rooting."""

@@ -1,0 +1,178 @@
+"""Where hair can be: the visual hull, carved by what the cameras saw, outside the head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.visual_hull import VoxelGrid
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def surface_samples(
+    mesh: Mesh, spacing: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Points `(M, 3)` on the mesh no more than about `spacing` metres apart, evenly laid out.
+
+    Also their smooth unit normals `(M, 3)` (the vertices', interpolated) and faces `(M,)`.
+    """
+    if not spacing > 0:
+        raise ValueError(f"spacing must be positive, got {spacing}")
+    corners = mesh.vertices[mesh.faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    parts = np.maximum(np.ceil(edges / spacing), 1).astype(int)
+    normals = mesh.vertex_normals()[mesh.faces]
+    points, directions, faces = [], [], []
+    for n in np.unique(parts):
+        which = np.flatnonzero(parts == n)
+        i, j = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+        up = i + j < n
+        down = i + j < n - 1  # centres of the sub-triangles that stand on their tip
+        b = np.concatenate([i[up] + 1 / 3, i[down] + 2 / 3]) / n
+        c = np.concatenate([j[up] + 1 / 3, j[down] + 2 / 3]) / n
+        weights = np.stack([1 - b - c, b, c], axis=1)
+        points.append(np.einsum("sk,fkd->fsd", weights, corners[which]).reshape(-1, 3))
+        directions.append(np.einsum("sk,fkd->fsd", weights, normals[which]).reshape(-1, 3))
+        faces.append(np.repeat(which, len(weights)))
+    n = np.concatenate(directions)
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+    return np.concatenate(points), n, np.concatenate(faces)
+
+
+def inside_mesh(grid: VoxelGrid, mesh: Mesh) -> Bools:
+    """Voxels `grid.inside.shape` with their centre in the mesh: most of six ray parities agree.
+
+    Scanned and modelled heads are open at the neck and often at the eyes; a vote over both
+    directions of three axes keeps such a hole from turning whole columns inside out.
+    """
+    votes = np.zeros(grid.inside.shape, np.int8)
+    corners = (mesh.vertices[mesh.faces] - grid.origin) / grid.spacing  # (F, 3, 3), voxels
+    # Off the lattice by a hair's breadth: no column may run along an edge shared by two faces.
+    corners = corners + np.array([1.3e-6, 2.1e-6, 1.7e-6])
+    for axis in range(3):
+        before, total = _crossings(corners, grid.inside.shape, axis)
+        votes += (before % 2).astype(np.int8)
+        votes += ((total - before) % 2).astype(np.int8)
+    return np.asarray(votes >= 4)
+
+
+def _crossings(
+    corners: Array, shape: tuple[int, ...], axis: int
+) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Crossings of each column `shape` before each voxel centre, and `total` with axis 1 long."""
+    u, v = (a for a in range(3) if a != axis)
+    deep = list(shape)
+    deep[axis] += 1  # the last layer collects what lies beyond the last centre
+    counts = np.zeros(deep, np.int16)
+    last = np.array([shape[u] - 1, shape[v] - 1])
+    low = np.maximum(np.ceil(corners[:, :, [u, v]].min(axis=1)).astype(int), 0)
+    high = np.minimum(np.floor(corners[:, :, [u, v]].max(axis=1)).astype(int), last)
+    for f in np.flatnonzero((high >= low).all(axis=1)):
+        a, b, c = corners[f]
+        area = (b[u] - a[u]) * (c[v] - a[v]) - (b[v] - a[v]) * (c[u] - a[u])
+        if area == 0:
+            continue
+        i, j = (
+            grid.ravel()
+            for grid in np.meshgrid(
+                np.arange(low[f, 0], high[f, 0] + 1), np.arange(low[f, 1], high[f, 1] + 1)
+            )
+        )
+        wb = ((i - a[u]) * (c[v] - a[v]) - (j - a[v]) * (c[u] - a[u])) / area
+        wc = ((b[u] - a[u]) * (j - a[v]) - (b[v] - a[v]) * (i - a[u])) / area
+        hit = (wb >= 0) & (wc >= 0) & (wb + wc <= 1)
+        depth = a[axis] + wb[hit] * (b[axis] - a[axis]) + wc[hit] * (c[axis] - a[axis])
+        index = np.empty((3, len(depth)), int)
+        index[u], index[v] = i[hit], j[hit]
+        index[axis] = np.clip(np.ceil(depth), 0, shape[axis])
+        np.add.at(counts, tuple(index), 1)
+    total = counts.sum(axis=axis, keepdims=True, dtype=np.int16)
+    before = np.cumsum(counts, axis=axis, dtype=np.int16).take(range(shape[axis]), axis=axis)
+    return before, total
+
+
+def carve(
+    hull: VoxelGrid,
+    cameras: Sequence[Camera],
+    first_surface: Mapping[str, NDArray[np.floating]],
+    margin: float = 0.0,
+) -> VoxelGrid:
+    """The hull without the voxels that some camera saw through (space carving).
+
+    `first_surface[name] (H, W)` is the depth along that camera's z, metres, of the first thing
+    each pixel sees: infinite where the pixel sees nothing at all, 0 where nothing is known. Voxels
+    more than `margin` metres in front of it are empty; voxels off an image are not judged by it.
+    """
+    index = np.argwhere(hull.inside)
+    for camera in cameras:
+        if camera.name not in first_surface:
+            continue
+        first = first_surface[camera.name]
+        if first.shape != (camera.height, camera.width):
+            raise ValueError(
+                f"{camera.name}: first_surface must be {(camera.height, camera.width)}, "
+                f"got {first.shape}"
+            )
+        pixels, depth = camera.project(hull.centers(index))
+        seen = (depth > 0) & camera.inside(pixels)
+        x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+        index = index[~seen | (depth >= first[y, x] - margin)]
+    inside = np.zeros_like(hull.inside)
+    inside[tuple(index.T)] = True
+    return replace(hull, inside=inside)
+
+
+def depth_map(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Depth `(H, W)` along z, metres: the median of the points on a pixel, 0 where there are none.
+
+    A pixel has a point for each projector that reaches it; the lower median of those outvotes a
+    single wrong one, and of two takes the nearer, which carves less.
+    """
+    xy, depth = camera.project(points)
+    ok = (depth > 0) & camera.inside(xy)
+    x, y = np.rint(xy[ok]).astype(int).T
+    flat, depth = y * camera.width + x, depth[ok]
+    order = np.lexsort((depth, flat))
+    pixel, start, count = np.unique(flat[order], return_index=True, return_counts=True)
+    out = np.zeros(camera.height * camera.width)
+    out[pixel] = depth[order][start + (count - 1) // 2]
+    return out.reshape(camera.height, camera.width)
+
+
+def mesh_depth(camera: Camera, mesh: Mesh) -> NDArray[np.float64]:
+    """Depth `(H, W)` along z of the mesh's nearest surface, infinite where it is not seen.
+
+    Faces are painted from far to near, each pixel takes its face's plane: right where faces are
+    small against the distances between surfaces that hide each other. Faces that reach behind the
+    camera are left out.
+    """
+    pixels, depth = camera.project(mesh.vertices)
+    corners = depth[mesh.faces]
+    limit = 30.0 * max(camera.width, camera.height)  # keeps the fixed-point numbers in range
+    usable = (corners > 1e-3).all(axis=1) & (np.abs(pixels[mesh.faces]) < limit).all(axis=(1, 2))
+    order = np.flatnonzero(usable)
+    order = order[np.argsort(-corners[order].mean(axis=1), kind="stable")]
+    painted = np.full((camera.height, camera.width), -1, np.int32)
+    shift = 4  # OpenCV's fixed-point bits below the pixel
+    triangles = np.rint(pixels[mesh.faces[order]] * (1 << shift)).astype(np.int32)
+    for number, triangle in zip(order.tolist(), triangles, strict=True):
+        cv2.fillConvexPoly(painted, triangle, number, lineType=cv2.LINE_8, shift=shift)
+    out = np.full(painted.shape, np.inf)
+    y, x = np.nonzero(painted >= 0)
+    face = painted[y, x]
+    rays = camera.rays(np.stack([x, y], axis=1))
+    normals, base = mesh.face_normals()[face], mesh.vertices[mesh.faces[face, 0]]
+    slope = np.einsum("nk,nk->n", normals, rays)
+    reach = np.einsum("nk,nk->n", normals, base - camera.center)
+    along = reach / np.where(np.abs(slope) > 1e-9, slope, np.inf) * (rays @ camera.R[2])
+    low, high = corners[face].min(axis=1), corners[face].max(axis=1)
+    out[y, x] = np.clip(along, low, high)  # an edge's pixel may lie just beside its face
+    return out

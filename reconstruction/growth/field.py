@@ -1,0 +1,281 @@
+"""Orientation fields: measured tangents spread through the hair's volume (Photobooth §3.3)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import connected_components
+
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.growth.laplace import conjugate_gradients, explicit_diffusion, grid_laplacian
+from reconstruction.report.report import Series
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_PAD = 2
+_ROWS, _COLUMNS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+
+
+def to_tensors(directions: NDArray[np.floating]) -> Array:
+    """Structure tensors `(N, 6)` (xx, yy, zz, xy, xz, yz) of lines along `directions (N, 3)`.
+
+    `t tᵀ / |t|²`: the same for t and -t, trace 1.
+    """
+    t = np.asarray(directions, float)
+    norm = np.linalg.norm(t, axis=1, keepdims=True)
+    if (norm == 0).any():
+        raise ValueError("directions must not be zero")
+    t = t / norm
+    return np.asarray(t[:, _ROWS] * t[:, _COLUMNS])
+
+
+def principal(tensors: Array) -> tuple[Array, Array]:
+    """Unit eigenvectors `(N, 3)` of the largest eigenvalue, and eigenvalues `(N, 3)`.
+
+    `tensors (N, 6)` as `to_tensors` makes them; eigenvalues have the largest first.
+    """
+    full = np.empty((len(tensors), 3, 3))
+    full[:, _ROWS, _COLUMNS] = tensors
+    full[:, _COLUMNS, _ROWS] = tensors
+    values, vectors = np.linalg.eigh(full)
+    return vectors[:, :, 2], values[:, ::-1]
+
+
+def _within(index: NDArray[np.int64], shape: tuple[int, ...]) -> Bools:
+    """Which of the voxels `index (N, 3)` lie on a grid of `shape`."""
+    return np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationField:
+    """Undirected orientations on the voxels of an envelope.
+
+    `grid` marks the envelope; its M inside voxels in C order carry `tensors (M, 6)`,
+    `directions (M, 3)` (unit, sign meaningless; 0 where `valid` is False), `coherence (M,)`
+    (largest minus second eigenvalue, 0 to 1), `measured (M,)` (a measurement fell into the voxel),
+    `empty (M,)` (part of a connected piece without any data) and `degenerate (M,)` (the two largest
+    eigenvalues nearly agree: there is no orientation).
+    """
+
+    grid: VoxelGrid
+    tensors: Array
+    directions: Array
+    coherence: Array
+    measured: Bools
+    empty: Bools
+    degenerate: Bools
+    _padded: NDArray[np.int32] = field(init=False)
+    _table: NDArray[np.float32] = field(init=False)
+    _corners: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        # Two voxels of nothing on each side, so that eight corners are looked up at once without
+        # asking whether they are on the grid; nothing is the row of zeros after the last voxel.
+        count = len(self.directions)
+        padded = np.full(np.array(self.grid.inside.shape) + 2 * _PAD, count, np.int32)
+        inner = padded[_PAD:-_PAD, _PAD:-_PAD, _PAD:-_PAD]
+        inner[self.grid.inside] = np.arange(count)
+        corners = np.array(list(np.ndindex(2, 2, 2))) @ self._strides(padded.shape)
+        object.__setattr__(self, "_padded", padded)
+        object.__setattr__(self, "_corners", corners)
+        table = np.concatenate([self.directions, np.zeros((1, 3))]).astype(np.float32)
+        object.__setattr__(self, "_table", table)
+
+    @property
+    def valid(self) -> Bools:
+        """Voxels `(M,)` with an orientation."""
+        return np.asarray(~(self.empty | self.degenerate))
+
+    def near_measured(self, reach: float) -> Bools:
+        """Voxels `(M,)` within `reach` metres, centre to centre, of a measured one."""
+        measured = np.zeros(self.grid.inside.shape, bool)
+        measured[self.grid.inside] = self.measured
+        if not measured.any():
+            return np.zeros(len(self.directions), bool)
+        away = ndimage.distance_transform_edt(~measured, sampling=self.grid.spacing)
+        return np.asarray(away[self.grid.inside] <= reach)
+
+    def voxel(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """The number `(N,)` of the envelope voxel that holds each point, -1 outside."""
+        number = self._padded.ravel()[self._flat(self.grid.index(points))]
+        return np.where(number == len(self.directions), -1, number).astype(np.int64)
+
+    def sample(self, points: NDArray[np.floating], along: Array) -> tuple[Array, Bools]:
+        """Directions `(N, 3)` at `points (N, 3)`, each signed to turn least from `along (N, 3)`.
+
+        The eight voxels around a point are interpolated trilinearly after their signs are made to
+        agree with `along`; those outside the envelope or without orientation take no part. Also
+        says where there was anything to interpolate `(N,)`.
+        """
+        q = (points - self.grid.origin) / self.grid.spacing
+        base = np.floor(q)
+        high = (q - base).astype(np.float32)
+        low = 1 - high
+        flat = self._flat(base.astype(np.int64))
+        d = self._table[self._padded.ravel()[flat[:, None] + self._corners]]
+        # (N, 8) in the order of `ndindex`: the last axis of the grid runs fastest
+        x, y, z = (np.stack([low[:, k], high[:, k]], axis=1) for k in range(3))
+        weight = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(-1, 8)
+        turned = np.einsum("nkd,nd->nk", d, along.astype(np.float32)) < 0
+        total = np.einsum("nk,nkd->nd", np.where(turned, -weight, weight), d).astype(float)
+        norm = np.sqrt(np.einsum("nd,nd->n", total, total))
+        good = norm > 1e-6
+        return np.where(good[:, None], total / np.where(good, norm, 1.0)[:, None], 0.0), good
+
+    def _flat(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Places `(N,)` in the padded volume; voxels far off the grid fall on its rim."""
+        shape = self._padded.shape
+        inside = np.clip(index + _PAD, 0, np.array(shape) - 2)
+        return np.asarray(inside @ self._strides(shape))
+
+    @staticmethod
+    def _strides(shape: tuple[int, ...]) -> NDArray[np.int64]:
+        return np.array([shape[1] * shape[2], shape[2], 1])
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """How a field is solved.
+
+    `tolerance` is the relative residual at which conjugate gradients stop; `explicit_seconds` how
+    long the explicit reference runs beside it (0: not at all); `least_coherence` the difference of
+    the two largest eigenvalues under which a voxel counts as degenerate.
+    """
+
+    tolerance: float = 1e-4
+    explicit_seconds: float = 0.0
+    least_coherence: float = 0.5
+
+
+def gather(
+    grid: VoxelGrid,
+    points: NDArray[np.floating],
+    directions: NDArray[np.floating],
+    weights: NDArray[np.floating],
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Data per voxel: numbers `(D,)` of the voxels hit, mean tensors `(D, 6)`, weights `(D,)`.
+
+    Points outside the envelope are given to the nearest of the 26 neighbours that is inside, or
+    are dropped: a measured surface point may lie a fraction of a voxel in front of the envelope.
+    """
+    number = np.full(grid.inside.shape, -1, np.int64)
+    number[grid.inside] = np.arange(int(grid.inside.sum()))
+    index = grid.index(points)
+    q = (np.asarray(points, float) - grid.origin) / grid.spacing
+    best, distance = np.full(len(index), -1, np.int64), np.full(len(index), np.inf)
+    for shift in np.ndindex(3, 3, 3):
+        moved = index + np.array(shift) - 1
+        on = _within(moved, number.shape)
+        n = np.where(on, number[tuple(np.where(on[:, None], moved, 0).T)], -1)
+        far = np.linalg.norm(q - moved, axis=1)
+        nearer = (n >= 0) & (far < distance)
+        best[nearer], distance[nearer] = n[nearer], far[nearer]
+    ok = (best >= 0) & (np.asarray(weights) > 0)
+    voxels, member = np.unique(best[ok], return_inverse=True)
+    w = np.asarray(weights, float)[ok]
+    tensors = to_tensors(np.asarray(directions)[ok]) * w[:, None]
+    total = np.bincount(member, w, len(voxels)).astype(float)
+    sums = np.stack([np.bincount(member, t, len(voxels)) for t in tensors.T], axis=1)
+    return voxels, sums / np.maximum(total, 1e-300)[:, None], total
+
+
+def solve_field(
+    grid: VoxelGrid,
+    points: NDArray[np.floating],
+    directions: NDArray[np.floating],
+    weights: NDArray[np.floating] | None = None,
+    boundary: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    options: FieldOptions = FieldOptions(),
+) -> tuple[OrientationField, list[Series]]:
+    """Spread measured lines through the envelope: Laplace's equation for each tensor entry.
+
+    `points (N, 3)` with `directions (N, 3)` and `weights (N,)` are the measured lines, `boundary`
+    more points and directions (the scalp and its normals) that yield to measurements where both
+    hit a voxel. Both are Dirichlet data; the envelope's surface passes no flux. That is the state
+    of rest of Photobooth Eq. 3. Also returns error against run time of the solver and, if asked
+    for, of the explicit steps that the paper takes.
+
+    Raises `ValueError` for an empty envelope or when no datum falls into it.
+    """
+    system = field_system(grid, points, directions, weights, boundary)
+    values, free = system.values.copy(), system.free
+    series: list[Series] = []
+    if len(free):
+        A, b, start = system.equations()
+        values[free], fast = conjugate_gradients(A, b, start, options.tolerance)
+        series.append(fast)
+        if options.explicit_seconds > 0:
+            begin = time.perf_counter()
+            series.append(explicit_diffusion(A, b, start, options.explicit_seconds, begin)[1])
+    directions_, eigenvalues = principal(values)
+    coherence = eigenvalues[:, 0] - eigenvalues[:, 1]
+    degenerate = ~system.empty & (coherence < options.least_coherence)
+    directions_[system.empty | degenerate] = 0
+    field = OrientationField(
+        grid, values, directions_, coherence, system.measured, system.empty, degenerate
+    )
+    return field, series
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSystem:
+    """What `solve_field` solves, on the M voxels of the envelope.
+
+    `values (M, 6)` are tensors, 0 where not `fixed (M,)`; `measured (M,)` and `empty (M,)` as in
+    the field; `free (F,)` numbers the unknowns.
+    """
+
+    laplacian: sparse.csr_array
+    values: Array
+    fixed: Bools
+    measured: Bools
+    empty: Bools
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Numbers `(F,)` of the voxels to solve for."""
+        return np.flatnonzero(~self.fixed & ~self.empty)
+
+    def equations(self) -> tuple[sparse.csr_array, Array, Array]:
+        """`A (F, F)`, `b (F, 6)` and a start `(F, 6)`: the mean of the data, so of trace 1."""
+        rows = self.laplacian[self.free]
+        known = np.flatnonzero(self.fixed)
+        b = -(rows[:, known] @ self.values[known])
+        return rows[:, self.free], b, np.broadcast_to(self.values[known].mean(axis=0), b.shape)
+
+
+def field_system(
+    grid: VoxelGrid,
+    points: NDArray[np.floating],
+    directions: NDArray[np.floating],
+    weights: NDArray[np.floating] | None = None,
+    boundary: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+) -> FieldSystem:
+    """The linear system of `solve_field`, which says what the arguments are and what it raises."""
+    count = int(grid.inside.sum())
+    if count == 0:
+        raise ValueError("the hair's envelope is empty: check masks and poses")
+    weights = np.ones(len(points)) if weights is None else weights
+    voxels, data, _ = gather(grid, points, directions, weights)
+    measured = np.zeros(count, bool)
+    measured[voxels] = True
+    values = np.zeros((count, 6))
+    values[voxels] = data
+    fixed = measured.copy()
+    if boundary is not None and len(boundary[0]):
+        voxels, data, _ = gather(grid, *boundary, np.ones(len(boundary[0])))
+        new = ~measured[voxels]
+        values[voxels[new]] = data[new]
+        fixed[voxels] = True
+    if not fixed.any():
+        raise ValueError("no orientation was measured inside the hair's envelope")
+    laplacian = grid_laplacian(grid.inside)
+    pieces, piece = connected_components(laplacian, directed=False)
+    has_data = np.zeros(pieces, bool)
+    has_data[piece[fixed]] = True
+    return FieldSystem(laplacian, values, fixed, measured, ~has_data[piece])

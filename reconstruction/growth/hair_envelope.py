@@ -1,0 +1,123 @@
+"""The volume that can hold hair, from masks, triangulated points and the head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.visual_hull import VoxelGrid, visual_hull
+from reconstruction.growth.envelope import carve, depth_map, inside_mesh, mesh_depth
+from reconstruction.light_planes import PointCloud
+from reconstruction.masks import HairMask
+from reconstruction.report.report import Stage
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_BARE = 2e-3
+"""Metres behind the head's surface up to which a pixel of skin rules hair out."""
+
+
+def build_envelope(
+    capture: Capture,
+    cloud: PointCloud,
+    masks: Mapping[str, HairMask],
+    head: Mesh,
+    *,
+    grid: float,
+    margin: float,
+    stage: Stage,
+) -> tuple[VoxelGrid, dict[str, Array]]:
+    """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels.
+
+    `grid` is the voxels' edge, `margin` how far in front of the seen surface hair may be, metres.
+
+    The visual hull of everything that is not background, less the head's inside, less what a
+    camera saw through: voxels in front of a triangulated hair pixel, or on the head and in front of
+    it where the pixel shows skin. A pixel has one depth and may look past a thin wisp: where
+    triangulated points of hair stand, there is hair. Without a sweep, hair pixels carve nothing,
+    and their depth is where the ray enters the envelope.
+    """
+    cameras = [c for c in capture.rig.cameras if c.name in masks]
+    bounds = _bounds(cloud, head)
+    hull = visual_hull(
+        cameras, {k: m.subject for k, m in masks.items()}, spacing=grid, bounds=bounds
+    )
+    surfaces, depths, hairs = {}, {}, []
+    for camera in cameras:
+        mask = masks[camera.name]
+        bare = mesh_depth(camera, head) + _BARE + margin
+        own = cloud.of_camera(camera.name).points if len(cloud) else cloud.points
+        depth = np.where(mask.hair, depth_map(camera, own), 0.0)
+        first = np.where(mask.hair, depth, np.where(np.isfinite(bare), bare, 0.0))
+        surfaces[camera.name], depths[camera.name] = first, depth
+        hairs.append(own[_on(mask.hair, camera, own)])
+    carved = carve(hull, cameras, surfaces, margin)
+    held = hull.inside & _holding(hull, np.concatenate(hairs))
+    inside = (carved.inside | held) & ~inside_mesh(hull, head)
+    envelope = replace(carved, inside=inside)
+    for camera in cameras:
+        depth = depths[camera.name]
+        unknown = masks[camera.name].hair & (depth == 0)
+        depths[camera.name] = np.where(unknown, depth_map_first(camera, envelope), depth)
+    litres = 1e3 * grid**3
+    stage.figures.update(
+        hull_litres=float(hull.inside.sum() * litres),
+        carved_litres=float(carved.inside.sum() * litres),
+        envelope_litres=float(inside.sum() * litres),
+        voxels=int(inside.sum()),
+        shape=list(inside.shape),
+    )
+    stage.leave_out(
+        "voxels outside the envelope",
+        "no hair can be there",
+        f"{inside.size - int(inside.sum())} of {inside.size} unknowns",
+    )
+    if not inside.any():
+        raise CaptureError(
+            f"{capture.path}: no volume is left for hair: check masks, head.obj and poses"
+        )
+    return envelope, depths
+
+
+def _on(mask: Bools, camera: Camera, points: Array) -> Bools:
+    """Which of `points (N, 3)` fall on `mask (H, W)`."""
+    pixels, depth = camera.project(points)
+    seen = (depth > 0) & camera.inside(pixels)
+    x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+    return np.asarray(seen & mask[y, x])
+
+
+def _holding(grid: VoxelGrid, points: Array) -> Bools:
+    """Voxels `grid.inside.shape` with at least two of `points (N, 3)`."""
+    index = grid.index(points)
+    index = index[((index >= 0) & (index < grid.inside.shape)).all(axis=1)]
+    flat = np.ravel_multi_index(tuple(index.T), grid.inside.shape)
+    counts = np.bincount(flat, minlength=grid.inside.size)
+    return np.asarray(counts.reshape(grid.inside.shape) >= 2)
+
+
+def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
+    """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
+    pixels, depth = camera.project(envelope.centers())
+    ok = (depth > 0) & camera.inside(pixels)
+    x, y = np.rint(pixels[ok]).astype(int).T
+    out = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(out, (y, x), depth[ok])
+    return np.where(np.isfinite(out), out, 0.0)
+
+
+def _bounds(cloud: PointCloud, head: Mesh) -> Array:
+    """A box `(2, 3)` that holds the hair: the points', or 12 cm about the head's upper part."""
+    if len(cloud) >= 100:
+        low, high = np.percentile(cloud.points, [0.1, 99.9], axis=0)
+        return np.stack([low - 0.015, high + 0.015])
+    top = head.vertices[:, 2].max()
+    upper = head.vertices[head.vertices[:, 2] > top - 0.25]
+    return np.stack([upper.min(axis=0) - 0.12, upper.max(axis=0) + 0.12])

@@ -1,0 +1,181 @@
+"""Strands that reach the scalp: loose ones rise from it, or join a neighbour on its way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.head.scalp import Scalp
+
+Polyline = NDArray[np.float32]
+Array = NDArray[np.float64]
+
+_STRIDE = 4
+"""Every fourth point of a strand stands for it in the search: the growth's step is short."""
+
+_RISE = 1e-3
+"""Metres between the points of a way from the scalp."""
+
+
+@dataclass(frozen=True)
+class Rooted:
+    """Strands that start on the scalp, and how loose ones got there.
+
+    `to_scalp` were led to the scalp from their lower end, `joined` run as a rooted neighbour does,
+    `dropped` found neither.
+    """
+
+    strands: list[Polyline]
+    to_scalp: int
+    joined: int
+    dropped: int
+
+
+def root_all(
+    rooted: list[Polyline],
+    loose: list[Polyline],
+    scalp: Scalp,
+    *,
+    near_scalp: float = 8e-3,
+    highest: float = 40e-3,
+    reaches: tuple[float, ...] = (3e-3, 5e-3, 8e-3, 8e-3, 12e-3, 12e-3, 20e-3),
+    turn_deg: float = 45.0,
+) -> Rooted:
+    """Give every loose polyline a root; its direction in space is not changed.
+
+    An end within `near_scalp` metres of the scalp is led to it. Any other goes on as the nearest
+    rooted strand that continues it within `turn_deg`: where the scalp is at most `highest` metres
+    below, down through the hair to it, which hides what nobody measured; else beside that strand,
+    keeping a distance that fades towards its root. Strands that were joined carry others in the
+    next round. `reaches` are the distances, metres, within which a neighbour is looked for, round
+    by round. What finds none is led down from its lower end, if the scalp is near enough.
+    """
+    strands = list(rooted)
+    if not loose:
+        return Rooted(strands, 0, 0, 0)
+    below = _Below(scalp, highest)
+    height = below.heights(_ends(loose))
+    waiting: list[Polyline] = []
+    for path, h in zip(loose, height, strict=True):
+        if h.min() > near_scalp:
+            waiting.append(path)
+        else:
+            strands.append(below.lead_lower(path, h))
+    to_scalp = len(strands) - len(rooted)
+    joined = 0
+    for reach in reaches:
+        if not waiting or not strands:
+            break
+        least = np.cos(np.radians(turn_deg))
+        attached, waiting = _join_round(strands, waiting, reach, least, below)
+        joined += len(attached)
+        strands += attached
+    height = below.heights(_ends(waiting)) if waiting else np.zeros((0, 2))
+    for path, h in zip(waiting, height, strict=True):
+        if h.min() <= highest:
+            strands.append(below.lead_lower(path, h))
+    led = int((height.min(axis=1) <= highest).sum())
+    return Rooted(strands, to_scalp + led, joined, len(waiting) - led)
+
+
+class _Below:
+    """Ways to the scalp under a strand."""
+
+    def __init__(self, scalp: Scalp, highest: float) -> None:
+        self._scalp = scalp
+        self._tree = cKDTree(scalp.points)
+        self.highest = highest
+
+    def heights(self, points: Array) -> Array:
+        """Distance `(...)` of `points (..., 3)` to the scalp, metres."""
+        return np.asarray(self._tree.query(points)[0])
+
+    def lead_lower(self, path: Polyline, heights: Array) -> Polyline:
+        """`lead` from the lower end; `heights (2,)` are those of both."""
+        return self.lead(path if heights[0] <= heights[1] else path[::-1])
+
+    def lead(self, path: Polyline) -> Polyline:
+        """The path with a way from the scalp before it: out along its normal, then into the path.
+
+        It rises at about 45 degrees, a cubic in Hermite's form.
+        """
+        p = path[0].astype(float)
+        along = path[min(_STRIDE, len(path) - 1)] - p
+        along /= max(float(np.linalg.norm(along)), 1e-12)
+        height, _ = self._tree.query(p)
+        _, k = self._tree.query(p - height * along)
+        root, normal = self._scalp.points[k], self._scalp.normals[k]
+        length = float(np.linalg.norm(p - root))
+        if length < 5e-4:
+            return path
+        u = np.linspace(0, 1, max(2, int(length / _RISE) + 1))[:-1, None]
+        start, out = (2 * u - 3) * u * u + 1, ((u - 2) * u + 1) * u
+        end, into = (3 - 2 * u) * u * u, (u - 1) * u * u
+        way = start * root + end * p + length * (out * normal + into * along)
+        return np.concatenate([way.astype(np.float32), path])
+
+
+def _ends(paths: list[Polyline]) -> Array:
+    """First and last points `(N, 2, 3)`."""
+    return np.stack([[p[0] for p in paths], [p[-1] for p in paths]], axis=1).astype(float)
+
+
+def _join_round(
+    strands: list[Polyline],
+    loose: list[Polyline],
+    reach: float,
+    least_cosine: float,
+    below: _Below,
+) -> tuple[list[Polyline], list[Polyline]]:
+    """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
+    points = np.concatenate(strands)
+    counts = np.array([len(s) for s in strands])
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    owner = np.repeat(np.arange(len(strands)), counts)
+    place = np.arange(len(points)) - first[owner]
+    some = np.flatnonzero((place > 0) & (place % _STRIDE == 0))  # nothing goes on below a root
+    if not len(some):
+        return [], loose
+    rootward = points[some - 1] - points[some]
+    rootward /= np.maximum(np.linalg.norm(rootward, axis=1, keepdims=True), 1e-12)
+    tree = cKDTree(points[some], balanced_tree=False, compact_nodes=False)
+    height = below.heights(_ends(loose))
+    ends = _ends(loose).reshape(-1, 3)
+    before = [[p[min(4, len(p) - 1)] for p in loose], [p[-min(5, len(p))] for p in loose]]
+    out = ends - np.stack(before, axis=1).reshape(-1, 3)
+    out = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
+    distance, index = tree.query(ends, k=np.arange(1, 17), distance_upper_bound=reach)
+    found = np.isfinite(distance)
+    index = np.where(found, index, 0)
+    cosine = np.einsum("nkd,nd->nk", rootward[index], out)
+    cost = np.where(found & (cosine >= least_cosine), distance + reach * (1 - cosine), np.inf)
+    pick = cost.argmin(axis=1)
+    cost = cost[np.arange(len(ends)), pick].reshape(-1, 2)
+    target = some[index[np.arange(len(ends)), pick]].reshape(-1, 2)
+    attached, left = [], []
+    for path, c, t, h in zip(loose, cost, target, height, strict=True):
+        if not np.isfinite(c.min()):
+            left.append(path)
+            continue
+        end = int(c.argmin())
+        path = path if end == 0 else path[::-1]
+        if h[end] <= below.highest:
+            attached.append(below.lead(path))
+            continue
+        guide = points[first[owner[t[end]]] : t[end] + 1].astype(float)
+        attached.append(_beside(guide, path))
+    return attached, left
+
+
+def _beside(guide: Array, path: Polyline) -> Polyline:
+    """The path with a way to the guide's root before it, parallel to the guide where they meet."""
+    offset = path[0] - guide[-1]
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1))])
+    share = arc / max(arc[-1], 1e-12)
+    fade = share * share * (3 - 2 * share)
+    way = guide + fade[:, None] * offset
+    # the guide's last point falls on the path's first by construction
+    return np.concatenate([way[:-1].astype(np.float32), path])

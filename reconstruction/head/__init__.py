@@ -1,0 +1,1 @@
+"""The head under the hair: template, pose, shape, scalp and its map."""

@@ -1,0 +1,260 @@
+"""A head mesh under points: the generic head, or the user's, posed and then bent onto them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.geometry.closest_point import ClosestPoint
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.growth.envelope import surface_samples
+from reconstruction.head.generic import generic_head
+from reconstruction.head.pose import MOTIONS, Pose, Surface, find_pose, similarity, tukey
+from reconstruction.head.shape import ShapeOptions, bend
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FEWEST = 10
+"""Points under which no head is fitted: a pose alone has seven unknowns."""
+
+Part = Literal["head", "above chin", "scalp"]
+_SCALES = (0.7, 1.4)
+_CROWN_TO_CHIN = 0.24
+_UNITS = {10: "decimetres", 39.37: "inches", 100: "centimetres", 1000: "millimetres"}
+
+
+class HeadFitError(ValueError):
+    """Points that no head can be fitted to; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Distances:
+    """How far points and mesh are apart, in the points' unit.
+
+    `to_mesh_*` from the points that count (no outliers) to the mesh, `to_points_*` from the matched
+    part of the mesh to the nearest point, which is never less than the points' own spacing and
+    large where the points leave the head uncovered. `_median` and `_p95` are quantiles, `_rms` is
+    the root mean square.
+    """
+
+    to_mesh_rms: float
+    to_mesh_median: float
+    to_mesh_p95: float
+    to_points_median: float
+    to_points_p95: float
+
+
+@dataclass(frozen=True, eq=False)
+class HeadFit:
+    """The template on the points: posed (`pose`), then bent (`mesh`, with the template's scalp).
+
+    `posed` and `bent` are the distances before and after bending; `outliers (N,)` the points that
+    did not count in the end; `folded` how many faces turned over against the posed template.
+    """
+
+    mesh: Mesh
+    pose: Pose
+    posed: Distances
+    bent: Distances
+    outliers: Bools
+    folded: int
+    warnings: tuple[str, ...]
+
+    def figures(self) -> dict[str, Any]:
+        """All numbers, JSON-ready."""
+        deviation = [float(d) if np.isfinite(d) else None for d in self.pose.deviation]
+        return {
+            "scale": self.pose.scale,
+            "posed": vars(self.posed),
+            "bent": vars(self.bent),
+            "outlier_share": float(self.outliers.mean()),
+            "folded_faces": self.folded,
+            "pose_deviation": dict(zip(MOTIONS, deviation, strict=True)),
+            "stiffness": self.pose.stiffness.tolist(),
+            "weakest": self.pose.weakest,
+            "margin": self.pose.margin if np.isfinite(self.pose.margin) else None,
+        }
+
+
+def fit_head(
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating] | None = None,
+    template: Mesh | None = None,
+    *,
+    part: Part = "head",
+    landmarks: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    turn: float | None = None,
+    guides: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    any_unit: bool = False,
+    shape: ShapeOptions = ShapeOptions(),  # noqa: B008  frozen
+    seed: int = 0,
+) -> HeadFit:
+    """Fit `template` (the generic head where None) to `points (N, 3)`, both with z upwards.
+
+    The points, with outward unit `normals (N, 3)` where known, lie on any part of the template, on
+    what is above its chin, or on its scalp alone (`part`), and may have outliers, up to about two
+    in five. `landmarks` are places `(L, 3)` on the template and the same places `(L, 3)` among the
+    points, L at least 3; without them all turns about z are tried, or those about `turn` (radians).
+    `guides` are further points and normals `(G, 3)` that only roughly lie on the head: they take
+    part in the pose, and the mesh is not bent onto them. Points are in the template's unit, metres,
+    unless `any_unit`. Raises `HeadFitError`.
+    """
+    template = generic_head() if template is None else template
+    at: Array = np.asarray(points, np.float64).reshape(-1, 3)
+    facing: Array | None = None
+    if normals is not None:
+        facing = np.asarray(normals, np.float64).reshape(-1, 3)
+    faces = _faces(template, part)
+    extent = float(np.ptp(template.vertices, axis=0).max())
+    places, own, face = surface_samples(template, extent / 35)
+    surface = Surface(places[faces[face]], own[faces[face]])
+    ratio = _ratio(at, facing, surface.points)
+    if not any_unit:
+        _require_unit(ratio, part)
+    middle = ratio if any_unit else 1.0
+    size = middle * _spread(surface.points)
+    start = None
+    if landmarks is not None:
+        try:
+            start = similarity(*(np.asarray(side, float) for side in landmarks))
+        except ValueError as error:
+            raise HeadFitError(str(error)) from error
+    pose = find_pose(
+        surface,
+        *_with(at, facing, guides),
+        start=start,
+        turn=turn,
+        scales=(0.7 * middle, middle, 1.4 * middle) if any_unit else (1.0,),
+        scale_deviation=None if any_unit else 0.1,
+        size=size,
+        seed=seed,
+    )
+    if not any_unit and not _SCALES[0] < pose.scale < _SCALES[1]:
+        raise HeadFitError(
+            f"the head under the points would be {pose.scale:.2f} times the template's size, "
+            f"expected {_SCALES[0]} to {_SCALES[1]}: are the points a head's, in metres?"
+        )
+    posed = Mesh(pose(template.vertices), template.faces, template.scalp)
+    mesh = bend(posed, faces, at, facing, size, shape)
+    before, _ = _distances(posed, faces, at, size)
+    after, outliers = _distances(mesh, faces, at, size)
+    folded = int(((posed.face_normals() * mesh.face_normals()).sum(axis=1) < 0).sum())
+    return HeadFit(mesh, pose, before, after, outliers, folded, _warnings(pose, outliers))
+
+
+def mark_scalp(mesh: Mesh, *, seed: int = 0) -> tuple[Mesh, HeadFit]:
+    """A head without a marked scalp (any unit, z up) with the generic head's scalp marked on it.
+
+    The generic head is fitted to the mesh; faces that lie on its scalp and look the same way (the
+    backs of ears do not) are scalp. Cut a whole body off below the neck beforehand. Raises
+    `HeadFitError`.
+    """
+    spacing = float(np.ptp(mesh.vertices, axis=0).max()) / 80
+    places, normals, _ = surface_samples(mesh, spacing)
+    few = np.random.default_rng(seed).permutation(len(places))[:3000]
+    fit = fit_head(places[few], normals[few], any_unit=True, seed=seed)
+    assert fit.mesh.scalp is not None
+    nearest = ClosestPoint(fit.mesh, spacing)
+    face, _, distance = nearest(mesh.vertices[mesh.faces].mean(axis=1))
+    alike = (mesh.face_normals() * fit.mesh.face_normals()[face]).sum(axis=1) > 0.5
+    scalp = fit.mesh.scalp[face] & alike & (distance < 2 * spacing)
+    return Mesh(mesh.vertices, mesh.faces, scalp), fit
+
+
+def _faces(template: Mesh, part: str) -> Bools:
+    if part not in get_args(Part):
+        raise ValueError(f"part must be one of {get_args(Part)}, got {part!r}")
+    if part == "above chin":
+        height = template.vertices[template.faces][:, :, 2].min(axis=1)
+        return np.asarray(height > template.vertices[:, 2].max() - _CROWN_TO_CHIN)
+    if part == "head":
+        return np.ones(len(template.faces), bool)
+    if template.scalp is None or not template.scalp.any():
+        raise HeadFitError(
+            "the template marks no scalp (a group or material named 'scalp' in its OBJ): "
+            "fit the whole head, or let mark_scalp mark it"
+        )
+    return template.scalp
+
+
+def _with(
+    points: Array,
+    normals: Array | None,
+    guides: tuple[NDArray[np.floating], NDArray[np.floating]] | None,
+) -> tuple[Array, Array | None]:
+    if guides is None:
+        return points, normals
+    every = np.concatenate([points, np.asarray(guides[0], np.float64)])
+    if normals is None:
+        return every, None
+    return every, np.concatenate([normals, np.asarray(guides[1], np.float64)])
+
+
+def _spread(points: Array) -> float:
+    """Median distance from the median: a size that outliers hardly change."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
+def _ratio(points: Array, normals: Array | None, template: Array) -> float:
+    """How much the points spread against the template's, once they are fit to be used."""
+    if len(points) < FEWEST:
+        raise HeadFitError(f"{len(points)} points, at least {FEWEST} are needed to fit a head")
+    if normals is not None and normals.shape != points.shape:
+        raise HeadFitError(f"{len(points)} points but {len(normals)} normals")
+    for what, array in (("points", points), ("normals", normals)):
+        if array is not None and not np.isfinite(array).all():
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+            raise HeadFitError(f"{len(bad)} {what} are not finite, the first is number {bad[0]}")
+    spans = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if spans[1] <= 1e-6 * max(spans[0], 1e-12):
+        raise HeadFitError("the points coincide or lie on a line: no head is determined")
+    return _spread(points) / _spread(template)
+
+
+def _require_unit(ratio: float, part: str) -> None:
+    smallest = 0.25 if part == "head" else 0.1  # a patch of scalp may be all there is
+    if smallest < ratio < 4:
+        return
+    if ratio >= 4:
+        factor, unit = min(_UNITS.items(), key=lambda u: abs(np.log(ratio / u[0])))
+        raise HeadFitError(
+            f"the points spread {ratio:.3g} times as far as a head in metres does: they look like "
+            f"{unit}; multiply them by {1 / factor:.4g}"
+        )
+    raise HeadFitError(
+        f"the points spread only {ratio:.3g} times as far as a head in metres does: check their "
+        "unit, or whether they are a head's at all"
+    )
+
+
+def _distances(mesh: Mesh, faces: Bools, points: Array, size: float) -> tuple[Distances, Bools]:
+    distance = ClosestPoint(mesh, 0.08 * size, faces)(points)[2]
+    outliers = tukey(distance, 0.03 * size) == 0
+    places, _, face = surface_samples(mesh, 0.08 * size)
+    back = cKDTree(points[~outliers]).query(places[faces[face]])[0]
+    used = distance[~outliers]
+    quantiles = [np.percentile(d, q) for d in (used, back) for q in (50, 95)]
+    rms = float(np.sqrt(np.mean(used**2)))
+    return Distances(rms, *(float(q) for q in quantiles)), outliers
+
+
+def _warnings(pose: Pose, outliers: Bools) -> tuple[str, ...]:
+    out = []
+    if pose.stiffness[0] < 0.03:
+        out.append(
+            f"the points hardly determine the head's pose: {pose.weakest} is the weakest motion, a "
+            f"millimetre along it changes distances by {pose.stiffness[0]:.2g} mm"
+        )
+    if pose.margin < 0.2:
+        out.append(
+            f"another pose fits nearly as well (its cost is {pose.margin:.0%} higher): give "
+            "landmarks"
+        )
+    if outliers.mean() > 0.4:
+        out.append(f"{outliers.mean():.0%} of the points do not lie on the head")
+    return tuple(out)

@@ -1,0 +1,235 @@
+"""The head of a capture that has none: a template laid under digitised or reconstructed points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.files.points import read_points
+from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
+from reconstruction.head.fit import HeadFit, HeadFitError, Part, fit_head
+from reconstruction.head.generic import generic_head
+from reconstruction.head.scalp_map import ScalpMap
+from reconstruction.head.template import template
+from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.masks import HairMask, distance_to
+from reconstruction.report.report import Stage
+from reconstruction.tangents.reflection import surface_normals
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FEWEST_SKIN = 300
+"""Cells with a point of skin under which a head is not guessed from them."""
+
+_CELL = 3e-3
+_INSIDE = 4e-3
+_AMBIGUOUS = 0.2
+_HAIR = 0.015
+"""Metres of hair over the scalp, roughly."""
+_CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
+"""Metres: a crown that shows where the head is; from hair to mouth or chin; half a head's depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeadPoints:
+    """Points `(N, 3)` of a head, metres, outward unit `normals (N, 3)` where known.
+
+    `part` says where on the head they lie, `source` who gave them, `turn` is the head's about z
+    (radians, 0 faces −y) where that is known, and `guides` see `fit_head`.
+    """
+
+    points: Array
+    normals: Array | None
+    part: Part
+    source: str
+    turn: float | None = None
+    guides: tuple[Array, Array] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FittedHead:
+    """A head under points, and the flat map of its scalp, which it has from its template.
+
+    None where the template's scalp cannot be laid flat.
+    """
+
+    mesh: Mesh
+    scalp_map: ScalpMap | None
+
+
+def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | None:
+    """The scalp points of the user's file, or else of `scalp.obj` in the capture, or else None.
+
+    Raises `ValueError` naming the file where it cannot be read.
+    """
+    file = Path(path) if path is not None else capture.path / "scalp.obj"
+    if path is None and not file.is_file():
+        return None
+    points, normals = read_points(file)
+    return HeadPoints(*_thinned(points, normals), "scalp", file.name)
+
+
+def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMask]) -> HeadPoints:
+    """Reconstructed points that the mask of the camera that saw them calls skin.
+
+    Points with a neighbour that some mask calls hair within a cell's size are left out: a fringe's
+    edge is no skin. So is what lies too low or too far out to be the face of the head that the
+    highest points are of: neck and shoulders. The head is taken to face the side of the bare skin,
+    and to lie some way under the hair of its crown: skin alone leaves its size open. Raises
+    `CaptureError` where too few are left to fit a head to.
+    """
+    skin = np.zeros(len(cloud), bool)
+    hair = np.zeros(len(cloud), bool)
+    for index, name in enumerate(cloud.cameras):
+        if name not in masks:
+            continue
+        mine = np.flatnonzero(cloud.camera == index)
+        camera = capture.rig.camera(name)
+        pixels, depth = camera.project(cloud.points[mine])
+        ok = (depth > 0) & camera.inside(pixels)
+        x, y = np.rint(pixels[ok]).astype(int).T
+        skin[mine[ok]] = masks[name].skin[y, x]
+        hair[mine[ok]] = masks[name].hair[y, x]
+    if skin.any() and hair.any():
+        near = cKDTree(cloud.points[hair]).query(cloud.points[skin])[0] < _CELL
+        skin[np.flatnonzero(skin)[near]] = False
+    face, middle = _head_region(cloud.points)
+    skin &= face
+    facing = surface_normals(cloud.points[skin], cloud.view[skin], 24)
+    points, normals = _thinned(cloud.points[skin], facing)
+    if len(points) < FEWEST_SKIN:
+        raise CaptureError(
+            f"{capture.path}: no head.obj, and only {len(points)} cells of {_CELL * 1e3:g} mm hold "
+            f"triangulated points of bare skin, at least {FEWEST_SKIN} are needed to fit a head: "
+            "strands need a scalp to be rooted on; give head.obj, or digitised scalp points as "
+            "scalp.obj in the capture or by the option scalp_points"
+        )
+    x, y = points[:, :2].mean(axis=0) - middle
+    turn = float(np.arctan2(x, -y))
+    guides = _under_the_hair(cloud.subset(hair & face), len(points))
+    return HeadPoints(points, normals, "above chin", "reconstructed skin", turn, guides)
+
+
+def lay_head(
+    points: HeadPoints,
+    head_mesh: str | Path | None,
+    model: Path,
+    stage: Stage,
+    *,
+    cloud: PointCloud | None = None,
+    seed: int = 0,
+) -> FittedHead:
+    """Fit the generic head, or the user's `head_mesh`, and write `head.obj` into `model`.
+
+    `head_mesh` is an OBJ with z up and may mark its scalp. Points that leave the turn about z open
+    are taken to be of a head that faces −y, as heads do by convention, with a warning. Of a
+    `cloud`, the share that lies inside the head is reported. Raises `CaptureError`.
+    """
+    own = None if head_mesh is None else read_obj(head_mesh)
+    try:
+        shape = generic_head() if own is None else template(own, seed=seed)[0]
+
+        def fitted(turn: float | None) -> HeadFit:
+            return fit_head(
+                points.points,
+                points.normals,
+                shape,
+                part=points.part,
+                turn=turn,
+                guides=points.guides,
+                seed=seed,
+            )
+
+        fit = fitted(points.turn)
+        if fit.pose.margin < _AMBIGUOUS:
+            stage.warn(
+                "the points fit a head that faces another way nearly as well (its cost is "
+                f"{fit.pose.margin:.0%} higher): it is taken to face −y"
+            )
+            fit = fitted(0.0)
+    except HeadFitError as error:
+        raise CaptureError(f"no head fits the points of {points.source}: {error}") from error
+    _report(points, fit, "generic head" if own is None else Path(str(head_mesh)).name, stage)
+    if cloud is not None and len(cloud):
+        share = float((distance_to(fit.mesh, cloud.points) < -_INSIDE).mean())
+        stage.figures["cloud_inside_share"] = share
+        if share > 0.1:
+            stage.warn(
+                f"{share:.0%} of the triangulated points lie over {_INSIDE * 1e3:g} mm inside the "
+                "fitted head: it is too large or displaced; digitised scalp points would settle it"
+            )
+    write_obj(model / "head.obj", fit.mesh)
+    try:
+        return FittedHead(fit.mesh, ScalpMap.of(shape).on(fit.mesh))
+    except ValueError:  # it folds, which is said where the map is written
+        return FittedHead(fit.mesh, None)
+
+
+def model_head(model: Path, capture: Capture | None) -> Mesh | None:
+    """The head that a model stands on: the one laid under points for it, else the capture's."""
+    fitted = Path(model) / "head.obj"
+    if fitted.is_file():
+        return read_obj(fitted)
+    return capture.head if capture is not None else None
+
+
+def _report(points: HeadPoints, fit: HeadFit, name: str, stage: Stage) -> None:
+    for warning in fit.warnings:
+        stage.warn(warning)
+    stage.figures |= {
+        "points": len(points.points),
+        "source": points.source,
+        "template": name,
+        "rms_mm": fit.bent.to_mesh_rms * 1e3,
+        "posed_rms_mm": fit.posed.to_mesh_rms * 1e3,
+        "used_share": 1 - float(fit.outliers.mean()),
+        "fit": fit.figures(),
+    }
+
+
+def _head_region(points: Array) -> tuple[Bools, Array]:
+    """Which of the points `(N, 3)`, hair and all, can be of the head that the highest are of.
+
+    Also its middle `(2,)` on the ground.
+    """
+    if not len(points):
+        return np.zeros(0, bool), np.zeros(2)
+    top = np.percentile(points[:, 2], 99.5)
+    upper = points[points[:, 2] > top - _CROWN][:, :2]
+    middle = np.percentile(upper, [2, 98], axis=0).mean(axis=0)
+    beside = np.linalg.norm(points[:, :2] - middle, axis=1)
+    return (points[:, 2] > top - _HEIGHT) & (beside < _RADIUS), middle
+
+
+def _under_the_hair(hair: PointCloud, most: int) -> tuple[Array, Array] | None:
+    """About where the scalp is `(G, 3)` under points on the crown's hair, with its normals.
+
+    No more than `most`: they weigh no more than the skin.
+    """
+    if not len(hair):
+        return None
+    top = np.percentile(hair.points[:, 2], 99.5)
+    crown = hair.subset(hair.points[:, 2] > top - _CROWN)
+    crown = crown.subset(_one_a_cell(crown.points))
+    normals = surface_normals(crown.points, crown.view)
+    guides = crown.points - _HAIR * normals
+    few = np.random.default_rng(0).permutation(len(guides))[:most]
+    return guides[few], normals[few]
+
+
+def _thinned(points: Array, normals: Array | None) -> tuple[Array, Array | None]:
+    """One of the points in each cell, so that dense places do not outweigh the others."""
+    first = _one_a_cell(points)
+    return points[first], None if normals is None else normals[first]
+
+
+def _one_a_cell(points: Array) -> NDArray[np.int64]:
+    cell = np.floor(points / _CELL).astype(np.int64)
+    return np.sort(np.unique(cell, axis=0, return_index=True)[1])

@@ -1,0 +1,109 @@
+"""A flat map of the scalp: roots to (u, v) in the unit square, as appearance volumes need them.
+
+The scalp is seen from the middle of the sphere that fits it best and laid flat by Lambert's
+equal-area projection about its own middle, then stretched to the unit square: u grows to the
+subject's left, v from the forehead to the nape. Heads of one template share the map, vertex by
+vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.geometry.closest_point import ClosestPoint
+from reconstruction.geometry.mesh import Mesh
+
+Array = NDArray[np.float64]
+
+_SPACING = 2e-2
+"""Of samples for the closest point, as a share of the scalp's extent."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScalpMap:
+    """`uv (V, 2)` at the vertices of `head` that belong to a scalp face; NaN at the others."""
+
+    head: Mesh
+    uv: Array
+    _closest: ClosestPoint = field(init=False)
+
+    def __post_init__(self) -> None:
+        scalp = _scalp(self.head)
+        if self.uv.shape != (len(self.head.vertices), 2):
+            raise ValueError(
+                f"expected uv for {len(self.head.vertices)} vertices, got {self.uv.shape}"
+            )
+        extent = float(np.ptp(self.head.vertices[self.head.faces[scalp]], axis=(0, 1)).max())
+        object.__setattr__(self, "_closest", ClosestPoint(self.head, _SPACING * extent, scalp))
+
+    @classmethod
+    def of(cls, head: Mesh) -> ScalpMap:
+        """The map of a head in its own frame: z up, face towards -y, its scalp marked.
+
+        Raises `ValueError` where it is not marked, or where the map would fold: where one ray from
+        the middle meets the scalp twice.
+        """
+        scalp = _scalp(head)
+        faces = head.faces[scalp]
+        used, areas = np.unique(faces), head.face_areas()[scalp]
+        d = head.vertices[used] - sphere_center(head.vertices[used])
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        weight = np.bincount(faces.ravel(), np.repeat(areas, 3))[used]
+        pole = weight @ d
+        pole /= np.linalg.norm(pole)
+        right = np.array([1.0, 0, 0]) - pole[0] * pole
+        right /= np.linalg.norm(right)
+        back = np.cross(pole, right)
+        flat = np.stack([d @ right, d @ back], axis=1)
+        flat *= np.sqrt(2 / np.maximum(1 + d @ pole, 1e-9))[:, None]
+        uv = np.full((len(head.vertices), 2), np.nan)
+        uv[used] = (flat - flat.min(axis=0)) / np.ptp(flat, axis=0)
+        folded = int(((_signed_areas(uv[faces]) <= 0) & (areas > 1e-9 * areas.max())).sum())
+        if folded:
+            raise ValueError(
+                f"the map of the scalp folds at {folded} of its {len(faces)} faces: they face the "
+                "middle of the head or hide each other (ears?); leave them out of the marked scalp"
+            )
+        return cls(head, uv)
+
+    def on(self, head: Mesh) -> ScalpMap:
+        """The same map on `head`, another shape or pose of the same template."""
+        if not np.array_equal(head.faces, self.head.faces):
+            raise ValueError("the other head must have the same faces")
+        return ScalpMap(Mesh(head.vertices, head.faces, self.head.scalp), self.uv)
+
+    def __call__(self, points: NDArray[np.floating]) -> tuple[Array, Array]:
+        """(u, v) `(N, 2)` at the scalp's closest point to `points (N, 3)`, and its distance."""
+        face, weights, distance = self._closest(points)
+        uv = np.einsum("nc,ncd->nd", weights, self.uv[self.head.faces[face]])
+        return np.clip(uv, 0, 1), distance
+
+    def stretch(self) -> Array:
+        """Area on the map over area on the head, by scalp face, in units of their mean `(F',)`."""
+        scalp = _scalp(self.head)
+        areas = self.head.face_areas()[scalp]
+        ratio = _signed_areas(self.uv[self.head.faces[scalp]]) / np.maximum(areas, 1e-300)
+        return np.asarray(ratio / np.average(ratio, weights=areas))
+
+
+def _scalp(head: Mesh) -> NDArray[np.bool_]:
+    if head.scalp is None or not head.scalp.any():
+        raise ValueError("the head marks no scalp: mark it in the OBJ, or let mark_scalp do so")
+    return head.scalp
+
+
+def sphere_center(points: Array) -> Array:
+    """Centre `(3,)` of the sphere that fits `points (N, 3)` best, by algebraic least squares."""
+    middle = points.mean(axis=0)
+    q = points - middle
+    solved, *_ = np.linalg.lstsq(np.c_[2 * q, np.ones(len(q))], (q**2).sum(axis=1), rcond=None)
+    return np.asarray(middle + solved[:3])
+
+
+def _signed_areas(corners: Array) -> Array:
+    """Areas of flat triangles `(F, 3, 2)`, negative where they are turned over."""
+    e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(0.5 * (e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]))

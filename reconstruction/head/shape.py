@@ -1,0 +1,118 @@
+"""A head's own shape: a smooth displacement of a posed mesh towards points.
+
+The displacement is carried by some hundred handles spread over the mesh, so that it is smooth by
+construction, and held stiff between neighbouring handles; stiffness falls from round to round while
+closest points are found anew (Amberg, Romdhani, Vetter: Optimal Step Nonrigid ICP, 2007, with
+handles instead of vertices).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.growth.envelope import surface_samples
+from reconstruction.head.pose import Surface, tukey
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_NEAR = 8
+
+
+@dataclass(frozen=True)
+class ShapeOptions:
+    """How a mesh is bent.
+
+    `handles` carry the displacement; `stiffness` is the penalty on the difference of neighbouring
+    handles against the mean squared distance, round by round; `anchor` the same on displacement as
+    such, which fades the displacement out where there are no points.
+    """
+
+    handles: int = 200
+    stiffness: tuple[float, ...] = (10.0, 1.0, 0.1, 0.01)
+    anchor: float = 1e-3
+    rounds: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Handles:
+    """`at (K, 3)`: where handles sit on the mesh at rest; `reach` is that of one, metres."""
+
+    at: Array
+    reach: float
+    links: NDArray[np.int64]
+
+    @classmethod
+    def on(cls, points: Array, count: int) -> Handles:
+        """`count` handles far from each other among `points (N, 3)`."""
+        chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())]
+        far = np.full(len(points), np.inf)
+        while len(chosen) < min(count, len(points)):
+            far = np.minimum(far, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+            chosen.append(int(far.argmax()))
+        at = points[chosen]
+        distance, near = cKDTree(at).query(at, k=np.arange(2, min(_NEAR, len(at)) + 1))
+        pairs = np.stack([np.repeat(np.arange(len(at)), near.shape[1]), near.ravel()], axis=1)
+        links = np.unique(np.sort(pairs, axis=1), axis=0)
+        return cls(at, 1.5 * float(np.median(distance[:, 0])), links)
+
+    def weights(self, points: Array) -> sparse.csr_array:
+        """Share `(N, K)` of each handle in the displacement at `points (N, 3)`; rows sum to 1."""
+        k = min(_NEAR, len(self.at))
+        distance, near = cKDTree(self.at).query(points, k=np.arange(1, k + 1))
+        # relative to the nearest: points far off all handles still get shares
+        w = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / self.reach**2)
+        w /= w.sum(axis=1, keepdims=True)
+        row = np.repeat(np.arange(len(points)), k)
+        return sparse.csr_array((w.ravel(), (row, near.ravel())), shape=(len(points), len(self.at)))
+
+
+def bend(
+    mesh: Mesh,
+    faces: Bools,
+    points: Array,
+    normals: Array | None,
+    size: float,
+    options: ShapeOptions = ShapeOptions(),
+) -> Mesh:
+    """`mesh`, already posed, bent smoothly so that its `faces (F,) bool` lie on `points (N, 3)`.
+
+    `size` is the head's radius in the points' unit.
+    """
+    places, own, face = surface_samples(mesh, 0.08 * size)
+    places, own = places[faces[face]], own[faces[face]]
+    handles = Handles.on(mesh.vertices[np.unique(mesh.faces)], options.handles)
+    spread, moves = handles.weights(places), handles.weights(mesh.vertices)
+    count = len(handles.at)
+    i, j = handles.links.T
+    one = np.ones(len(i))
+    tie = sparse.coo_array(
+        (np.r_[one, one, -one, -one], (np.r_[i, j, i, j], np.r_[i, j, j, i])), shape=(count, count)
+    ).toarray() / len(i)
+    shift = np.zeros((count, 3))
+    for stiffness in options.stiffness:
+        for _ in range(options.rounds):
+            now = places + spread @ shift
+            distance, index = Surface(now, own).nearest(points, 0.3 * size)
+            n = own[index]
+            weight = tukey(distance, 0.01 * size)
+            if normals is not None:
+                weight = weight * ((n * normals).sum(axis=1) > 0.5)
+            used = np.flatnonzero(weight)
+            if not len(used):
+                return mesh
+            share = spread[index[used]]
+            r = (n[used] * (points[used] - places[index[used]])).sum(axis=1)
+            J = sparse.hstack([share * n[used, k : k + 1] for k in range(3)]).tocsr()
+            w = weight[used] / weight.sum()
+            normal = (J.T @ (J * w[:, None])).toarray()
+            hold = np.kron(np.eye(3), stiffness * tie + options.anchor / count * np.eye(count))
+            solved = np.linalg.solve(normal + hold, J.T @ (w * r))
+            shift = solved.reshape(3, count).T
+    return Mesh(mesh.vertices + moves @ shift, mesh.faces, mesh.scalp)

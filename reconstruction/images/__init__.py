@@ -1,0 +1,1 @@
+"""What pictures alone say: silhouettes, line orientation, hair features, segmentation."""

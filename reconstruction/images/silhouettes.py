@@ -1,0 +1,106 @@
+"""Where a camera sees the subject at all, and how noisy its pictures are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.undistorted import StraightenedCapture
+
+NOISE_FACTOR = 5.0
+FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light, even without noise
+SMALLEST = 6  # pixels: smaller specks are noise
+
+
+class NoSilhouette(ValueError):
+    """A camera without the frames that a silhouette needs."""
+
+
+def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
+    """Mean of the camera's dark frames `(H, W, 3)`; zeros where none was shot.
+
+    With `exposure`, only the dark frames at the nearest exposure count.
+    """
+    steps = [s for s in capture.of_kind("dark") if capture.has(s, camera)]
+    if exposure is not None and steps:
+        nearest = min((s.exposure for s in steps), key=lambda e: abs(e - exposure))
+        steps = [s for s in steps if s.exposure == nearest]
+    c = capture.rig.camera(camera)
+    if not steps:
+        return np.zeros((c.height, c.width, 3), np.float32)
+    return np.mean([capture.frame(s, camera) for s in steps], axis=0)
+
+
+def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
+    """`dark_rgb`'s mean over the channels `(H, W)`."""
+    return np.asarray(dark_rgb(capture, camera, exposure).mean(axis=-1))
+
+
+def background_noise(image: NDArray[np.floating]) -> float:
+    """Standard deviation of the unlit pixels of a dark-subtracted `image (...)`.
+
+    Noise about zero is symmetric and the subject only adds light, so the values below zero are the
+    lower half of the noise's distribution. 0 where nothing is below zero.
+    """
+    below = -image[image < 0]
+    return 1.4826 * float(np.median(below)) if below.size else 0.0
+
+
+def lit_image(capture: Capture, camera: str) -> NDArray[np.float32]:
+    """`lit_rgb`'s mean over the channels `(H, W)`."""
+    return np.asarray(lit_rgb(capture, camera).mean(axis=-1))
+
+
+def lit_rgb(capture: Capture, camera: str) -> NDArray[np.float32]:
+    """The subject under as many lamps as the capture has, less the dark frame `(H, W, 3)`.
+
+    The all-on frames' mean at full level, else the sum of the OLAT frames, else the first tracking
+    frame. Raises `NoSilhouette` where the camera has none of them.
+    """
+    for kind, first in (("all_on", True), ("olat", False), ("tracking", True)):
+        steps = [s for s in capture.steps if s.kind == kind and capture.has(s, camera)]
+        if steps:
+            return _sum(capture, camera, steps[:1] if first else steps)
+    raise NoSilhouette(f"{capture.path}: {camera} has no all_on, olat or tracking frame")
+
+
+def silhouette(capture: Capture, camera: str) -> NDArray[np.bool_]:
+    """Pixels `(H, W)` where the subject adds light: above the noise, specks removed, holes filled.
+
+    Raises `NoSilhouette` where the camera has no frame to tell from.
+    """
+    if isinstance(capture, StraightenedCapture):  # resampled, the faintest light spreads by a pixel
+        return capture.straight(camera, silhouette(capture.source, camera))
+    image = lit_image(capture, camera)
+    positive = image[image > 0]
+    bright = float(np.percentile(positive, 95)) if positive.size else 0.0
+    noise = background_noise(image)
+    if bright <= NOISE_FACTOR * noise:
+        return np.zeros(image.shape, bool)
+    mask = image > max(NOISE_FACTOR * noise, FAINTEST * bright)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    small = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] < SMALLEST]
+    mask &= ~np.isin(labels, small)
+    return np.asarray(_fill_pinholes(mask))
+
+
+def _fill_pinholes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Close holes of under `SMALLEST` pixels; larger ones are what one sees through a curl."""
+    holes, count = ndimage.label(~mask)
+    area = np.bincount(holes.ravel(), minlength=count + 1)
+    return mask | ((area < SMALLEST)[holes] & ~mask)
+
+
+def _sum(capture: Capture, camera: str, steps: list[Step]) -> NDArray[np.float32]:
+    dark: dict[float, NDArray[np.float32]] = {}
+    c = capture.rig.camera(camera)
+    total = np.zeros((c.height, c.width, 3), np.float32)
+    for step in steps:
+        if step.exposure not in dark:
+            dark[step.exposure] = dark_rgb(capture, camera, step.exposure)
+        image = capture.frame(step, camera) - dark[step.exposure]
+        total += image / (step.level if step.level > 0 else 1.0)
+    return total

@@ -1,0 +1,119 @@
+"""One report for every stage: seconds, error against run time, work left out, warnings."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from reconstruction.report.memory import peak_memory
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share that is done, 0 to 1."""
+
+
+def silent(_what: str, _share: float) -> None:
+    """A `Progress` that tells nobody."""
+
+
+@dataclass
+class Series:
+    """Error against run time: `points` are (seconds, error) in the order they were reached."""
+
+    name: str
+    error: str
+    points: list[tuple[float, float]] = field(default_factory=list)
+
+
+@dataclass
+class LeftOut:
+    """Work that this scene does not need: `what`, `why`, and what leaving it out `saved`."""
+
+    what: str
+    why: str
+    saved: str
+
+
+@dataclass
+class Stage:
+    """One stage of a pipeline: `figures` holds its numbers by name, JSON-ready.
+
+    `peak_gb` is the most memory that the process held meanwhile, None where it is not known.
+    """
+
+    name: str
+    seconds: float = 0.0
+    figures: dict[str, Any] = field(default_factory=dict)
+    series: list[Series] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    peak_gb: float | None = None
+
+    def leave_out(self, what: str, why: str, saved: str) -> None:
+        """Record work that was not done because the scene does not need it."""
+        self.left_out.append(LeftOut(what, why, saved))
+
+    def warn(self, message: str) -> None:
+        """Record a warning, on conditioning or on data that was not there."""
+        self.warnings.append(message)
+
+
+@dataclass
+class Report:
+    """The stages that a model went through, in order."""
+
+    stages: list[Stage] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Stage]:
+        """Time a stage; a stage of the same name from an earlier run is replaced."""
+        stage = Stage(name)
+        self.stages = [s for s in self.stages if s.name != name] + [stage]
+        start = time.perf_counter()
+        with peak_memory() as peak:
+            try:
+                yield stage
+            finally:
+                stage.seconds = time.perf_counter() - start
+        stage.peak_gb = peak.gb
+
+    def __getitem__(self, name: str) -> Stage:
+        for stage in self.stages:
+            if stage.name == name:
+                return stage
+        raise KeyError(f"no stage {name!r} in this report; it has {[s.name for s in self.stages]}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON-ready data."""
+        return asdict(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write the report as JSON; numbers that are not finite are an error, never NaN."""
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+        temporary = Path(path).with_suffix(".part")
+        temporary.write_text(text + "\n")
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Report:
+        """Read a report; an absent file gives an empty one."""
+        if not Path(path).is_file():
+            return cls()
+        stages = [
+            Stage(
+                **{
+                    **s,
+                    "series": [
+                        Series(x["name"], x["error"], [tuple(p) for p in x["points"]])
+                        for x in s["series"]
+                    ],
+                    "left_out": [LeftOut(**x) for x in s["left_out"]],
+                }
+            )
+            for s in json.loads(Path(path).read_text())["stages"]
+        ]
+        return cls(stages)

@@ -1,0 +1,1 @@
+"""3D directions of hair: candidates, scoring, reflection, and their estimate."""

@@ -1,0 +1,190 @@
+"""Measured tangents: what the OLAT frames say about the hair at points of its surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.images.orientation import LogGaborBank, texture
+from reconstruction.masks import HairMask
+from reconstruction.report.report import Progress, Stage, silent
+from reconstruction.tangents.conditioning import condition_lines
+from reconstruction.tangents.line_evidence import (
+    LineEvidence,
+    decide,
+    half_sphere,
+    line_scores,
+    line_support,
+    pool,
+    seen_by,
+)
+from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """How tangents are measured.
+
+    The `bank` answers to pictures under `light_groups` groups of neighbouring lights, which show
+    different fibres: 1 is the sum of all OLAT frames, the number of lights is each light alone.
+    `candidates` directions are scored at each point, averaged over `radius` metres. Points closer
+    than `thin` metres are merged first. `tolerance` (metres) is how far behind a camera's own depth
+    a point may lie and still count as seen. The scores of the reflection under single lights count
+    `reflection_weight` times those of the texture.
+    """
+
+    bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)  # noqa: RUF009
+    texture_scale: float = 5.0
+    light_groups: int = 24
+    candidates: int = 500
+    radius: float = 10e-3
+    neighbours: int = 48
+    thin: float = 2e-3
+    reflection_weight: float = 6.0
+    tolerance: float = 4e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Lines at surface points: `points (N, 3)`, `directions (N, 3)`, `confidence (N,)`."""
+
+    points: Array
+    directions: Array
+    confidence: Array
+
+    def where(self, keep: NDArray[np.bool_]) -> Measured:
+        """Those that are to be kept `(N,)`."""
+        return Measured(self.points[keep], self.directions[keep], self.confidence[keep])
+
+
+def light_groups(lights: list[Light], count: int) -> NDArray[np.int64]:
+    """Group number `(L,)` of each light: nearest of `count` seeds spread over the lights.
+
+    Seeds are chosen one after the other, each the light furthest from all before it, then moved
+    to the middle of their lights twice; no randomness.
+    """
+    p = np.stack([light.position / np.linalg.norm(light.position) for light in lights])
+    count = min(count, len(p))
+    seeds = [0]
+    distance = np.linalg.norm(p - p[0], axis=1)
+    for _ in range(count - 1):
+        seeds.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(p - p[seeds[-1]], axis=1))
+    centers = p[seeds]
+    for _ in range(3):
+        group = np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1)
+        for k in np.unique(group):
+            centers[k] = p[group == k].mean(axis=0)
+    return np.asarray(group, np.int64)
+
+
+def measure_tangents(
+    capture: Capture,
+    points: Array,
+    masks: Mapping[str, HairMask],
+    depths: Mapping[str, Array],
+    envelope: VoxelGrid,
+    options: MeasureOptions = MeasureOptions(),
+    stage: Stage | None = None,
+    progress: Progress = silent,
+) -> Measured:
+    """Directions at the triangulated `points (N, 3)`, or where there are none, at the depths'.
+
+    `depths[camera] (H, W)` are those of the hair pixels, metres along z. Raises `CaptureError` for
+    a capture without OLAT frames.
+    """
+    stage = stage or Stage("orientation")
+    names = capture.olat_lights()
+    if not names:
+        raise CaptureError(f"{capture.path}: no OLAT frames, which the orientations come from")
+    lights = [capture.rig.light(n) for n in names]
+    group = light_groups(lights, options.light_groups)
+    cameras = [c for c in capture.rig.cameras if c.name in masks and masks[c.name].hair.any()]
+    evidences, olats = [], {}
+    for done, camera in enumerate(cameras):
+        progress("texture", done / len(cameras))
+        mask = masks[camera.name].hair
+        olat = capture.olat(camera.name, names).mean(axis=-1)
+        olats[camera.name] = olat
+        details = [
+            texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
+            for g in np.unique(group)
+        ]
+        support = line_support(options.bank.responses(np.stack(details)))
+        evidences.append(LineEvidence(camera, support, mask, depths[camera.name]))
+    points = thinned(
+        points if len(points) else np.concatenate([_lifted(e) for e in evidences]), options.thin
+    )
+    seen = np.stack([seen_by(e, points, options.tolerance) for e in evidences], axis=1)
+    points, seen = points[seen.any(axis=1)], seen[seen.any(axis=1)]
+    stage.figures["lines"] = condition_lines(evidences, points, seen).figures()
+    if not len(points):
+        raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
+    candidates = half_sphere(options.candidates)
+    scores = np.zeros((len(points), options.candidates), np.float32)
+    for k, evidence in enumerate(evidences):
+        scores += line_scores(evidence, points, candidates, seen[:, k])
+    average = pool(points, options.radius, options.neighbours)
+    scores = average @ scores
+    tangents = decide(scores, candidates)
+    if len(lights) < FEWEST_LIGHTS:
+        stage.leave_out(
+            "directions from reflection",
+            f"{len(lights)} lights, fewer than {FEWEST_LIGHTS}: highlights fall between them",
+            "the second half of this stage; directions come from texture alone",
+        )
+    else:
+        progress("reflection", 0.0)
+        more, table = reflection_scores(
+            cameras,
+            olats,
+            lights,
+            points,
+            seen,
+            candidates,
+            (tangents.directions, tangents.confidence),
+        )
+        texture_only = tangents
+        tangents = decide(scores + options.reflection_weight * (average @ more), candidates)
+        turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)
+        stage.figures["lobe_contrast"] = table.contrast
+        stage.figures["turned_by_reflection_deg"] = float(np.median(np.degrees(np.arccos(turned))))
+        if table.contrast < 1.3:
+            stage.warn(
+                f"the hair's highlight is only {table.contrast:.2f} times its surroundings: "
+                "directions from reflection are weak"
+            )
+    stage.figures.update(
+        points=len(points),
+        cameras_per_point={
+            str(k): int(n) for k, n in enumerate(np.bincount(seen.sum(axis=1))) if n
+        },
+        confidence={f"p{q}": float(np.percentile(tangents.confidence, q)) for q in (10, 50, 90)},
+    )
+    return Measured(points, tangents.directions, tangents.confidence)
+
+
+def _lifted(evidence: LineEvidence) -> Array:
+    y, x = np.nonzero(evidence.mask & (evidence.depth > 0))
+    camera = evidence.camera
+    rays = camera.rays(np.stack([x, y], axis=1))
+    along = rays @ camera.R[2]
+    return camera.center + rays * (evidence.depth[y, x] / along)[:, None]
+
+
+def thinned(points: Array, spacing: float) -> Array:
+    """The means of the points in each cell of `spacing` metres `(M, 3)`."""
+    _, member, count = np.unique(
+        np.floor(points / spacing).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    member = member.ravel()
+    sums = np.stack([np.bincount(member, p, len(count)) for p in points.T], axis=1)
+    return np.asarray(sums / count[:, None])

@@ -1,0 +1,159 @@
+"""3D directions of hair at surface points, from every camera that sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from reconstruction.geometry.cameras import Camera
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def half_sphere(count: int) -> Array:
+    """`count` nearly evenly spaced unit vectors `(count, 3)` of the half sphere z >= 0."""
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    z = (np.arange(count) + 0.5) / count
+    azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class LineEvidence:
+    """What one camera's texture says: `support (K, H, W)` for lines at k · 180°/K in the image.
+
+    Positive support speaks for an angle, negative against it; its mean over the angles is 0, so
+    that a pixel without texture says nothing. `mask (H, W)` are the pixels that may be asked,
+    `depth (H, W)` (metres along z, 0 unknown) what they see.
+    """
+
+    camera: Camera
+    support: NDArray[np.float32]
+    mask: Bools
+    depth: Array
+
+
+def line_support(responses: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Support `(K, H, W)` from a filter bank's answers `(K, H, W)`: their excess over the mean.
+
+    Normalised by the mean over angles, so that contrast does not count twice.
+    """
+    mean = responses.mean(axis=0)
+    floor = 0.05 * float(mean.mean()) + 1e-30
+    return np.asarray((responses - mean) / (mean + floor), np.float32)
+
+
+def seen_by(evidence: LineEvidence, points: NDArray[np.floating], tolerance: float) -> Bools:
+    """Points `(N,)` that project onto the mask at no more than `tolerance` behind its depth."""
+    pixels, depth = evidence.camera.project(points)
+    ok = (depth > 0) & evidence.camera.inside(pixels)
+    x, y = np.rint(np.where(ok[:, None], pixels, 0)).astype(int).T
+    there = evidence.depth[y, x]
+    return np.asarray(ok & evidence.mask[y, x] & (there > 0) & (depth <= there + tolerance))
+
+
+def line_scores(
+    evidence: LineEvidence, points: NDArray[np.floating], candidates: Array, seen: Bools
+) -> NDArray[np.float32]:
+    """Support `(N, D)` that a camera's texture gives each of `candidates (D, 3)` at the points.
+
+    A candidate is looked up at the angle of its projection and weighted by the squared sine of
+    its angle to the viewing ray: a line along the ray is a dot that no texture speaks about.
+    Points that are not `seen (N,)` get 0.
+    """
+    camera = evidence.camera
+    out = np.zeros((len(points), len(candidates)), np.float32)
+    which = np.flatnonzero(seen)
+    if not len(which):
+        return out
+    pixels, _ = camera.project(points[which])
+    x, y = np.rint(pixels).astype(int).T
+    rays = camera.rays(pixels)
+    # The projection of direction t at a pixel: the image velocity of X + s t, up to its length.
+    local_ray = rays @ camera.R.T
+    slope = local_ray[:, :2] / local_ray[:, 2:]
+    t = (candidates @ camera.R.T).astype(np.float32)
+    flow = t[None, :, :2] - slope[:, :, None].transpose(0, 2, 1).astype(np.float32) * t[None, :, 2:]
+    u = camera.K[0, 0] * flow[..., 0] + camera.K[0, 1] * flow[..., 1]
+    v = camera.K[1, 1] * flow[..., 1]
+    angle = np.arctan2(v, u)
+    count = len(evidence.support)
+    bins = np.rint(angle * (count / np.pi)).astype(np.int64) % count
+    sine2 = 1 - (rays.astype(np.float32) @ candidates.T.astype(np.float32)) ** 2
+    out[which] = sine2 * evidence.support[bins, y[:, None], x[:, None]]
+    return out
+
+
+def pool(points: NDArray[np.floating], radius: float, most: int = 24) -> sparse.csr_array:
+    """Weights `(N, N)` that average over neighbours within `radius` metres: a Gaussian of half it.
+
+    Each row sums to 1. At most `most` neighbours count.
+    """
+    if not len(points):
+        return sparse.csr_array((0, 0))
+    k = min(most, len(points))
+    distance, index = cKDTree(points).query(points, k=np.arange(1, k + 1))
+    weight = np.where(distance <= radius, np.exp(-2 * (distance / radius) ** 2), 0)
+    weight /= weight.sum(axis=1, keepdims=True)
+    rows = np.repeat(np.arange(len(points)), k)
+    table = sparse.csr_array(
+        (weight.ravel(), (rows, index.ravel())), shape=(len(points), len(points))
+    )
+    table.eliminate_zeros()
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """Undirected unit `directions (N, 3)` and `confidence (N,)` in [0, 1].
+
+    Confidence is the difference of the two largest eigenvalues of the mean structure tensor over
+    the candidates, weighted by how well each explains the images: 1 when one direction stands
+    alone, 0 when two or more do as well.
+    """
+
+    directions: Array
+    confidence: Array
+
+
+def decide(
+    scores: NDArray[np.floating], candidates: Array, sharpness: float | None = None
+) -> Tangents:
+    """The best direction for each row of `scores (N, D)` over `candidates (D, 3)`.
+
+    Scores are turned into weights by a softmax whose temperature is their median spread over the
+    rows divided by `sharpness` (default 6). The direction is the main axis of the weighted
+    structure tensor of the candidates near the best one: finer than their spacing.
+    """
+    if scores.shape != (len(scores), len(candidates)):
+        raise ValueError(f"scores must be (N, {len(candidates)}), got {scores.shape}")
+    if not len(scores):
+        return Tangents(np.zeros((0, 3)), np.zeros(0))
+    spread = float(np.median(scores.std(axis=1))) + 1e-12
+    weights = np.exp((sharpness or 6.0) * (scores - scores.max(axis=1, keepdims=True)) / spread / 3)
+    pair = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+    basis = np.stack([candidates[:, i] * candidates[:, j] for i, j in pair], axis=1)
+    total = weights.sum(axis=1, keepdims=True)
+    values = np.linalg.eigvalsh(_full(weights @ basis / total))
+    confidence = values[:, 2] - values[:, 1]
+    best = candidates[scores.argmax(axis=1)]
+    near = weights * np.clip((best @ candidates.T) ** 2 * 16 - 15, 0, 1)  # within about 14 degrees
+    _, vectors = np.linalg.eigh(_full(near @ basis))
+    direction = vectors[:, :, 2]
+    direction *= np.where((direction * best).sum(axis=1) < 0, -1, 1)[:, None]
+    flat = np.ptp(scores, axis=1) <= 0
+    return Tangents(direction, np.where(flat, 0.0, np.clip(confidence, 0, 1)))
+
+
+def _full(tensors: NDArray[np.floating]) -> Array:
+    full = np.empty((len(tensors), 3, 3))
+    for n, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+        full[:, i, j] = full[:, j, i] = tensors[:, n]
+    return full

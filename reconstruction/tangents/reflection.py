@@ -1,0 +1,221 @@
+"""Directions of hair from how it reflects: highlights under hundreds of single lights.
+
+A fibre mirrors light into the cone about its tangent, so a pixel's answers to all lights of an
+OLAT pass betray the tangent even where no fibre is resolved. Photobooth §4.2 refines orientations
+with a given model (Kajiya-Kay); here the model is a table that the capture itself fills, from the
+points whose texture already says their direction well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+FEWEST_LIGHTS = 60
+"""Under about one light for each 15 degrees the highlight falls between them."""
+
+_SUMS, _AZIMUTHS, _TILTS, _FACINGS = 9, 4, 2, 8
+_LARGEST_SUM = 1.4
+_GRAZING = 0.1
+_BRIGHTEST = 6.0
+_BLOCK = 0.03
+
+
+def surface_normals(points: Array, towards: Array, neighbours: int = 40) -> Array:
+    """Unit normals `(N, 3)` of the plane through each point's neighbours, facing `towards (N, 3)`.
+
+    `towards` are directions to where the point was seen from (Hoppe et al. 1992, as in
+    Photobooth §3.2).
+    """
+    k = min(neighbours, len(points))
+    if k < 3:
+        return towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    near = points[cKDTree(points).query(points, k=k)[1]]
+    near = near - near.mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+    normals = vectors[:, :, 0]
+    return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals)
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """One camera's answers at the points it sees.
+
+    `index (P,)` into the points, `response (P, L)` to each light, corrected for the light's
+    distance and intensity and divided by the mean over the lights in front; `to_light (P, L, 3)`
+    and `to_camera (P, 3)` are unit vectors, `facing (P, L)` the cosines of the lights to the
+    surface's normal.
+    """
+
+    index: NDArray[np.int64]
+    response: Floats
+    to_light: Floats
+    to_camera: Floats
+    facing: Floats
+
+
+def observe(
+    camera: Camera,
+    olat: NDArray[np.floating],
+    lights: Sequence[Light],
+    points: Array,
+    normals: Array,
+    seen: Bools,
+) -> Observations:
+    """What `camera` saw under each light (`olat (L, H, W)`) at the `points (N, 3)` it sees."""
+    index = np.flatnonzero(seen)
+    pixels, _ = camera.project(points[index])
+    x, y = np.rint(pixels).astype(int).T
+    away = np.stack([light.position for light in lights])[None] - points[index][:, None]
+    square = (away**2).sum(axis=2)
+    to_light = (away / np.sqrt(square)[..., None]).astype(np.float32)
+    strength = np.stack([x.intensity_towards(points[index]).mean(axis=-1) for x in lights], axis=1)
+    response = np.maximum(olat[:, y, x].T, 0) * square / np.maximum(strength, 1e-30)
+    facing = np.einsum("pld,pd->pl", to_light, normals[index].astype(np.float32))
+    front = facing > _GRAZING
+    mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)
+    response = response / np.maximum(mean, 1e-30)[:, None]
+    to_camera = camera.center - points[index]
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    return Observations(
+        index,
+        np.minimum(response, _BRIGHTEST).astype(np.float32),
+        to_light,
+        to_camera.astype(np.float32),
+        facing,
+    )
+
+
+def _cell(sin_i: Floats, sin_r: Floats, cos_between: Floats) -> NDArray[np.int64]:
+    """Cell of the reflection table for sines of inclination to light and camera."""
+    cos = np.sqrt(np.maximum((1 - sin_i**2) * (1 - sin_r**2), 1e-6))
+    azimuth = np.clip((cos_between - sin_i * sin_r) / cos, -1, 1)
+    s = np.minimum((np.abs(sin_i + sin_r) * (_SUMS / _LARGEST_SUM)).astype(np.int64), _SUMS - 1)
+    a = np.minimum(((azimuth + 1) * (0.5 * _AZIMUTHS)).astype(np.int64), _AZIMUTHS - 1)
+    r = np.minimum((np.abs(sin_r) * _TILTS).astype(np.int64), _TILTS - 1)
+    return np.asarray((s * _AZIMUTHS + a) * _TILTS + r)
+
+
+def _facing_cell(facing: Floats) -> NDArray[np.int64]:
+    return np.clip(((facing + 0.2) * (_FACINGS / 1.2)).astype(np.int64), 0, _FACINGS - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Reflection:
+    """How the hair of this capture reflects: a table over geometry, mean 1 in front of the light.
+
+    `lit (8,)` is the mean answer over the cosine of the light to the surface, what shading and
+    shadow leave; `lobe (9·4·2,)` the mean of what remains over |sin θ_i + sin θ_r| (0 on the mirror
+    cone), cos φ between light and camera around the fibre, and |sin θ_r|.
+    """
+
+    lit: Array
+    lobe: Array
+
+    @classmethod
+    def learn(
+        cls, observations: Sequence[Observations], directions: Array, trusted: Bools
+    ) -> Reflection:
+        """Fill the table from points that are `trusted (N,)` to lie along `directions (N, 3)`."""
+        total, count = np.zeros(_FACINGS), np.zeros(_FACINGS)
+        for o in observations:
+            cell = _facing_cell(o.facing).ravel()
+            total += np.bincount(cell, o.response.ravel(), _FACINGS)
+            count += np.bincount(cell, minlength=_FACINGS)
+        lit = np.maximum((total + 1e-3) / (count + 1e-3), 1e-3)
+        size = _SUMS * _AZIMUTHS * _TILTS
+        total, count = np.zeros(size), np.zeros(size)
+        for o in observations:
+            m = trusted[o.index]
+            t = directions[o.index[m]].astype(np.float32)
+            sin_i = np.einsum("pld,pd->pl", o.to_light[m], t)
+            sin_r = (o.to_camera[m] * t).sum(axis=1, keepdims=True)
+            between = np.einsum("pld,pd->pl", o.to_light[m], o.to_camera[m])
+            cell = _cell(sin_i, sin_r, between)
+            front = o.facing[m] > _GRAZING
+            ratio = np.minimum(o.response[m] / lit[_facing_cell(o.facing[m])], _BRIGHTEST)
+            total += np.bincount(cell[front], ratio[front], size)
+            count += np.bincount(cell[front], minlength=size)
+        return cls(lit, (total + 1) / (count + 1))
+
+    @property
+    def contrast(self) -> float:
+        """Lobe on the mirror cone over lobe far from it: 1 says that directions cannot be read."""
+        sums = self.lobe.reshape(_SUMS, -1)
+        return float(sums[:2].mean() / max(float(sums[4:].mean()), 1e-9))
+
+    def scores(self, o: Observations, points: Array, candidates: Array) -> Floats:
+        """Correlation `(P, D)` of the answers with the table's for each of `candidates (D, 3)`.
+
+        Weighted by `lit`, so that lights behind the surface, in shadow, hardly count; on square
+        roots, so that a single bright light does not decide. Points of one cell of 3 cm share
+        the directions to lights and camera.
+        """
+        out = np.zeros((len(o.index), len(candidates)), np.float32)
+        model = np.sqrt(self.lobe).astype(np.float32)
+        c = candidates.astype(np.float32)
+        weight = np.where(o.facing > _GRAZING, self.lit[_facing_cell(o.facing)], 0)
+        measured = np.sqrt(
+            np.minimum(o.response / self.lit[_facing_cell(o.facing)], _BRIGHTEST)
+        ).astype(np.float32)
+        weight = weight.astype(np.float32)
+        cell = np.floor(points[o.index] / _BLOCK).astype(np.int64)
+        _, block = np.unique(cell, axis=0, return_inverse=True)
+        order = np.argsort(block.ravel(), kind="stable")
+        for m in np.split(order, np.flatnonzero(np.diff(block.ravel()[order])) + 1):
+            to_light = o.to_light[m].mean(axis=0)
+            to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
+            to_camera = o.to_camera[m].mean(axis=0)
+            to_camera /= np.linalg.norm(to_camera)
+            sin_i, sin_r = to_light @ c.T, (c @ to_camera)[None]
+            predicted = model[_cell(sin_i, sin_r, (to_light @ to_camera)[:, None])]
+            w, y = weight[m], measured[m]
+            total = w.sum(axis=1, keepdims=True) + 1e-9
+            y = y - (w * y).sum(axis=1, keepdims=True) / total
+            mean = (w @ predicted) / total
+            variance = w @ (predicted * predicted) - total * mean**2
+            spread = variance * (w * y * y).sum(axis=1, keepdims=True)
+            out[m] = ((w * y) @ predicted) / np.sqrt(np.maximum(spread, 1e-9))
+        return out
+
+
+def reflection_scores(
+    cameras: Sequence[Camera],
+    olats: Mapping[str, NDArray[np.floating]],
+    lights: Sequence[Light],
+    points: Array,
+    seen: Bools,
+    candidates: Array,
+    first: tuple[Array, Array],
+    trusted_share: float = 0.4,
+) -> tuple[Floats, Reflection]:
+    """Scores `(N, D)` of the candidates at all points, and the table that they were read with.
+
+    `seen (N, C)` says which camera sees which point; `first` are directions `(N, 3)` and
+    confidences `(N,)` from texture: the `trusted_share` of the most confident ones teach the table.
+    """
+    centers = np.stack([c.center for c in cameras])
+    away = seen @ centers - seen.sum(axis=1, keepdims=True) * points
+    normals = surface_normals(points, away)
+    directions, confidence = first
+    trusted = confidence >= np.quantile(confidence, 1 - trusted_share)
+    observations = [
+        observe(camera, olats[camera.name], lights, points, normals, seen[:, k])
+        for k, camera in enumerate(cameras)
+    ]
+    table = Reflection.learn(observations, directions, trusted)
+    scores = np.zeros((len(points), len(candidates)), np.float32)
+    for o in observations:
+        scores[o.index] += table.scores(o, points, candidates)
+    return scores, table

@@ -1,0 +1,150 @@
+"""Frames from commanded states: light vector times what the (camera, pose) pair answers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.geometry.rig import Rig
+from simulators.frames.responses import Responder, Response
+from simulators.frames.sensor import Sensor
+from simulators.peers.projector_controller import Show
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The commanded state at a trigger pulse: all that a frame depends on.
+
+    `power (L,)` is the lamps' share of full intensity; `pose` is where the subject was.
+    """
+
+    pulse: int
+    power: NDArray[np.float64]
+    show: Show
+    pose: int
+
+
+class FrameMaker:
+    """Makes counts of snapshots and keeps the responses that it needs again.
+
+    At pose 0 the lamps' responses are kept one by one, so that every light vector is a weighted
+    sum; at other poses, where only the closing frames light lamps, one picture per light vector
+    is rendered. Sweeps are kept for the last two poses of each camera. `cache` keeps the lamps'
+    responses on disk under `key`, which must name everything that they depend on. Threads may ask
+    for frames of different cameras at the same time.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        responder: Responder,
+        sensor: Sensor,
+        seed: int,
+        cache: Path | None = None,
+        key: str = "",
+    ) -> None:
+        self._rig = rig
+        self._responder = responder
+        self._sensor = sensor
+        self._seed = seed
+        self._cache = cache
+        self._key = key
+        self._lamps: dict[str, Response] = {}
+        self._moved: dict[str, OrderedDict[Hashable, Response]] = {
+            c.name: OrderedDict() for c in rig.cameras
+        }
+        self._sweeps: dict[str, OrderedDict[int, Mapping[str, Response]]] = {
+            c.name: OrderedDict() for c in rig.cameras
+        }
+
+    def counts(self, camera: str, shot: Snapshot, exposure: float) -> NDArray[np.uint16]:
+        """The sensor's counts `(H, W, 3)`; the same seed, camera and pulse give the same bytes."""
+        index = [c.name for c in self._rig.cameras].index(camera)
+        radiance = self.radiance(camera, shot)
+        return self._sensor.expose(radiance, exposure, (self._seed, index, shot.pulse))
+
+    def radiance(self, camera: str, shot: Snapshot) -> NDArray[np.float32]:
+        """Radiance `(H, W, 3)`, W/(sr m²), without noise."""
+        c = self._rig.camera(camera)
+        flat = np.zeros((c.height * c.width, 3), np.float32)
+        if shot.power.any():
+            self._add_lamps(flat, camera, shot)
+        if shot.show.level > 0:
+            self._add_projectors(flat, camera, shot)
+        return flat.reshape(c.height, c.width, 3)
+
+    def _add_lamps(self, flat: NDArray[np.float32], camera: str, shot: Snapshot) -> None:
+        if shot.pose == 0:
+            response = self._all_lamps(camera)
+            lit = np.flatnonzero(shot.power)
+            weights = shot.power[lit].astype(np.float32)
+            flat[response.pixels] += np.tensordot(weights, response.images[lit], 1)
+            return
+        response = _kept(
+            self._moved[camera],
+            (shot.pose, shot.power.tobytes()),
+            lambda: self._responder.lamps_together(camera, shot.pose, shot.power),
+            4,
+        )
+        flat[response.pixels] += response.images[0]
+
+    def _add_projectors(self, flat: NDArray[np.float32], camera: str, shot: Snapshot) -> None:
+        sweep = _kept(
+            self._sweeps[camera], shot.pose, lambda: self._responder.sweep(camera, shot.pose), 2
+        )
+        power = np.float32(shot.show.power)
+        for name, response in sweep.items():
+            if shot.show.projector is None:
+                flat[response.pixels] += power * response.total()
+            elif shot.show.projector == name:
+                flat[response.pixels] += power * response.image(shot.show.row)
+
+    def _all_lamps(self, camera: str) -> Response:
+        if camera not in self._lamps:
+            file = self._file(camera)
+            if file is not None and file.is_file():
+                with np.load(file) as stored:
+                    self._lamps[camera] = Response(stored["pixels"], stored["images"])
+            else:
+                self._lamps[camera] = self._responder.lamps(camera)
+                if file is not None:
+                    _store(file, self._lamps[camera])
+        return self._lamps[camera]
+
+    def _file(self, camera: str) -> Path | None:
+        if self._cache is None:
+            return None
+        name = hashlib.sha256(f"{self._key} {camera}".encode()).hexdigest()[:32]
+        return self._cache / f"lamps_{name}.npz"
+
+
+def cache_key(*parts: Any) -> str:
+    """One text for everything that responses depend on; the parts must be ready for JSON."""
+    return json.dumps(parts, sort_keys=True)
+
+
+def _store(file: Path, response: Response) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_name(f"{file.stem}.{os.getpid()}.part")
+    with temporary.open("wb") as out:
+        np.savez(out, pixels=response.pixels, images=response.images)
+    temporary.replace(file)
+
+
+def _kept(store: OrderedDict[Any, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
+    """`store[key]`, made where absent; the least recently used beyond `most` goes."""
+    if key not in store:
+        store[key] = make()
+    store.move_to_end(key)
+    while len(store) > most:
+        store.popitem(last=False)
+    return store[key]

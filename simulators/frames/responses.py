@@ -1,0 +1,189 @@
+"""What the subject answers to each light: rendered once per camera and pose, in its own process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.scene.backend import ensure_backend
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.rig import Rig
+from simulators.subject.drift import Drift
+from simulators.subject.subject import Subject
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Paths per pixel and lights per vertex: what a frame costs and how noisy the truth is.
+
+    `lamps` paths serve all lamps of a camera at once, `sweep` paths all rows of a camera and pose,
+    `together` paths one light vector. The demo's capture takes five to six
+    minutes of rendering on two cores with these numbers.
+    """
+
+    lamps: int = 16
+    sweep: int = 16
+    together: int = 24
+    depth: int = 16
+    sweep_depth: int = 6
+
+    @classmethod
+    def scaled(cls, spp: int) -> Quality:
+        """The default proportions with `spp` paths for the lamps."""
+        return cls(spp, spp, spp + spp // 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Radiance at full level of the pixels that see the subject; every other pixel is dark.
+
+    `pixels (P,)` are flat indices, `images (N, P, 3)` in units of `scale`, one for each light or
+    row: float32, or float16 for sweeps, whose rounding (0.05 %) is far below a camera's noise.
+    """
+
+    pixels: NDArray[np.int64]
+    images: Image | NDArray[np.float16]
+    scale: float = 1.0
+
+    @classmethod
+    def halved(cls, pixels: NDArray[np.int64], images: Image) -> Response:
+        """In half the memory; the brightest value becomes 1024, far from overflow in sums of it."""
+        scale = float(images.max(initial=0.0)) / 1024 or 1.0
+        return cls(pixels, (images * np.float32(1 / scale)).astype(np.float16), scale)
+
+    def image(self, index: int) -> Image:
+        """Radiance `(P, 3)` of one light or row."""
+        return self.images[index] * np.float32(self.scale)
+
+    def total(self) -> Image:
+        """Radiance `(P, 3)` of all of them together."""
+        return self.images.sum(axis=0, dtype=np.float32) * np.float32(self.scale)
+
+
+class Responder(Protocol):
+    """Renders responses; slow calls, one at a time."""
+
+    def lamps(self, camera: str) -> Response:
+        """The answer at pose 0 to each lamp alone, in the rig's order."""
+
+    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+        """The one answer at `pose` to all lamps at `power (L,)` together."""
+
+    def sweep(self, camera: str, pose: int) -> Mapping[str, Response]:
+        """The answer at `pose` to each row of each projector, by projector name."""
+
+
+def reproducible(
+    rig: Rig, subject: Subject, drift: Drift, quality: Quality, seed: int
+) -> MitsubaResponder:
+    """A `MitsubaResponder` that gives the same bytes every time, for a process of its own.
+
+    Dr.Jit adds floating-point numbers to the film in the order in which its threads come by; with
+    one thread that order is fixed. Several such processes use several cores.
+    """
+    ensure_backend()
+    import drjit
+
+    drjit.set_thread_count(1)
+    return MitsubaResponder(rig, subject, drift, quality, seed)
+
+
+class MitsubaResponder:
+    """Renders with Mitsuba in this process; the scene is built at the first call.
+
+    A moved subject is rendered as the unmoved one under moved cameras, lights and projectors, so
+    one acceleration structure serves all poses.
+    """
+
+    def __init__(
+        self, rig: Rig, subject: Subject, drift: Drift, quality: Quality, seed: int
+    ) -> None:
+        self._rig = rig
+        self._subject = subject
+        self._drift = drift
+        self._quality = quality
+        self._seed = seed
+        self._scene: Any = None
+
+    def lamps(self, camera: str) -> Response:
+        """See `Responder.lamps`."""
+        from appearance.render.olat import render_olat
+
+        seen, pixels = self._view(camera, 0)
+        images = render_olat(
+            self._built(),
+            seen,
+            self._rig.lights,
+            spp=self._quality.lamps,
+            max_depth=self._quality.depth,
+            seed=self._seeds(camera, 0, 1),
+            pixels=pixels,
+        )
+        return Response(pixels, images)
+
+    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+        """See `Responder.lamps_together`; a vertex asks a sample of the lit lamps."""
+        from appearance.render.olat import render_olat
+
+        seen, pixels = self._view(camera, pose)
+        rotation, translation = self._drift.pose(pose)
+        lit = [
+            replace(light.moved(rotation, translation), intensity=light.intensity * share)
+            for light, share in zip(self._rig.lights, power, strict=True)
+            if share > 0
+        ]
+        images = render_olat(
+            self._built(),
+            seen,
+            lit,
+            spp=self._quality.together,
+            max_depth=self._quality.depth,
+            seed=self._seeds(camera, pose, 2),
+            pixels=pixels,
+            first_lights=8,
+            deep_lights=2,
+        )
+        return Response(pixels, images.sum(axis=0, keepdims=True))
+
+    def sweep(self, camera: str, pose: int) -> dict[str, Response]:
+        """See `Responder.sweep`."""
+        from appearance.render.scanlines import render_scanlines
+
+        seen, pixels = self._view(camera, pose)
+        rotation, translation = self._drift.pose(pose)
+        rows = render_scanlines(
+            self._built(),
+            seen,
+            [p.moved(rotation, translation) for p in self._rig.projectors],
+            spp=self._quality.sweep,
+            max_depth=self._quality.sweep_depth,
+            seed=self._seeds(camera, pose, 3),
+            pixels=pixels,
+        )
+        return {name: Response.halved(pixels, images) for name, images in rows.items()}
+
+    def _built(self) -> Any:
+        if self._scene is None:
+            from appearance.scene.hair_scene import build_scene
+
+            s = self._subject
+            self._scene = build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
+        return self._scene
+
+    def _view(self, camera: str, pose: int) -> tuple[Camera, NDArray[np.int64]]:
+        from appearance.render.coverage import covered_pixels
+
+        seen = self._rig.camera(camera).moved(*self._drift.pose(pose))
+        return seen, covered_pixels(self._built(), seen)
+
+    def _seeds(self, camera: str, pose: int, what: int) -> int:
+        """Each picture its own paths: noise that all poses shared would look like structure."""
+        index = [c.name for c in self._rig.cameras].index(camera)
+        sequence = np.random.SeedSequence([self._seed, index, pose, what])
+        return int(sequence.generate_state(1)[0])

@@ -1,0 +1,131 @@
+"""All simulated devices of one rig, started and stopped together."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from simulators.frames.sensor import Sensor
+from simulators.peers.cameras import CameraLink
+from simulators.peers.faults import Faults
+from simulators.peers.light_bank import light_bank
+from simulators.peers.serial_peer import SerialPeer
+from simulators.peers.trigger_box import TriggerBox
+from simulators.world import World
+from stage_service.config import DevicesConfig, LinkCamerasConfig, ModbusRtuConfig, ModbusTcpConfig
+
+HOST = "127.0.0.1"
+DEVICES_FILE = "devices.toml"
+
+
+class SimulatedStage:
+    """The four peers around a `World`; a context manager.
+
+    With `paced` a light bank on RTU takes the time that its baud rate needs.
+    `configured` is the rig file's `[devices]`; its TCP ports are used, or any free ones with
+    `free_ports` or without it. Inside, `devices` holds the `[devices]` table with the true ports
+    and paths, which `state/devices.toml` holds, too.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        sensor: Sensor,
+        faults: Faults,
+        state: Path,
+        configured: DevicesConfig | None = None,
+        free_ports: bool = True,
+        paced: bool = False,
+    ) -> None:
+        self._world = world
+        self._sensor = sensor
+        self._faults = faults
+        self._state = state
+        self._configured = configured
+        self._free_ports = free_ports
+        self._paced = paced
+        self._stack = ExitStack()
+        self.devices: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._start(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def _start(self, stack: ExitStack) -> None:
+        self._state.mkdir(parents=True, exist_ok=True)
+        world, wires = self._world, self._configured
+        fixed = None if self._free_ports else wires
+        light_kind = wires.lights if wires else ModbusTcpConfig()
+        light_tcp = (HOST, 0)
+        if fixed and isinstance(fixed.lights, ModbusTcpConfig):
+            light_tcp = (fixed.lights.host, fixed.lights.port)
+        camera_host, camera_port = HOST, 0
+        if fixed and isinstance(fixed.cameras, LinkCamerasConfig):
+            camera_host, camera_port = fixed.cameras.host, fixed.cameras.port
+        stack.callback(world.stop)
+        link = self._state.absolute() / "lights"
+        lights = light_bank(light_kind, world, link, light_tcp, self._paced)
+        stack.callback(lights.stop)
+        light: dict[str, Any] = {"kind": light_kind.kind, "port": lights.start()}
+        if isinstance(light_kind, ModbusTcpConfig):
+            light["host"] = light_tcp[0]
+        if isinstance(light_kind, ModbusRtuConfig):
+            # A pseudo-terminal has no parity bit; a second stop bit keeps a character as long.
+            light |= {"parity": "N", "stop_bits": 2}
+        cameras = CameraLink(world, self._sensor, camera_host, camera_port)
+        stack.callback(cameras.stop)
+        camera_port = cameras.start()
+        trigger = TriggerBox(world, self._faults)
+        stack.callback(trigger.stop)
+        serial = {"trigger": trigger.reply, "projectors": world.projectors.reply}
+        paths = {}
+        for name, reply in serial.items():
+            strikes = functools.partial(world.strikes, name)
+            peer = SerialPeer(self._state.absolute() / name, reply, strikes)
+            peer.start()
+            stack.callback(peer.stop)
+            paths[name] = str(peer.link)
+        self.devices = wires.model_dump(mode="json", exclude_none=True) if wires else {}
+        actual: dict[str, dict[str, Any]] = {
+            "lights": light,
+            "trigger": {"kind": "serial", "port": paths["trigger"]},
+            "projectors": {"kind": "serial", "port": paths["projectors"]},
+            "cameras": {"kind": "link", "host": camera_host, "port": camera_port},
+        }
+        for name, table in actual.items():
+            base = self.devices.get(name, {})
+            self.devices[name] = {**base, **table} if base.get("kind") == table["kind"] else table
+        if not world.rig.projectors:
+            del self.devices["projectors"]
+        file = self._state / DEVICES_FILE
+        stack.callback(file.unlink, missing_ok=True)
+        ready = file.with_name(f"{file.name}.{os.getpid()}")
+        ready.write_text(_toml({"devices": self.devices}))
+        ready.replace(file)
+
+
+def _toml(table: dict[str, Any], path: str = "") -> str:
+    """`table` as TOML; its values are texts, numbers and tables, which JSON spells as TOML does."""
+    plain = {k: v for k, v in table.items() if not isinstance(v, dict)}
+    text = "".join(f"{k} = {json.dumps(v)}\n" for k, v in plain.items())
+    if path and plain:
+        text = f"[{path}]\n{text}\n"
+    for key, value in table.items():
+        if isinstance(value, dict):
+            text += _toml(value, f"{path}.{key}" if path else key)
+    return text

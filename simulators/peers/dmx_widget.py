@@ -1,0 +1,110 @@
+"""An Enttec DMX USB Pro with dimmers (DMX USB Pro Widget API Specification 1.44)."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from simulators.peers.faults import Fault
+from simulators.peers.lamps import Lamps
+from simulators.peers.terminal import Terminal
+
+_START, _END = 0x7E, 0xE7
+_MOST_DATA = 600
+_PARAMETERS, _SEND_DMX, _SERIAL_NUMBER = 3, 6, 10
+_FIRMWARE, _BREAK, _MARK, _RATE = 0x0144, 9, 1, 40
+_SERIAL = bytes.fromhex("78563412")  # binary-coded decimal, low digits first: 12345678
+_GARBAGE = b"\x7e\x03\xff\xff\x00\x55"
+
+
+class DmxWidget:
+    """The widget at a pseudo-terminal, and `lamps` as its dimmers from `first_channel` on.
+
+    It has no dead-man: lamps keep their last level whatever happens to the host. Start with
+    `start`, end with `stop`. A request is told to `strikes` as its label, "6".
+    """
+
+    def __init__(
+        self,
+        lamps: Lamps,
+        first_channel: int,
+        link: Path,
+        strikes: Callable[[str], Fault | None] = lambda _request: None,
+        begun: Callable[[str], bool] = lambda _fault: False,
+    ) -> None:
+        lamps.without_dead_man()
+        self._lamps = lamps
+        self._before = first_channel - 1
+        self._strikes = strikes
+        self._begun = begun
+        self._terminal = Terminal(link)
+        self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
+
+    def start(self) -> str:
+        """Make the link, answer from now on; returns the link's path."""
+        self._terminal.make_link()
+        self._thread.start()
+        return str(self._terminal.link)
+
+    def stop(self) -> None:
+        """Remove the link and close the terminal."""
+        self._terminal.wake()
+        self._thread.join()
+        self._terminal.close()
+
+    def _run(self) -> None:
+        pending = b""
+        while (data := self._terminal.receive()) is not None:
+            pending += data
+            while (message := _next(pending)) is not None:
+                label, body, pending = message
+                if not self._take(label, body):
+                    pending = b""
+            pending = pending[-_MOST_DATA - 5 :]
+
+    def _take(self, label: int, data: bytes) -> bool:
+        """Carry one message out; False where the widget was unplugged."""
+        if self._begun("hang"):
+            return True
+        fault = self._strikes(str(label))
+        kind = None if fault is None else fault.kind
+        if fault is not None and kind == "unplug":
+            self._terminal.unplug(fault.seconds)
+            return False
+        reply = self._carry_out(label, data)
+        if reply is None or kind == "silent":
+            return True
+        if fault is not None and kind == "late" and self._terminal.stops_within(fault.seconds):
+            return False
+        framed = struct.pack("<BBH", _START, label, len(reply)) + reply + bytes([_END])
+        noise = _GARBAGE if kind in ("garbage", "noise") else b""
+        self._terminal.send(noise if kind == "garbage" else noise + framed)
+        return True
+
+    def _carry_out(self, label: int, data: bytes) -> bytes | None:
+        if label == _PARAMETERS and len(data) == 2:
+            user_data = bytes(int.from_bytes(data, "little"))
+            return struct.pack("<HBBB", _FIRMWARE, _BREAK, _MARK, _RATE) + user_data
+        if label == _SERIAL_NUMBER:
+            return _SERIAL
+        if label == _SEND_DMX and 25 <= len(data) <= 513 and data[0] == 0:
+            mine = data[1 + self._before :][: self._lamps.count].ljust(self._lamps.count, b"\0")
+            self._lamps.show([257 * level for level in mine])
+        return None
+
+
+def _next(data: bytes) -> tuple[int, bytes, bytes] | None:
+    """(label, body, what follows) of the first whole message; what comes before it is skipped."""
+    start = data.find(_START)
+    while start >= 0 and len(data) >= start + 4:
+        label, size = struct.unpack_from("<BH", data, start + 1)
+        end = start + 4 + size
+        if size <= _MOST_DATA:
+            if end >= len(data):
+                return None
+            if data[end] == _END:
+                return label, data[start + 4 : end], data[end + 1 :]
+        start = data.find(_START, start + 1)
+    return None

@@ -1,0 +1,201 @@
+"""The light bank as a Modbus unit: its register map (docs/wire.md) and the functions it knows.
+
+Written from the Modbus Application Protocol Specification 1.1b3; it carries no framing.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from simulators.peers.lamps import ENTRIES, FULL, Lamps, NotNow
+from stage_service.config import LightRegisters
+
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, FAILURE = 1, 2, 3, 4
+_MOST_READ, _MOST_WRITTEN = 125, 123
+_MOST_COILS_READ, _MOST_COILS_WRITTEN = 2000, 1968
+_ON, _OFF = 0xFF00, 0x0000
+
+
+class Refused(Exception):
+    """The request is answered with the exception `code`."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}")
+        self.code = code
+
+
+_Read = Callable[[], Sequence[int]]
+_Write = Callable[[int, Sequence[int]], None]
+
+
+@dataclass(frozen=True)
+class _Block:
+    """`count` registers from `first`; `write(offset, values)` is None where they are read-only."""
+
+    first: int
+    count: int
+    read: _Read
+    write: _Write | None = None
+
+
+class ModbusUnit:
+    """Answers requests for `lamps`; `registers` says where they are, and which are missing.
+
+    A bank without heartbeat or watchdog register has no dead-man. `begun(fault)` says whether a
+    lasting fault shows; of them "lies" matters here: no lamp is reported lit, whatever is.
+    """
+
+    def __init__(
+        self,
+        lamps: Lamps,
+        registers: LightRegisters | None = None,
+        begun: Callable[[str], bool] = lambda _fault: False,
+    ) -> None:
+        self._lamps = lamps
+        self._begun = begun
+        r = registers or LightRegisters()
+        self._full = r.level_full
+        if None in (r.heartbeat, r.watchdog):
+            lamps.without_dead_man()
+        self._coils = [_Block(r.coils, lamps.count, lamps.coils, lamps.switch)]
+        self._holding = _there(
+            (r.levels, lamps.count, self._levels, self._dim),
+            (r.selector, 1, lambda: lamps.control()[:1], _accepted(lamps.select)),
+            (r.heartbeat, 1, lambda: lamps.control()[1:2], lambda _, v: lamps.beat(v[0])),
+            (r.watchdog, 1, lambda: lamps.control()[2:], _accepted(lamps.watch)),
+            (r.sequence, 1, lambda: lamps.sequence()[:1], _accepted(lamps.arm)),
+            (r.table, 2 * ENTRIES, self._table, self._load),
+        )
+        signature = r.signature or (None, 0)
+        self._inputs = _there(
+            (r.status, 1, lambda: self._status()[:1], None),
+            (r.lit, 1, lambda: self._status()[1:], None),
+            (r.count, 1, lambda: [lamps.count], None),
+            (signature[0], 1, lambda: [signature[1]], None),
+            (r.position, 1, lambda: [lamps.sequence()[1] & 0xFFFF], None),
+        )
+
+    def answer(self, request: bytes) -> bytes:
+        """The answer to a request, function code first in both."""
+        function = request[0]
+        try:
+            return request[:1] + self._carry_out(function, request[1:])
+        except Refused as refused:
+            return bytes([function | 0x80, refused.code])
+        except NotNow:
+            return bytes([function | 0x80, FAILURE])
+        except struct.error:
+            return bytes([function | 0x80, ILLEGAL_VALUE])
+
+    def _carry_out(self, function: int, data: bytes) -> bytes:
+        match function:
+            case 1:
+                return self._read_coils(*struct.unpack(">HH", data))
+            case 3 | 4:
+                blocks = self._holding if function == 3 else self._inputs
+                return self._read(blocks, *struct.unpack(">HH", data))
+            case 5:
+                address, value = struct.unpack(">HH", data)
+                _check(value in (_ON, _OFF))
+                self._write(self._coils, address, [value == _ON])
+                return data
+            case 6:
+                address, value = struct.unpack(">HH", data)
+                self._write(self._holding, address, [value])
+                return data
+            case 15:
+                address, count, size = struct.unpack(">HHB", data[:5])
+                packed = data[5:]
+                _check(0 < count <= _MOST_COILS_WRITTEN)
+                _check(size == len(packed) == -(-count // 8))
+                on = [bool(packed[i // 8] >> i % 8 & 1) for i in range(count)]
+                self._write(self._coils, address, on)
+                return data[:4]
+            case 16:
+                address, count, size = struct.unpack(">HHB", data[:5])
+                _check(0 < count <= _MOST_WRITTEN and size == 2 * count)
+                self._write(self._holding, address, struct.unpack(f">{count}H", data[5:]))
+                return data[:4]
+        raise Refused(ILLEGAL_FUNCTION)
+
+    def _read_coils(self, address: int, count: int) -> bytes:
+        _check(0 < count <= _MOST_COILS_READ)
+        bits = _values(self._coils, address, count)
+        packed = bytearray(-(-count // 8))
+        for i, on in enumerate(bits):
+            packed[i // 8] |= on << i % 8
+        return bytes([len(packed)]) + packed
+
+    def _read(self, blocks: list[_Block], address: int, count: int) -> bytes:
+        _check(0 < count <= _MOST_READ)
+        return struct.pack(f">B{count}H", 2 * count, *_values(blocks, address, count))
+
+    def _write(self, blocks: list[_Block], address: int, values: Sequence[int]) -> None:
+        parts = list(_parts(blocks, address, len(values)))
+        if any(block.write is None for block, _, _ in parts):
+            raise Refused(ILLEGAL_ADDRESS)
+        for block, at, count in parts:
+            assert block.write is not None
+            block.write(at, values[:count])
+            values = values[count:]
+
+    def _levels(self) -> list[int]:
+        return [self._told(level) for level in self._lamps.levels()]
+
+    def _dim(self, first: int, levels: Sequence[int]) -> None:
+        self._lamps.dim(first, [self._meant(level) for level in levels])
+
+    def _table(self) -> list[int]:
+        words = self._lamps.table()
+        return [self._told(word) if at % 2 else word for at, word in enumerate(words)]
+
+    def _load(self, first: int, words: Sequence[int]) -> None:
+        meant = [self._meant(w) if at % 2 else w for at, w in enumerate(words, first)]
+        self._lamps.load(first, meant)
+
+    def _meant(self, level: int) -> int:
+        """The lamps' level for a register's."""
+        _check(level <= self._full)
+        return round(level * FULL / self._full)
+
+    def _told(self, level: int) -> int:
+        """The register's level for the lamps'."""
+        return round(level * self._full / FULL)
+
+    def _status(self) -> tuple[int, int]:
+        bits, lit = self._lamps.status()
+        return (bits & ~8, 0) if self._begun("lies") else (bits, lit)
+
+
+def _parts(blocks: list[_Block], address: int, count: int) -> Iterator[tuple[_Block, int, int]]:
+    """(block, offset, count) that make up the span; `Refused` where a register is missing."""
+    while count:
+        for block in blocks:
+            at = address - block.first
+            if 0 <= at < block.count:
+                break
+        else:
+            raise Refused(ILLEGAL_ADDRESS)
+        part = min(count, block.count - at)
+        yield block, at, part
+        address, count = address + part, count - part
+
+
+def _values(blocks: list[_Block], address: int, count: int) -> list[int]:
+    parts = _parts(blocks, address, count)
+    return [value for block, at, part in parts for value in block.read()[at : at + part]]
+
+
+def _there(*blocks: tuple[int | None, int, _Read, _Write | None]) -> list[_Block]:
+    return [_Block(at, count, read, write) for at, count, read, write in blocks if at is not None]
+
+
+def _accepted(command: Callable[[int], bool]) -> _Write:
+    return lambda _, values: _check(command(values[0]))
+
+
+def _check(good: bool) -> None:
+    if not good:
+        raise Refused(ILLEGAL_VALUE)

@@ -1,0 +1,142 @@
+"""The subject in front of the cameras: a procedural one by name, or any strand file."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.scene.hair_appearance import HairAppearance
+from reconstruction.files.strands import READABLE, read_strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from reconstruction.head.generic import generic_head
+from simulators.subject.grooms import GROOMS, covering_radius, grow
+from simulators.subject.head import hair_field
+
+_APPEARANCE = {
+    "wavy": HairAppearance((0.12, 0.24, 0.50), 0.28, 0.30),
+    "straight": HairAppearance((0.30, 0.52, 0.95), 0.20, 0.28),
+    "curly": HairAppearance((0.20, 0.42, 0.80), 0.34, 0.36),
+}
+_FILE_APPEARANCE = HairAppearance((0.10, 0.20, 0.45), 0.3, 0.3)
+_SKIN = {
+    "wavy": (0.45, 0.31, 0.25),
+    "straight": (0.52, 0.38, 0.31),
+    "curly": (0.28, 0.18, 0.13),
+}
+_FILE_SKIN = (0.42, 0.30, 0.24)
+
+
+class SubjectError(ValueError):
+    """A subject that cannot sit in this stage; the message says why and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Hair on a head, in the world frame of the rig at pose 0.
+
+    `head` may be None for a hairpiece; `skin` is its diffuse albedo per linear RGB channel.
+    """
+
+    name: str
+    strands: Strands
+    head: Mesh | None
+    hair: HairAppearance
+    skin: tuple[float, float, float]
+
+    def digest(self) -> str:
+        """A hash of everything that frames depend on."""
+        head = (self.head.vertices, self.head.faces) if self.head is not None else ()
+        radius = np.asarray(self.strands.radius, np.float64)
+        total = hashlib.sha256(repr((self.hair, self.skin)).encode())
+        for array in (self.strands.points, self.strands.offsets, radius, *head):
+            total.update(repr((array.shape, str(array.dtype))).encode())
+            total.update(np.ascontiguousarray(array).tobytes())
+        return total.hexdigest()
+
+
+def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subject:
+    """The procedural subject `wavy`, `straight` or `curly`; `strands` overrides their number.
+
+    The seed moves every strand. Raises `SubjectError` for another name.
+    """
+    if name not in GROOMS:
+        raise SubjectError(
+            f"no subject called {name!r}: choose one of {', '.join(GROOMS)}, or give a strand file "
+            f"({', '.join(READABLE)})"
+        )
+    head = generic_head()
+    # The three grooms of one seed are three heads of hair, not one with three settings.
+    draw = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
+    hair = grow(GROOMS[name], head, hair_field(), draw, strands)
+    return Subject(name, hair, head, _APPEARANCE[name], _SKIN[name])
+
+
+def load_subject(
+    name_or_file: str,
+    head: str | Path | None = None,
+    *,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
+) -> Subject:
+    """A procedural subject by name, or the strands of a file on the OBJ `head`.
+
+    Strands of a file keep their radius where they cover at least half of what a whole head of hair
+    does (100,000 fibres of 40 µm); a thinned groom gets the radius that keeps that coverage, and
+    `say` gets a line about it. Raises `SubjectError`, or `ValueError` of the reader.
+    """
+    path = Path(name_or_file)
+    if name_or_file in GROOMS:
+        if head is not None:
+            raise SubjectError(
+                f"the subject {name_or_file!r} brings its own head: leave out {head}"
+            )
+        return make_subject(name_or_file, seed)
+    if not path.is_file():
+        raise SubjectError(
+            f"no subject {name_or_file!r}: neither a file nor one of {', '.join(GROOMS)}"
+        )
+    strands = read_strands(path)
+    if len(strands) == 0:
+        raise SubjectError(f"{path}: holds no strands")
+    wanted = covering_radius(len(strands))
+    given = float(np.mean(strands.radius))
+    if given < 0.5 * wanted:
+        say(
+            f"{path.name}: {len(strands)} strands of {given * 1e3:.3f} mm radius cover less than a "
+            f"head of hair; rendered with {wanted * 1e3:.2f} mm, which keeps the coverage of "
+            "100,000 fibres of 0.040 mm"
+        )
+        strands = replace(strands, radius=wanted)
+    mesh = read_obj(head) if head is not None else None
+    return Subject(path.stem, strands, mesh, _FILE_APPEARANCE, _FILE_SKIN)
+
+
+def check_fits(subject: Subject, rig: Rig) -> None:
+    """Raise `SubjectError` unless every camera sees half of the hair or is half filled by it."""
+    points = subject.strands.points.astype(float)
+    for camera in rig.cameras:
+        pixels, depth = camera.project(points)
+        on = camera.inside(pixels) & (depth > 0.05)
+        share = float(np.mean(on))
+        if share < 0.5 and _filled(camera, pixels[on]) < 0.5:
+            low, high = points.min(axis=0).round(3), points.max(axis=0).round(3)
+            raise SubjectError(
+                f"subject {subject.name}: {camera.name} of rig {rig.name} sees only {share:.0%} of "
+                f"the hair, which spans {low} to {high} m; the stage expects metres, z up, face "
+                "towards −y, the head's centre at the origin: convert the file"
+            )
+
+
+def _filled(camera: Camera, pixels: NDArray[np.float64]) -> float:
+    """Share of the image's 16x16 tiles that `pixels (N, 2)` fall into."""
+    tiles = (pixels + 0.5) * 16 / [camera.width, camera.height]
+    return len(np.unique(tiles.astype(int) @ [1, 16])) / 256

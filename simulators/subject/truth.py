@@ -1,0 +1,33 @@
+"""The truth behind the simulated frames, written for those who judge results by it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.mesh import write_obj
+from simulators.subject.drift import Drift
+from simulators.subject.props import Prop
+from simulators.subject.subject import Subject
+
+EXPOSURES = "exposures.jsonl"
+
+
+def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
+    """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`.
+
+    All at pose 0. Of a prop, which stands still, `prop.json` instead. `exposures.jsonl` beside
+    them, begun empty here and continued by `World`, says the pose of each pulse.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / EXPOSURES).write_text("")
+    if not isinstance(subject, Subject):
+        (folder / "prop.json").write_text(json.dumps(subject.to_dict(), indent=1) + "\n")
+        return
+    write_strands(folder / "strands.npz", subject.strands)
+    if subject.head is not None:
+        write_obj(folder / "head.obj", subject.head)
+    appearance = {"hair": subject.hair.to_dict(), "skin": list(subject.skin)}
+    (folder / "appearance.json").write_text(json.dumps(appearance, indent=1) + "\n")
+    (folder / "poses.json").write_text(json.dumps(drift.to_dicts(), indent=1) + "\n")

@@ -1,0 +1,1 @@
+"""Shooting a plan: sequencing, accounting for frames, staying safe."""

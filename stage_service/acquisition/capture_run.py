@@ -1,0 +1,91 @@
+"""The capture that is being made: its sequencer, and what is known of it meanwhile."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.writer import CaptureWriter
+from stage_service.acquisition.capture_status import CaptureStatus, read_status
+from stage_service.acquisition.sequencer import Sequencer
+from stage_service.config import RigFile
+from stage_service.devices.device_set import Stage
+from stage_service.plan.capture_plan import CapturePlan, PlanError
+from stage_service.plan.flash import FlashWatch
+from stage_service.records.events import EventLog
+
+
+class CaptureRun:
+    """One run over what a capture lacks; whoever makes it starts `sequencer` on `thread`.
+
+    Before a living subject the flash rate is watched, unless the plan has consent and somebody
+    has armed it (`consented`).
+    """
+
+    def __init__(
+        self,
+        capture_id: str,
+        plan: CapturePlan,
+        rig_file: RigFile,
+        stage: Stage,
+        writer: CaptureWriter,
+        events: EventLog,
+        *,
+        consented: bool,
+    ) -> None:
+        self.id = capture_id
+        self.thread: threading.Thread | None = None
+        self._events = events
+        self._writer = writer
+        self._first = read_status(writer.path)
+        free = not rig_file.safety.living_subject or (plan.consent is not None and consented)
+        self.sequencer = Sequencer(
+            stage,
+            writer,
+            retries=plan.retries_on(rig_file),
+            runs=plan.runs(rig_file, writer.steps)[0],
+            rate_hz=plan.rate_hz,
+            watch=_any_rate if free else FlashWatch(),
+            notify=self._notify,
+        )
+
+    def status(self) -> CaptureStatus:
+        """Where it is now."""
+        sequencer = self.sequencer
+        written, missing = self._writer.counts()
+        return self._first.model_copy(
+            update={
+                "state": sequencer.state,
+                "outcome": sequencer.outcome if sequencer.state == "done" else None,
+                "error": sequencer.error,
+                "step": sequencer.steps_done,
+                "frames_written": written,
+                "frames_missing": missing,
+                "seconds": sequencer.seconds,
+            }
+        )
+
+    def _notify(self, kind: str, data: dict[str, Any]) -> None:
+        self._events.publish(kind, {"id": self.id, **data})
+
+
+def plan_of(capture: Capture, rig_file: RigFile) -> CapturePlan:
+    """The plan of a capture that is to go on. Raises `PlanError` where it no longer fits."""
+    if "plan" not in capture.plan:
+        raise PlanError([f"{capture.path}: this capture was not shot by a plan"])
+    plan = CapturePlan.model_validate(capture.plan["plan"])
+    if capture.rig.to_dict() != rig_file.rig.to_dict():
+        raise PlanError([f"{rig_file.path}: the rig has changed since this capture: begin anew"])
+    if plan.steps(rig_file) != capture.steps:
+        raise PlanError(
+            [
+                f"{rig_file.path}: [capture] has changed since this capture, and with it the "
+                "plan's steps: begin anew"
+            ]
+        )
+    return plan
+
+
+def _any_rate(_step: Step) -> None:
+    """Flashes may have any rate: nobody is there, or whoever is has consented."""

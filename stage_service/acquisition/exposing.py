@@ -1,0 +1,133 @@
+"""One software-stepped exposure: light, confirm, settle, fire, confirm, dark."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from reconstruction.capture.folder import Step
+from stage_service.acquisition.timings import Spent
+from stage_service.devices.device_set import Stage
+from stage_service.devices.errors import Cancelled, DeviceError
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """The trigger box's count, and the monotonic seconds between which it fired."""
+
+    count: int
+    asked: float
+    answered: float
+
+
+class Exposing:
+    """Exposes a step on a connected stage, at most `rate_hz` times a second.
+
+    `watch` is called right before a step's light, and raises what forbids it. Raises `DeviceError`
+    where a device fails, `Cancelled` when `cancel` is set meanwhile.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        lamp: dict[str, int],
+        cancel: threading.Event,
+        spent: Spent,
+        *,
+        rate_hz: float | None,
+        watch: Callable[[Step], None],
+    ) -> None:
+        self._watch = watch
+        self._stage, self._lamp, self._cancel, self._spent = stage, lamp, cancel, spent
+        self._period = 1 / rate_hz if rate_hz else 0.0
+        self._next = 0.0
+
+    def expose(self, step: Step) -> Pulse:
+        """Make one pulse in the step's light."""
+        spent = self._spent
+        with spent.on("rate limit"):
+            self._sleep(self._next - time.monotonic())
+        self._next = time.monotonic() + self._period
+        self._watch(step)
+        with spent.on("lights"):
+            self._light(step)
+        with spent.on("settle"):
+            self._sleep(self._stage.config.lights.settle_s)
+        with spent.on("trigger"):
+            asked = time.monotonic()
+            count = self._stage.trigger.pulse(step.exposure)
+            pulse = Pulse(count, asked, time.monotonic())
+        # From the box's answer, which never comes before the pulse: the light stays long enough.
+        with spent.on("exposure"):
+            self._sleep(step.exposure)
+        with spent.on("lights"):
+            self._check_lamps(step)
+            self._check_projectors(step)
+            self.dark(step)
+        return pulse
+
+    def dark(self, step: Step | None = None) -> None:
+        """Put off what the step lit; without a step, everything."""
+        if step is None or step.kind in ("olat", "all_on"):
+            self._stage.lights.off()
+        projected = step is None or step.kind in ("scanline", "tracking")
+        if projected and self._stage.projectors is not None:
+            self._stage.projectors.off()
+
+    def _light(self, step: Step) -> None:
+        lights = self._stage.lights
+        if step.kind in ("olat", "all_on"):
+            lights.set_level(step.level)
+        if step.light is not None:
+            lights.select(self._lamp[step.light])
+        elif step.kind == "all_on":
+            lights.all_on()
+        elif step.kind == "dark":
+            self.dark()
+        else:
+            self._project(step)
+
+    def _project(self, step: Step) -> None:
+        projectors = self._stage.projectors
+        if projectors is None:
+            raise RuntimeError(f"step {step.index} ({step.kind}): the stage has no projectors")
+        if step.kind == "tracking":
+            projectors.all_on(step.level)
+        else:
+            assert step.projector is not None
+            assert step.row is not None
+            projectors.line(step.projector, step.row, step.level)
+
+    def _check_lamps(self, step: Step) -> None:
+        """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
+        lights = self._stage.lights
+        if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
+            return
+        lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
+        if lit != expected:
+            raise DeviceError(
+                lights.name,
+                f"looking after the exposure of step {step.index}",
+                expected=f"{expected} lamps lit",
+                received=f"{lit} lit",
+                todo="Watchdog, interlock or emergency stop put them off: clear the cause.",
+            )
+
+    def _check_projectors(self, step: Step) -> None:
+        """The same for projectors, which go dark when nobody feeds their watchdog."""
+        beams = self._stage.projectors
+        projected = step.kind in ("scanline", "tracking")
+        if projected and beams is not None and beams.capabilities.reads_back and beams.is_dark():
+            raise DeviceError(
+                beams.name,
+                f"looking after the exposure of step {step.index}",
+                expected="the row shown",
+                received="darkness",
+                todo="Its watchdog put it dark, or it lost power: check its cable.",
+            )
+
+    def _sleep(self, seconds: float) -> None:
+        if self._cancel.wait(max(0.0, seconds)):
+            raise Cancelled("the capture is being stopped")

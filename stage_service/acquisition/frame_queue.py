@@ -1,0 +1,133 @@
+"""Frames on their way to disk: a bounded queue, so that a slow disk slows the sequence."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from dataclasses import dataclass, replace
+
+from reconstruction.capture.folder import FrameRecord, Step
+from reconstruction.capture.writer import CaptureWriter
+from stage_service.devices.cameras.interface import CameraInfo, Frame
+
+THREADS = (os.cpu_count() or 1) + 2
+"""Threads that convert, hash and write side by side: one a processor, and one each that waits for
+the disk while it writes and while it flushes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame with what it takes to write it."""
+
+    step: Step
+    camera: str
+    frame: Frame
+    info: CameraInfo
+    pulse: int
+    attempt: int
+
+
+class FrameWriter:
+    """Converts and writes frames on threads of its own; at most `capacity` are under way.
+
+    One thread puts. Frames are stored side by side and journalled in the order of `put`, so a
+    crash leaves a capture without gaps, and costs at most `capacity` frames.
+    """
+
+    def __init__(self, writer: CaptureWriter, capacity: int) -> None:
+        self._writer = writer
+        self._queue: queue.SimpleQueue[tuple[int, Shot] | None] = queue.SimpleQueue()
+        self._room = threading.Semaphore(capacity)
+        self._batch = max(1, capacity // 2)
+        self._error: Exception | None = None
+        self._stored: dict[int, FrameRecord] = {}
+        self._next_put = self._next_commit = 0
+        self._lock = threading.Lock()
+        self._committing = False
+        self._threads = [
+            threading.Thread(target=self._run, name=f"frame-writer-{i}", daemon=True)
+            for i in range(THREADS)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def put(self, shot: Shot) -> None:
+        """Hand over a frame; waits while there are too many. Raises what writing raised."""
+        self._room.acquire()
+        try:
+            self.check()
+        except Exception:
+            self._room.release()  # for whoever tries again
+            raise
+        number = self._next_put
+        self._next_put += 1  # first: the frame that is put last must find itself the last
+        self._queue.put((number, shot))
+
+    def check(self) -> None:
+        """Raise what writing raised, if it did."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Write what waits, then stop. Raises what writing raised."""
+        for _ in self._threads:
+            self._queue.put(None)
+        for thread in self._threads:
+            thread.join()
+        try:
+            if not self._committing:  # no commit failed: what a failed frame left is whole
+                self._commit_what_is_due()
+        finally:
+            self.check()
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            if self._error is not None:
+                continue
+            try:
+                self._write(*item)
+            except Exception as error:  # handed to the sequencer by `check`
+                self._error = self._error or error
+                self._room.release()  # or `put` would wait for ever
+
+    def _write(self, number: int, shot: Shot) -> None:
+        frame, info = shot.frame, shot.info
+        record = self._writer.store_frame(
+            shot.step,
+            shot.camera,
+            frame.radiance(info),
+            full_scale=frame.full_scale(info),
+            count_scale=frame.count_scale(info),
+        )
+        record = replace(
+            record,
+            pulse=shot.pulse,
+            block_id=frame.block_id,
+            timestamp=frame.timestamp,
+            attempt=shot.attempt,
+        )
+        with self._lock:
+            self._stored[number] = record
+            if self._committing:  # whoever is at it goes on with this one
+                return
+            self._committing = True
+        self._commit_what_is_due()
+
+    def _commit_what_is_due(self) -> None:
+        while batch := self._next_in_order():
+            self._writer.commit(batch)
+            self._room.release(len(batch))
+
+    def _next_in_order(self) -> list[FrameRecord]:
+        """The stored frames whose turn it is, once they are many or no other is under way: a
+        flush holds up what others write meanwhile, and many flush as fast as one."""
+        batch = []
+        with self._lock:
+            many = len(self._stored) >= self._batch
+            last = self._next_commit + len(self._stored) == self._next_put
+            while (many or last or self._error is not None) and self._next_commit in self._stored:
+                batch.append(self._stored.pop(self._next_commit))
+                self._next_commit += 1
+            self._committing = bool(batch)
+        return batch

@@ -1,0 +1,105 @@
+"""Remembers, beyond a restart, that nobody knows whether the lamps are off."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from reconstruction.capture.writer import utc_now
+from reconstruction.files.durable import write_whole
+from stage_service.acquisition.safety import Blackout
+
+log = logging.getLogger("hairstage.safety")
+
+
+class Unsafe(RuntimeError):
+    """Captures are refused: the last blackout could not be verified."""
+
+    def __init__(self, latched: Latched) -> None:
+        way_out = (
+            "until POST /devices/blackout reads it back dark"
+            if latched.reads_back
+            else "until somebody has looked and says so with POST /devices/acknowledge"
+        )
+        detail = latched.detail.rstrip(".")
+        super().__init__(f"since {latched.since}: {detail}. Nothing is lit {way_out}.")
+
+
+class CannotAcknowledge(RuntimeError):
+    """Nothing is latched, or the link can tell by itself whether the lamps are off."""
+
+
+@dataclass(frozen=True)
+class Latched:
+    """Why and since when; `reads_back`: the link can tell that the lamps are off."""
+
+    since: str
+    detail: str
+    reads_back: bool
+
+
+class Latch:
+    """ "Unknown, unsafe", kept in `path` until a blackout was read back dark.
+
+    A link that cannot read back never clears it: a person does, by `acknowledge`. A file that is
+    there and cannot be read counts as latched.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._latched: Latched | None = None
+        if path.exists():
+            try:
+                self._latched = Latched(**json.loads(path.read_text()))
+            except (OSError, ValueError, TypeError) as error:
+                self._latched = Latched(utc_now(), f"{path} cannot be read: {error}", True)
+
+    @property
+    def latched(self) -> Latched | None:
+        """What is latched."""
+        return self._latched
+
+    def check(self) -> None:
+        """Raise `Unsafe` while it is set."""
+        latched = self._latched
+        if latched is not None:
+            raise Unsafe(latched)
+
+    def learn(self, result: Blackout, reads_back: bool) -> str | None:
+        """Take a blackout's result; returns "set" or "cleared" when that changes the latch."""
+        with self._lock:
+            if result.blocks:
+                was = self._latched
+                self._set(Latched(was.since if was else utc_now(), result.detail, reads_back))
+                return None if was else "set"
+            if result.safe and self._latched is not None:
+                self._clear()
+                return "cleared"
+        return None
+
+    def acknowledge(self) -> None:
+        """Clear it on a person's word. Raises `CannotAcknowledge`."""
+        with self._lock:
+            if self._latched is None:
+                raise CannotAcknowledge("nothing is latched: there is nothing to acknowledge")
+            if self._latched.reads_back:
+                raise CannotAcknowledge(
+                    "this light bank says itself whether its lamps are off: ask for a blackout "
+                    "(POST /devices/blackout) once it answers"
+                )
+            self._clear()
+
+    def _set(self, latched: Latched) -> None:
+        self._latched = latched
+        try:
+            write_whole(self._path, json.dumps(asdict(latched)).encode())
+        except OSError:  # a full disk must not keep anybody from a blackout
+            log.exception("%s cannot be written: the latch ends with this process", self._path)
+
+    def _clear(self) -> None:
+        self._path.unlink(missing_ok=True)
+        self._latched = None

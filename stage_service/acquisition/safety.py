@@ -1,0 +1,148 @@
+"""Lights off, verified; and no light while the stage says no.
+
+Software is not the safety function: the light bank's own watchdog and the wired emergency stop are.
+"""
+
+from __future__ import annotations
+
+import atexit
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from stage_service.devices.device_set import Stage
+from stage_service.devices.errors import DeviceError, SafetyRefusal
+from stage_service.devices.lights.interface import LightCapabilities, LightStatus
+from stage_service.devices.projectors.interface import ProjectorCapabilities
+from stage_service.devices.trigger.interface import TriggerStatus
+
+ATTEMPTS = 3
+Darkness = Literal["dark", "unknown, unsafe"]
+
+
+@dataclass(frozen=True)
+class Blackout:
+    """What a blackout came to: `safe` only if every lamp and projector was read back dark.
+
+    `accepted`: off was sent, nothing failed, and the rig file accepts that the light bank cannot
+    read it back (`accept_unverified_blackout`).
+    """
+
+    safe: bool
+    detail: str
+    accepted: bool = False
+
+    @property
+    def state(self) -> Darkness:
+        """What is known of the lamps."""
+        return "dark" if self.safe else "unknown, unsafe"
+
+    @property
+    def blocks(self) -> bool:
+        """Whether this fails a capture, and the next one may not begin."""
+        return not (self.safe or self.accepted)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the API, events and manifests tell of it."""
+        return {"safe": self.safe, "state": self.state, "detail": self.detail}
+
+
+class _Dark(Protocol):
+    name: str
+
+    def off(self) -> None: ...
+
+
+def blackout(stage: Stage, attempts: int = ATTEMPTS) -> Blackout:
+    """Put lamps and projectors off and read it back; never raises for a device.
+
+    A device that fails is tried again on a new connection. What cannot be verified is reported
+    as "unknown, unsafe".
+    """
+    lights, beams, config = stage.lights, stage.projectors, stage.config
+    problems = unread = ""
+    devices: list[tuple[_Dark, LightCapabilities | ProjectorCapabilities, Callable[[], bool]]]
+    devices = [(lights, lights.capabilities, lambda: lights.status().lit == 0)]
+    if beams is not None:
+        devices.append((beams, beams.capabilities, beams.is_dark))
+    for device, can, is_dark in devices:
+        problem = _darken(device, is_dark if can.reads_back else None, attempts)
+        if problem and can.dead_man:
+            problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
+        problems += problem
+        if not problem and not can.reads_back:
+            unread += f" {device.name}: off was sent, but cannot be read back."
+    if not problems and not unread:
+        return Blackout(True, "every lamp and projector was read back dark")
+    only_lamps = beams is None or beams.capabilities.reads_back
+    accepted = not problems and only_lamps and config.lights.accept_unverified_blackout
+    return Blackout(False, f"unknown, unsafe: {(problems + unread).strip()}", accepted)
+
+
+def _darken(device: _Dark, is_dark: Callable[[], bool] | None, attempts: int) -> str:
+    """Empty when the device is dark as far as it can tell, else what went wrong the last time."""
+    problem = ""
+    for attempt in range(attempts):
+        if attempt:
+            time.sleep(0.05 * attempt)
+        try:
+            device.off()
+            if is_dark is None or is_dark():
+                return ""
+            problem = f" {device.name}: still lit after off."
+        except DeviceError as error:
+            problem = f" {error}"
+        except Exception as error:  # whatever it is, the next device must still be darkened
+            problem = f" {device.name}: {type(error).__name__}: {error}"
+    return problem
+
+
+def check_interlocks(stage: Stage) -> None:
+    """Raise `SafetyRefusal` while an interlock is open or the emergency stop is pressed."""
+    inputs: list[tuple[str, TriggerStatus | LightStatus]] = [
+        (stage.trigger.name, stage.trigger.status())
+    ]
+    if stage.lights.capabilities.reads_back:
+        inputs.append((stage.lights.name, stage.lights.status()))
+    for name, status in inputs:
+        for seen, text in (
+            (status.estop_pressed, "emergency stop pressed"),
+            (status.interlock_open, "interlock open"),
+        ):
+            if seen:
+                raise SafetyRefusal(
+                    "stage",
+                    "arming",
+                    expected="interlock closed and emergency stop released",
+                    received=f"{name}: {text}",
+                    todo="Clear it at the stage; the service never does.",
+                )
+
+
+def off_on_exit(close: Callable[[], None]) -> Callable[[], None]:
+    """Have `close` called when the process ends, by SIGTERM too; returns what undoes that.
+
+    SIGTERM is turned into `SystemExit` where nobody else handles it; a server that does handle
+    it ends in `atexit` as well.
+    """
+
+    def terminate(number: int, _frame: object) -> None:
+        sys.exit(128 + number)
+
+    atexit.register(close)
+    main = threading.current_thread() is threading.main_thread()
+    mine = main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if mine:
+        signal.signal(signal.SIGTERM, terminate)
+
+    def undo() -> None:
+        atexit.unregister(close)
+        still_main = threading.current_thread() is threading.main_thread()
+        if mine and still_main and signal.getsignal(signal.SIGTERM) is terminate:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    return undo

@@ -1,0 +1,402 @@
+"""Runs a plan's steps over a stage: expose, read, account, write; dark at every end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.writer import CaptureWriter
+from stage_service.acquisition.accounting import FrameAccount, PulseAccount
+from stage_service.acquisition.exposing import Exposing, Pulse
+from stage_service.acquisition.frame_queue import FrameWriter, Shot
+from stage_service.acquisition.hardware_run import HardwareRun, Shots
+from stage_service.acquisition.safety import Blackout, blackout, check_interlocks
+from stage_service.acquisition.sentinels import check_sentinels
+from stage_service.acquisition.states import Machine, Outcome, State, WrongState
+from stage_service.acquisition.timings import Spent
+from stage_service.devices.cameras.fan_out import FanOut
+from stage_service.devices.cameras.interface import Camera, Frame
+from stage_service.devices.device_set import Stage
+from stage_service.devices.errors import Cancelled, IndexShift
+from stage_service.devices.heartbeat import Heartbeat
+from stage_service.plan.stepping import SHORTEST_RUN, Run
+
+Notify = Callable[[str, dict[str, Any]], None]
+QUEUED_STEPS = 2
+"""Steps' worth of frames that may wait for the disk before the sequence waits, too."""
+MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
+
+
+class CannotPause(WrongState):
+    """The trigger box clocks these steps; it cannot wait."""
+
+    def __init__(self, steps: int) -> None:
+        RuntimeError.__init__(
+            self,
+            f"cannot pause: the trigger box clocks a run of {steps} steps by itself. Pause after "
+            "it, or abort, which stops it at once and keeps the frames of the steps that are done",
+        )
+        self.action, self.state = "pause", "running"
+
+
+class Sequencer:
+    """One run over the frames that a capture still lacks, so an interrupted one goes on where it
+    stopped. `run` blocks; the other methods may be called from any thread.
+
+    `runs` says who clocks which steps (default: the service all), `rate_hz` how many steps a
+    second there are at most. `watch` is called before the service lights a step, and raises what
+    forbids it; what the box clocks keeps to the plan's prediction. `notify(kind, data)` hears
+    "capture.state", "capture.step" and "capture.frame_missing". Whatever ends the run, lamps and
+    projectors are put off and read back.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        writer: CaptureWriter,
+        *,
+        retries: int = 2,
+        runs: Sequence[Run] | None = None,
+        rate_hz: float | None = None,
+        watch: Callable[[Step], None] = lambda _step: None,
+        notify: Notify = lambda _kind, _data: None,
+    ) -> None:
+        self.stage = stage
+        self.error: str | None = None
+        self.blackout: Blackout | None = None
+        self.steps_done = 0
+        self._began: float | None = None
+        self._ended: float | None = None
+        self._writer = writer
+        self._retries = retries
+        self._runs = [Run(writer.steps, "software")] if runs is None else list(runs)
+        self._rate_hz = rate_hz
+        self._notify = notify
+        self._machine = Machine()
+        self._changed = threading.Condition()
+        self._pause_asked = False
+        self._abort_asked = False
+        self._cancel = threading.Event()
+        self._lamp = {light.name: i for i, light in enumerate(writer.rig.lights)}
+        self._armed: float | None = None
+        self._doubtful = False
+        # By camera: frames since its queue was last found empty, and those that it put in doubt.
+        self._unchecked: dict[str, list[Step]] = {c.name: [] for c in stage.cameras}
+        self._withdrawn: dict[str, list[Step]] = {}
+        self._clocked = 0  # steps of the hardware-stepped run that is under way
+        self._unclear: dict[str, str] = {}
+        self._spent = Spent()
+        self._exposing = Exposing(
+            stage, self._lamp, self._cancel, self._spent, rate_hz=rate_hz, watch=watch
+        )
+        self._pulses = PulseAccount(stage.trigger.name)
+        self._accounts = {
+            c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in stage.cameras
+        }
+
+    @property
+    def state(self) -> State:
+        """Where the run is."""
+        return self._machine.state
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """How the run ends, as soon as that is decided."""
+        return self._machine.outcome
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds from the start until now, or until the end; None before the start."""
+        if self._began is None:
+            return None
+        return (time.monotonic() if self._ended is None else self._ended) - self._began
+
+    def pause(self) -> None:
+        """Pause at the next step boundary, lights off. Raises `WrongState`."""
+        with self._changed:
+            self._require("pause")
+            if self._clocked:
+                raise CannotPause(self._clocked)
+            self._pause_asked = True
+            self._changed.notify_all()
+
+    def resume(self) -> None:
+        """Go on, or take back a pause that has not begun. Raises `WrongState`."""
+        with self._changed:
+            if not self._pause_asked:
+                self._require("resume")
+            self._pause_asked = False
+            self._changed.notify_all()
+
+    def abort(self) -> None:
+        """Abort at the next step boundary. Raises `WrongState`."""
+        with self._changed:
+            self._require("abort")
+            self._abort_asked = True
+            self._changed.notify_all()
+
+    def stop_now(self) -> None:
+        """Abort without waiting for the step's frames; does nothing when the run is over."""
+        with self._changed:
+            self._abort_asked = True
+            self._cancel.set()
+            self._changed.notify_all()
+
+    def run(self) -> Outcome:
+        """Shoot what is missing and finish the capture folder; returns the outcome.
+
+        Trouble with a device, the disk or a frame ends in the outcome "failed" and `error`.
+        KeyboardInterrupt and SystemExit are raised again after everything is in order.
+        """
+        self._began = time.monotonic()
+        leave: BaseException | None = None
+        self._move("start")
+        try:
+            self._session()
+            self._move("complete")
+        except Cancelled:
+            self._move("abort")
+        except Exception as error:
+            self._fail(error)
+        except BaseException as error:
+            self._fail(error)
+            leave = error
+        self._finish()
+        if leave is not None:
+            raise leave
+        assert self.outcome is not None
+        return self.outcome
+
+    def _finish(self) -> None:
+        if self.blackout is not None and self.blackout.blocks:
+            self._fail(RuntimeError(f"blackout: {self.blackout.detail}"))
+        extra: dict[str, Any] = {
+            "seconds": self.seconds,
+            "error": self.error,
+            "seconds_by_cause": dict(self._spent.seconds),
+            "service_s_per_step_median": self._spent.own_median_s,
+            "sentinels_unclear": self._unclear,
+        }
+        if self.blackout is not None:
+            extra["blackout"] = self.blackout.to_dict()
+        try:
+            for camera, steps in self._withdrawn.items():
+                for step in steps:
+                    self._writer.withdraw(step, camera, reason=MAY_BE_ANOTHER)
+            self._writer.finish(str(self.outcome), extra)
+        except Exception as error:  # a full disk: the journal keeps the frames, state the reason
+            self._fail(error)
+        self._ended = time.monotonic()
+        self._move("finish")
+
+    def _session(self) -> None:
+        stage = self.stage
+        with ExitStack() as stack:
+            frames = FrameWriter(self._writer, QUEUED_STEPS * len(stage.cameras))
+            stack.callback(frames.close)
+            stack.callback(stage.close)
+            # The heartbeat ends before the blackout begins: should that fail, the bank's own
+            # watchdog puts the lamps off.
+            stack.callback(self._black_out)
+            stage.connect()
+            check_interlocks(stage)
+            if any(s.kind in ("scanline", "tracking") for s in self._writer.steps):
+                stage.require_power()
+            if stage.trigger.table_rows:
+                stage.trigger.stop()  # a table that a service which died has started
+            stage.trigger.reset()
+            cameras = FanOut(stage.cameras)
+            stack.callback(cameras.close)
+            watched = [
+                device
+                for device in (stage.lights, stage.projectors)
+                if device is not None and device.capabilities.dead_man
+            ]
+            for device in watched:
+                device.set_watchdog(stage.config.watchdog_s)
+            beats = [
+                stack.enter_context(Heartbeat(device, stage.config.heartbeat_s))
+                for device in watched
+            ]
+            self._exposing.dark()
+            for run in self._runs:
+                todo = {s: w for s in run.steps if (w := self._wanted(s))}
+                self.steps_done += len(run.steps) - len(todo)  # shot before this run
+                if run.stepping == "hardware" and len(todo) >= SHORTEST_RUN:
+                    self._boundary(beats)
+                    self._clock(todo, cameras, frames)
+                for step, wanted in todo.items():
+                    self._boundary(beats)
+                    if wanted:
+                        with self._spent.step():
+                            self._shoot(step, wanted, cameras, frames)
+                    self.steps_done += 1
+                    self._notify("capture.step", {"steps_done": self.steps_done, **step.to_dict()})
+            cameras(self._drain)
+            cameras(lambda camera: camera.disarm())
+        self._unclear = check_sentinels(Capture(self._writer.path))
+
+    def _wanted(self, step: Step) -> set[str]:
+        records = self._writer.records
+        names = (c.name for c in self.stage.cameras)
+        return {
+            name
+            for name in names
+            if (record := records.get((step.index, name))) is None or record.file is None
+        }
+
+    def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
+        """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
+        steps = list(todo)
+        run = HardwareRun(self.stage, steps, self._lamp, rate_hz=self._rate_hz)
+        self._clocked = len(steps)
+        try:
+            with self._spent.on("arm"):
+                self._arm(steps[0].exposure, cameras)
+            with self._spent.on("hardware run"):
+                shots = run.shoot(cameras, self._cancel, lambda: self._abort_asked)
+                self._exposing.dark()
+        finally:
+            self._clocked = 0
+        first = self._pulses.count + 1
+        self._pulses.ran(shots.progress.pulses, self.stage.trigger.count())
+        places = self._place(shots, run)
+        for camera in self.stage.cameras:
+            for place, frame in zip(
+                places[camera.name] or (), shots.frames[camera.name], strict=False
+            ):
+                # The frame of a pulse beyond the steps that were done was cut short.
+                if place >= shots.progress.steps or camera.name not in todo[steps[place]]:
+                    continue
+                self._put(
+                    frames, Shot(steps[place], camera.name, frame, camera.info, first + place, 0)
+                )
+                todo[steps[place]].discard(camera.name)
+        self._doubtful = any(todo.values())
+        if shots.error is not None:
+            raise shots.error
+        if not self._abort_asked:
+            for step in steps:
+                self._tell_missing(step, todo[step], 0)
+
+    def _place(self, shots: Shots, run: HardwareRun) -> dict[str, list[int] | None]:
+        schedule = run.schedule[: shots.progress.pulses]
+        return {
+            name: self._accounts[name].place(
+                [f.block_id for f in frames], [f.timestamp for f in frames], schedule, run.steady
+            )
+            for name, frames in shots.frames.items()
+        }
+
+    def _shoot(self, step: Step, wanted: set[str], cameras: FanOut, frames: FrameWriter) -> None:
+        """One step; cameras without a frame get more pulses, only their frames are kept then."""
+        for attempt in range(self._retries + 1):
+            if self._doubtful or self._armed != step.exposure:
+                with self._spent.on("arm"):
+                    self._arm(step.exposure, cameras)
+            pulse = self._exposing.expose(step)
+            self._pulses.fired(pulse.count)
+            with self._spent.on("cameras"):
+                shot = cameras(lambda camera: camera.read(self._cancel))
+            for camera in self.stage.cameras:
+                frame = shot[camera.name]
+                self._account(camera, frame, pulse)
+                if frame is not None and camera.name in wanted:
+                    self._put(
+                        frames, Shot(step, camera.name, frame, camera.info, pulse.count, attempt)
+                    )
+                    wanted.discard(camera.name)
+            if not wanted:
+                return
+            self._tell_missing(step, wanted, attempt)
+        for name in sorted(wanted):
+            reason = f"no frame from the camera after {self._retries + 1} pulses"
+            self._writer.record_missing(
+                step, name, reason=reason, pulse=pulse.count, attempt=self._retries
+            )
+
+    def _put(self, frames: FrameWriter, shot: Shot) -> None:
+        with self._spent.on("storage"):
+            frames.put(shot)
+        self._unchecked[shot.camera].append(shot.step)
+
+    def _tell_missing(self, step: Step, cameras: set[str], attempt: int) -> None:
+        if cameras:
+            lost = {"step": step.index, "cameras": sorted(cameras), "attempt": attempt}
+            again = attempt < self._retries
+            self._notify("capture.frame_missing", {**lost, "shot_again": again})
+
+    def _account(self, camera: Camera, frame: Frame | None, pulse: Pulse) -> None:
+        if frame is None:
+            # It may still come, and must not pass for the next pulse's.
+            self._doubtful = True
+            self._accounts[camera.name].missed()
+        else:
+            account = self._accounts[camera.name]
+            account.arrived(frame.block_id, frame.left)
+            if camera.capabilities.timestamps and frame.timestamp:
+                account.timed(frame.timestamp, pulse.asked, pulse.answered)
+
+    def _arm(self, exposure: float, cameras: FanOut) -> None:
+        """Arm every camera; all have confirmed when this returns. What a queue still holds is
+        looked at first, because arming drops it."""
+        if self._armed is not None:
+            cameras(self._drain)
+        self._armed = None
+        cameras(lambda camera: camera.arm(exposure))
+        for account in self._accounts.values():
+            account.armed()
+        self._armed, self._doubtful = exposure, False
+
+    def _drain(self, camera: Camera) -> None:
+        """Drop frames that came late for pulses counted as missed; others raise `IndexShift`, and
+        the frames since the last time are taken back: resumed, the capture shoots them again."""
+        try:
+            while (frame := camera.read(self._cancel)) is not None:
+                self._accounts[camera.name].late(frame.block_id)
+        except IndexShift:
+            self._withdrawn[camera.name] = self._unchecked[camera.name]
+            raise
+        self._unchecked[camera.name] = []
+
+    def _boundary(self, beats: Sequence[Heartbeat]) -> None:
+        """Where pause and abort take effect, and failed heartbeats come to light."""
+        for beat in beats:
+            beat.check()
+        if self._abort_asked:
+            raise Cancelled("aborted")
+        if not self._pause_asked:
+            return
+        self._move("pause")
+        dark = blackout(self.stage)
+        if dark.blocks:
+            raise RuntimeError(f"pausing: {dark.detail}")
+        with self._changed:
+            self._changed.wait_for(lambda: self._abort_asked or not self._pause_asked)
+        if self._abort_asked:
+            raise Cancelled("aborted while paused")
+        check_interlocks(self.stage)
+        self._move("resume")
+
+    def _black_out(self) -> None:
+        self.blackout = blackout(self.stage)
+
+    def _require(self, action: str) -> None:
+        if not self._machine.allows(action) or (self._abort_asked and action != "abort"):
+            raise WrongState(action, self.state)
+
+    def _fail(self, error: BaseException) -> None:
+        text = str(error) or type(error).__name__
+        self.error = text if self.error is None else f"{self.error}; {text}"
+        self._move("fail")
+
+    def _move(self, action: str) -> None:
+        with self._changed:
+            self._machine.do(action)
+            self._changed.notify_all()
+        state = {"state": self.state, "outcome": self.outcome, "error": self.error}
+        self._notify("capture.state", state)

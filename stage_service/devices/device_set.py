@@ -1,0 +1,190 @@
+"""All devices of one stage, as the rig file describes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Self
+
+from reconstruction.geometry.cameras import Camera as Geometry
+from reconstruction.geometry.rig import RigError
+from stage_service.config import (
+    BaslerConfig,
+    CamerasConfig,
+    DevicesConfig,
+    DmxConfig,
+    LightBankConfig,
+    LinkCamerasConfig,
+    ModbusRtuConfig,
+    ModbusTcpConfig,
+    RigFile,
+)
+from stage_service.devices.cameras.basler import BaslerCamera
+from stage_service.devices.cameras.fan_out import FanOut
+from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.cameras.link import LinkCamera
+from stage_service.devices.errors import DeviceError
+from stage_service.devices.lights.dmx_enttec import DmxLightBank
+from stage_service.devices.lights.interface import LightBank
+from stage_service.devices.lights.limited import LimitedLightBank, LitTimes
+from stage_service.devices.lights.modbus import ModbusLightBank
+from stage_service.devices.projectors.interface import ProjectorController
+from stage_service.devices.projectors.pjlink import PjLinkProjector, Power
+from stage_service.devices.projectors.serial_controller import SerialProjectorController
+from stage_service.devices.trigger.interface import TriggerBox
+from stage_service.devices.trigger.serial_box import SerialTriggerBox
+
+Device = LightBank | TriggerBox | ProjectorController | Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The drivers of a stage; `projectors` is None where it has none.
+
+    `powers` are the projectors whose power can be asked for.
+    """
+
+    config: DevicesConfig
+    lights: LightBank
+    trigger: TriggerBox
+    projectors: ProjectorController | None
+    cameras: tuple[Camera, ...]
+    powers: tuple[PjLinkProjector, ...] = ()
+
+    @classmethod
+    def of(cls, rig_file: RigFile, lit: LitTimes | None = None) -> Self:
+        """Make the drivers; connects to nothing. Raises `RigError` without `[devices]`.
+
+        `lit` has how long lamps were lit before, for their duty, and goes on being kept.
+        """
+        config, rig = rig_file.devices, rig_file.rig
+        if config is None:
+            raise RigError(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
+        projectors = None
+        if config.projectors is not None and rig.projectors:
+            names = tuple(p.name for p in rig.projectors)
+            projectors = SerialProjectorController(config.projectors, names)
+        return cls(
+            config,
+            LimitedLightBank(
+                _light_bank(config.lights, len(rig.lights)), rig_file.safety, past=lit
+            ),
+            SerialTriggerBox(config.trigger),
+            projectors,
+            tuple(_camera(config.cameras, c) for c in rig.cameras),
+            _powers(rig_file, config),
+        )
+
+    def connect(self) -> None:
+        """Connect to every device, lights first, cameras side by side. Raises `DeviceError`, or
+        an `ExceptionGroup` of those of several cameras."""
+        for device in self._all():
+            if device not in self.cameras:
+                device.connect()
+        cameras = FanOut(self.cameras)
+        try:
+            cameras(lambda camera: camera.connect())
+        finally:
+            cameras.close()
+
+    def require_power(self) -> None:
+        """Raise `DeviceError` for a projector that is not on: its rows would be dark."""
+        for projector in self.powers:
+            state = projector.power()
+            if state is not Power.ON:
+                raise DeviceError(
+                    projector.name,
+                    "looking before a sweep",
+                    expected="power on",
+                    received=state.name.lower().replace("_", " "),
+                    todo="Switch it on, and wait until its lamp has warmed up.",
+                )
+
+    def close(self) -> None:
+        """Close every link; lamps and projectors stay as they are."""
+        for device in self._all():
+            device.close()
+
+    def status(self, *, connect: bool) -> dict[str, Any]:
+        """Ask each device how it is: {kind: {"state": "ok" | "unreachable", ...}}.
+
+        With `connect` each device is connected first. Without it, as during a capture, the cameras
+        are left alone; a driver whose link is closed opens it to ask.
+        """
+        lights, trigger, beams = self.lights, self.trigger, self.projectors
+        out = {
+            "lights": _ask(lights, connect, lambda: _lamps(lights)),
+            "trigger": _ask(
+                trigger, connect, lambda: {"pulses": trigger.count(), **asdict(trigger.status())}
+            ),
+        }
+        if beams is not None:
+            out["projectors"] = _ask(
+                beams, connect, lambda: {"dark": beams.is_dark(), "names": list(beams.names)}
+            )
+        out["cameras"] = {
+            c.name: _ask(c, connect, partial(_info, c)) if connect else {"state": "in use"}
+            for c in self.cameras
+        }
+        out["projector_power"] = {p.projector: _power(p) for p in self.powers if connect}
+        return out
+
+    def _all(self) -> tuple[Device, ...]:
+        beams = (self.projectors,) if self.projectors is not None else ()
+        return (self.lights, *beams, self.trigger, *self.cameras)
+
+
+def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
+    match config:
+        case ModbusTcpConfig() | ModbusRtuConfig():
+            return ModbusLightBank(config, lamps)
+        case DmxConfig():
+            return DmxLightBank(config, lamps)
+
+
+def _camera(config: CamerasConfig, geometry: Geometry) -> Camera:
+    match config:
+        case LinkCamerasConfig():
+            return LinkCamera(config, geometry)
+        case BaslerConfig():
+            return BaslerCamera(config, geometry)
+
+
+def _powers(rig_file: RigFile, config: DevicesConfig) -> tuple[PjLinkProjector, ...]:
+    known, out = {p.name for p in rig_file.rig.projectors}, []
+    for name, link in config.pjlink.items():
+        where = f"{rig_file.path}: devices.pjlink.{name}"
+        if name not in known:
+            raise RigError(f"{where}: the rig has no projector {name!r}")
+        file = link.password_file
+        # Read when it is needed: a file that is gone must not keep anybody from a blackout.
+        password = "" if file is None else rig_file.path.parent / file
+        out.append(PjLinkProjector(name, link.host, link.port, password, link.timeout_s))
+    return tuple(out)
+
+
+def _power(projector: PjLinkProjector) -> dict[str, Any]:
+    try:
+        lamps = [asdict(lamp) for lamp in projector.lamps()]
+        return {"state": "ok", "power": projector.power().name, "lamps": lamps}
+    except DeviceError as error:
+        return {"state": "unreachable", "error": str(error)}
+
+
+def _lamps(lights: LightBank) -> dict[str, Any]:
+    known = asdict(lights.status()) if lights.capabilities.reads_back else {}
+    return {"count": lights.count, **known}
+
+
+def _info(camera: Camera) -> dict[str, Any]:
+    return asdict(camera.info)
+
+
+def _ask(device: Device, connect: bool, question: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    try:
+        if connect:
+            device.connect()
+        return {"name": device.name, "state": "ok", **question()}
+    except DeviceError as error:
+        return {"name": device.name, "state": "unreachable", "error": str(error)}

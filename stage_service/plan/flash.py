@@ -1,0 +1,157 @@
+"""How fast a plan flashes, and whether a living subject may be in front of it.
+
+Flashes of 3 to 30 Hz are those that most often set off seizures (Epilepsy Society, "Photosensitive
+epilepsy"); up to three flashes in a second pass (W3C, WCAG 2.2, success criterion 2.3.1).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from reconstruction.capture.folder import Step
+from stage_service.devices.errors import SafetyRefusal
+from stage_service.plan.timeline import Lit
+
+SLOWEST_HZ, FASTEST_HZ = 3.0, 30.0
+IN_A_ROW = 3
+"""So many intervals of the band within a second, four flashes, are flashing in the band."""
+SLOW_HZ = 2.5
+"""What is offered as a way out: below the band, with room for steps that come early."""
+
+Band = Literal["below 3 Hz", "3 to 30 Hz", "above 30 Hz"]
+IN_BAND: Band = "3 to 30 Hz"
+ROUNDING = 1e-9
+
+
+class FlashRate(BaseModel):
+    """How fast a plan flashes, as predicted: `hz`, over four flashes in a row, decides the band.
+
+    Retries, a slow link or a slow disk make it slower: what is above the band can fall into it, so
+    the rate is measured while running, too. `by_kind` has how often each kind of step comes again.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    hz: float
+    band: Band
+    by_kind: dict[str, float]
+    needs_consent: bool
+
+
+class FlashRefusal(RuntimeError):
+    """A plan that flashes in the band; `problems` has the ways out."""
+
+    def __init__(
+        self, rate: FlashRate, consent: str | None, *, seconds: float, slow_seconds: float
+    ) -> None:
+        lacks = "the operator has not armed it" if consent else "no consent is recorded"
+        self.problems = [
+            f"the plan flashes at {rate.hz:.1f} Hz, within {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, "
+            f"before a living subject, and {lacks}",
+            f"either set rate_hz to {SLOW_HZ:g} in the plan, which keeps it below the band and "
+            f"takes {slow_seconds:.0f} s instead of {seconds:.0f} s",
+            "or record in the plan's consent who agreed to what and when, and give in armed_by who "
+            "answers for it at the stage",
+            "a mannequin or a simulated subject: set living_subject = false in [safety] of the rig "
+            "file",
+        ]
+        super().__init__("; ".join(self.problems))
+
+
+class _Train:
+    """Flashes of one kind, in time's order; remembers the newest intervals that are in the band."""
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._begins: deque[float] = deque(maxlen=IN_A_ROW)
+        self._newest: deque[float] = deque(maxlen=IN_A_ROW + 1)
+
+    def add(self, at: float) -> float | None:
+        """Take a flash; returns the rate in Hz once it is within the band."""
+        before, self._last = self._last, at
+        self._newest.append(at)
+        if before is None:
+            return None
+        low, high = 1 / FASTEST_HZ - ROUNDING, 1 / SLOWEST_HZ + ROUNDING
+        if not low <= at - before <= high:
+            return None
+        self._begins.append(before)
+        if len(self._begins) < IN_A_ROW or at - self._begins[0] > 1 + ROUNDING:
+            return None
+        return IN_A_ROW / (at - self._begins[0])
+
+    def rate(self) -> float:
+        """Hz over the newest flashes; 0 while there are too few."""
+        if len(self._newest) <= IN_A_ROW or self._newest[-1] <= self._newest[0]:
+            return 0.0
+        return IN_A_ROW / (self._newest[-1] - self._newest[0])
+
+
+class _Trains:
+    """Every light of the plan as one train, and the full-field flashes among them as another.
+
+    A tracking frame before every tenth scanline outshines them: it flashes at its own rate.
+    """
+
+    def __init__(self) -> None:
+        self.each = _Train()
+        self._full_field = _Train()
+
+    def add(self, step: Step, at: float) -> float | None:
+        """The rate that lies in the band with this flash, or None."""
+        rates = [self.each.add(at)]
+        if step.kind in ("tracking", "all_on"):
+            rates.append(self._full_field.add(at))
+        found = [r for r in rates if r is not None]
+        return max(found) if found else None
+
+
+def flash_rate(lights: Iterable[Lit], living_subject: bool) -> FlashRate:
+    """Classify a plan by its predicted course."""
+    trains, worst, fastest = _Trains(), 0.0, 0.0
+    kinds, by_kind = dict[str, _Train](), dict[str, float]()
+    for lit in lights:
+        worst = max(worst, trains.add(lit.step, lit.at) or 0.0)
+        fastest = max(fastest, trains.each.rate())
+        kind = lit.step.kind
+        own = kinds.setdefault(kind, _Train())
+        own.add(lit.at)
+        by_kind[kind] = max(by_kind.get(kind, 0.0), own.rate())
+    if worst:
+        return FlashRate(hz=worst, band=IN_BAND, by_kind=by_kind, needs_consent=living_subject)
+    band: Band = "above 30 Hz" if fastest > FASTEST_HZ else "below 3 Hz"
+    return FlashRate(hz=fastest, band=band, by_kind=by_kind, needs_consent=False)
+
+
+class FlashWatch:
+    """Measures the flash rate while running. Call it as each step's light is about to go on.
+
+    Raises `SafetyRefusal` before the flash that makes the rate fall into the band.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._trains = _Trains()
+        self._lock = threading.Lock()
+
+    def __call__(self, step: Step) -> None:
+        """Take the flash of a step that is about to be lit. Raises `SafetyRefusal`."""
+        if step.kind == "dark":
+            return
+        with self._lock:
+            rate = self._trains.add(step, self._clock())
+        if rate is not None:
+            raise SafetyRefusal(
+                "stage",
+                f"lighting step {step.index} ({step.kind})",
+                expected=f"flashes slower than {SLOWEST_HZ:g} or faster than {FASTEST_HZ:g} Hz: "
+                "no consent is armed",
+                received=f"{rate:.1f} Hz",
+                todo=f"Set rate_hz to {SLOW_HZ:g} in the plan, or record consent and arm it.",
+            )

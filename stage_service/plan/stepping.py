@@ -1,0 +1,128 @@
+"""Who clocks the steps, the service or the trigger box, and how long that takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+from reconstruction.capture.folder import Step
+from stage_service.config import DevicesConfig, RigFile
+
+Stepping = Literal["software", "hardware"]
+
+LATENCY_S = 0.002
+"""Time that the command, the confirmation and the pulse of a software-stepped step take."""
+UPLOAD_S = 0.05
+"""Time that arming, uploading and starting a hardware-stepped run takes."""
+SHORTEST_RUN = 8
+"""Steps below which uploading a table takes longer than it saves."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Consecutive steps that are clocked alike; in hardware they share one exposure time."""
+
+    steps: tuple[Step, ...]
+    stepping: Stepping
+
+
+def runs(
+    steps: tuple[Step, ...], rig_file: RigFile, asked: Literal["auto", "software", "hardware"]
+) -> tuple[list[Run], str]:
+    """Divide the steps of a plan into runs, and say why they are clocked as they are.
+
+    A hardware-stepped run is never longer than what the cameras hold unread: the box cannot wait
+    for a slow link or disk, so the sequence waits between runs and no frame is dropped. Lamps of a
+    bank without a sequence table are lit by the service.
+    """
+    devices = rig_file.devices
+    why = ""
+    if asked == "software":
+        why = "the plan asks for it"
+    elif devices is None or not devices.hardware_stepping:
+        why = "the rig file does not say that the trigger box's gates are wired (hardware_stepping)"
+    elif devices.cameras.buffers < SHORTEST_RUN:
+        why = f"the cameras hold only {devices.cameras.buffers} frames unread"
+    if why:
+        return [Run(steps, "software")], why
+    assert devices is not None
+    out: list[Run] = []
+    gated = devices.lights.sequences
+
+    def alike(step: Step) -> tuple[float, bool]:
+        return step.exposure, gated or step.kind not in ("olat", "all_on")
+
+    for (_, by_box), group in groupby(steps, key=alike):
+        own = tuple(group)
+        size = devices.cameras.buffers
+        for i in range(0, len(own), size):
+            part = own[i : i + size]
+            stepping: Stepping = "hardware" if by_box and len(part) >= SHORTEST_RUN else "software"
+            if out and out[-1].stepping == stepping == "software":
+                part = out.pop().steps + part
+            out.append(Run(part, stepping))
+    clocked = sum(len(r.steps) for r in out if r.stepping == "hardware")
+    lamps = "" if gated else "; the light bank has no sequence table, so the service lights lamps"
+    if clocked == 0:
+        return out, f"no {SHORTEST_RUN} steps in a row share an exposure time{lamps}"
+    return out, f"the trigger box clocks {clocked} of {len(steps)} steps{lamps}"
+
+
+def period_s(step: Step, devices: DevicesConfig, rate_hz: float | None) -> float:
+    """Seconds from one hardware-stepped step to the next: the sensor is read before the next."""
+    light = devices.lights.settle_s + step.exposure
+    return max(light + devices.cameras.readout_s, 1 / rate_hz if rate_hz else 0.0)
+
+
+def seconds_by_cause(
+    parts: list[Run],
+    rig_file: RigFile,
+    *,
+    wire_bytes: int,
+    folder_bytes: int,
+    rate_hz: float | None = None,
+) -> dict[str, float]:
+    """Predicted seconds by cause; `wire_bytes` and `folder_bytes` are those of one step.
+
+    Software-stepped, a step's frames are read before the next step begins. Hardware-stepped, they
+    are read while the box goes on: only what link lags behind counts. Writing goes on beside all.
+    """
+    devices = rig_file.devices
+    causes = dict.fromkeys(
+        ("exposure", "settle", "readout", "link", "latency", "rate limit", "storage"), 0.0
+    )
+    steps = [s for r in parts for s in r.steps]
+    causes["exposure"] = sum(s.exposure for s in steps)
+    if devices is None:
+        causes["latency"] = len(steps) * LATENCY_S
+    else:
+        causes["settle"] = len(steps) * devices.lights.settle_s
+        causes["readout"] = len(steps) * devices.cameras.readout_s
+        link = wire_bytes / devices.cameras.bytes_per_s
+        for run in parts:
+            own = [
+                s.exposure + devices.lights.settle_s + devices.cameras.readout_s for s in run.steps
+            ]
+            n, shooting = len(own), sum(own)
+            if run.stepping == "hardware":
+                causes["latency"] += UPLOAD_S
+                waiting = sum(period_s(s, devices, rate_hz) for s in run.steps) - shooting
+                causes["rate limit"] += waiting
+                causes["link"] += max(0.0, n * link - shooting - waiting)
+            else:
+                causes["latency"] += n * LATENCY_S
+                causes["link"] += n * link
+                if rate_hz:
+                    busy = (t + LATENCY_S + link for t in own)
+                    causes["rate limit"] += sum(max(0.0, 1 / rate_hz - t) for t in busy)
+    writing = len(steps) * folder_bytes / rig_file.capture.storage_bytes_per_s
+    causes["storage"] = max(0.0, writing - sum(causes.values()))
+    return causes
+
+
+def limited_by(causes: dict[str, float]) -> str:
+    """What limits the rate most, in a few words."""
+    cause, seconds = max(causes.items(), key=lambda item: item[1])
+    share = seconds / max(sum(causes.values()), 1e-12)
+    return f"{cause}: {share:.0%} of the time"

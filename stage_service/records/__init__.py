@@ -1,0 +1,1 @@
+"""Who did what: audit, events, leases."""

@@ -1,0 +1,106 @@
+"""Stiff and extreme cases: the fit ends by itself, never with a NaN, never worse than its start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering.batches import Batch
+from appearance.inverse_rendering.loop import Stage1Options, run
+from appearance.inverse_rendering.problem import Effort, Problem
+from appearance.inverse_rendering.unknowns import Lamps
+from appearance.scene.hair_appearance import HairAppearance
+
+START = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
+FEW = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=5)
+OPTIONS = Stage1Options(row="original", steps=4, check_every=2, watched_views=1, effort=FEW)
+
+
+def check(problem: Problem, start: HairMaps, options: Stage1Options = OPTIONS) -> HairMaps:
+    found = run(problem, start, options=options)
+    assert np.isfinite([found.error, found.start_error]).all()
+    assert found.error <= found.start_error
+    assert np.isfinite(found.maps.sigma_a).all()
+    assert found.ended
+    return found.maps
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        HairAppearance((6.0, 9.0, 15.0), 0.25, 0.3),
+        HairAppearance((0.001, 0.002, 0.008), 0.25, 0.3),
+    ],
+    ids=["black hair", "white hair"],
+)
+def test_black_and_white_hair(tufted, truth):
+    check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START))
+
+
+@pytest.mark.parametrize("beta_m", [0.02, 0.9])
+def test_a_roughness_that_starts_at_either_end(plain, beta_m):
+    check(plain, HairMaps.of(replace(START, beta_m=beta_m)))
+
+
+def test_one_light_and_one_view(tufted):
+    lone = tufted.problem(views=1, lights=tufted.dome(8)[1:2])
+    check(lone, HairMaps.of(START), replace(OPTIONS, row="lights", shape=(2, 2, 2)))
+
+
+def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain):
+    views = []
+    for o in plain.views:
+        bright = o.radiance.max(axis=-1) > np.percentile(o.radiance, 95)
+        radiance = np.where(bright[..., None], 1e9, o.radiance).astype(np.float32)
+        views.append(replace(o, radiance=radiance, valid=~bright))
+    check(Problem(plain.mapped, views, plain.scale, plain.skin), HairMaps.of(START))
+
+
+def test_a_cell_that_no_ray_meets_stays_at_its_prior(tufted, plain):
+    # the cells beyond the last strand's column hold no strand
+    uv = tufted.mapped.root_uv * [0.4, 1.0]
+    mapped = type(tufted.mapped).of(tufted.scene, tufted.strands, uv)
+    problem = Problem(mapped, plain.views, plain.scale, plain.skin)
+    start = HairMaps.of(START, (2, 2, 1))
+    options = replace(OPTIONS, row="correctives", shape=(2, 2, 1), steps=6)
+    found = run(problem, start, options=options).maps
+    np.testing.assert_allclose(found.sigma_a[:, 1], START.sigma_a[0], rtol=1e-3)
+    assert (np.abs(found.rotation[:, 1]) < 1e-6).all()
+
+
+def test_gradients_at_no_rotation_are_finite_and_not_all_zero(plain):
+    raw = plain.raw_of(HairMaps.of(START, (2, 2, 2)), Lamps.calibrated(8))
+    slope = plain.slope(
+        raw,
+        np.ones(8),
+        ("rotation", "position", "turn", "profile"),
+        Batch(0, np.arange(8), np.ones(8) / 8),
+        FEW,
+        (1, 2),
+        np.random.default_rng(0),
+        lambdas=(0.5, 10.0),
+    )
+    assert all(np.isfinite(g).all() for g in slope.gradient.values())
+    assert np.abs(slope.gradient["rotation"]).max() > 0
+    assert np.abs(slope.gradient["position"]).max() > 0
+
+
+def test_lamps_at_a_third_of_the_distance(tufted):
+    near = tufted.problem(views=1, lights=tufted.dome(8, 0.33))
+    check(near, HairMaps.of(START), replace(OPTIONS, row="lights", shape=(2, 2, 2)))
+
+
+def test_a_constant_image_is_fitted_as_far_as_it_goes(plain):
+    views = [replace(o, radiance=np.full_like(o.radiance, 0.5 / plain.scale)) for o in plain.views]
+    check(Problem(plain.mapped, views, plain.scale, plain.skin), HairMaps.of(START))
+
+
+def test_black_frames_end_the_fit_at_once_with_the_reason(plain):
+    views = [replace(o, radiance=np.zeros_like(o.radiance)) for o in plain.views]
+    start = HairMaps.of(START)
+    found = run(Problem(plain.mapped, views, 1.0, plain.skin), start, options=OPTIONS)
+    assert (found.ended, found.steps) == ("no pair of camera and light shows lit hair", 0)
+    assert found.maps is start

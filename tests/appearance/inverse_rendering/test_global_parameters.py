@@ -1,0 +1,97 @@
+"""Numbers that all hair shares, found from pictures: near and far, and where nothing tells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering.batches import Pairs
+from appearance.inverse_rendering.global_parameters import solved
+from appearance.inverse_rendering.problem import Effort, Problem
+from appearance.inverse_rendering.unknowns import Lamps, maps_of
+from appearance.scene.hair_appearance import HairAppearance
+
+COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
+EFFORT = Effort(pixels=100, spp=64, max_depth=6)
+
+
+def solve(problem: Problem, hair: HairAppearance, names=COLOUR, effort: Effort = EFFORT):
+    raw = problem.raw_of(HairMaps.of(hair), Lamps.calibrated(len(problem.lights)))
+    pairs = problem.spread(Pairs(problem.views, problem.scale), 2, 8)
+    found, gain = solved(problem, raw, np.ones(len(problem.lights)), names, pairs, effort, seed=3)
+    return raw, found, maps_of(found), gain
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        HairAppearance((0.2, 0.2, 0.2), 0.4, 0.2, eta=1.45),
+        HairAppearance((0.2, 0.2, 0.2), 0.9, 0.9),
+    ],
+    ids=["near", "far"],
+)
+def test_all_are_found_together(plain, tufted, start):
+    _, _, maps, _ = solve(plain, start)
+    truth = tufted.truth
+    assert maps.beta_m == pytest.approx(truth.beta_m, rel=0.08)
+    assert maps.beta_n == pytest.approx(truth.beta_n, rel=0.4)
+    assert maps.eta == pytest.approx(truth.eta, abs=0.08)
+    np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.25)
+
+
+@pytest.mark.parametrize(("beta_m", "beta_n"), [(0.05, 0.3), (0.7, 0.7)])
+def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
+    truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
+    problem = tufted.problem(HairMaps.of(truth), spp=512)
+    _, _, maps, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3))
+    assert maps.beta_m == pytest.approx(beta_m, rel=0.25)
+    assert maps.beta_n == pytest.approx(beta_n, rel=0.4)
+    np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.25)
+
+
+def test_intensities_are_found_and_their_mean_is_kept(tufted):
+    plain = tufted.problem(spp=2048)
+    off = np.exp(0.06 * np.array([1, -1, 1, -1, 1, -1, 1, -1]))
+    lights = [replace(x, intensity=x.intensity * f) for x, f in zip(plain.lights, off, strict=True)]
+    views = [replace(o, lights=tuple(lights)) for o in plain.views]
+    problem = Problem(plain.mapped, views, plain.scale, plain.skin)
+    many = replace(EFFORT, spp=256)
+    _, _, _, gain = solve(problem, tufted.truth, (*COLOUR, "gain"), many)
+    assert np.log(gain).mean() == pytest.approx(0, abs=1e-9)
+    assert np.std(np.log(gain * off)) < 0.5 * np.std(np.log(off))
+
+
+def test_only_what_is_named_moves(plain, tufted):
+    raw, found, _, gain = solve(plain, replace(tufted.truth, beta_m=0.3), ("beta_m",))
+    assert found["beta_m"] != raw["beta_m"]
+    assert all((found[name] == raw[name]).all() for name in raw if name != "beta_m")
+    assert (gain == 1).all()
+
+
+def test_the_same_seed_gives_the_same_numbers(plain, tufted):
+    few = replace(EFFORT, spp=8)
+    one, other = (solve(plain, tufted.truth, effort=few)[1] for _ in range(2))
+    assert all((one[name] == other[name]).all() for name in one)
+
+
+def test_what_no_pixel_tells_stays(plain, tufted):
+    views = [replace(o, valid=np.zeros_like(o.valid)) for o in plain.views]
+    problem = Problem(plain.mapped, views, plain.scale, plain.skin)
+    raw = problem.raw_of(HairMaps.of(tufted.truth), Lamps.calibrated(8))
+    pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
+    found, gain = solved(problem, raw, np.ones(8), COLOUR, pairs, replace(EFFORT, spp=8))
+    for name, value in raw.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-12)
+    assert (gain == 1).all()
+
+
+def test_a_frame_that_is_not_a_number_changes_nothing(plain, tufted):
+    views = [replace(o, radiance=np.full_like(o.radiance, np.nan)) for o in plain.views]
+    problem = Problem(plain.mapped, views, plain.scale, plain.skin)
+    raw = problem.raw_of(HairMaps.of(tufted.truth), Lamps.calibrated(8))
+    pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
+    found, _ = solved(problem, raw, np.ones(8), COLOUR, pairs, replace(EFFORT, spp=8))
+    assert all((found[name] == raw[name]).all() for name in raw)

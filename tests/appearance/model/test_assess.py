@@ -1,0 +1,185 @@
+"""Held-out images, their baselines and the pictures, on a small capture of known appearance."""
+
+import cv2
+import numpy as np
+import pytest
+
+from appearance.metrics.pictures import comparison_picture
+from appearance.metrics.scores import Exposure
+from appearance.model.assess import AssessOptions, assess, judge, three_nearest
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.model.relight import relight_model, three_quarter_view
+from appearance.observations import HeldOut
+from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat
+from appearance.render.smoothed import olat_smoothed, smoothed
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import build_scene
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.writer import CaptureWriter
+from reconstruction.files.exr import read_exr
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from reconstruction.report.report import Report, Stage
+
+TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.2, 0.2)
+HELD_OUT = HeldOut(("cam_2",), ("l4", "l7"))
+OPTIONS = AssessOptions(
+    cameras=2, lights=3, spp=64, baseline_pixels=60, baseline_lights=8, relit_size=32, relit_spp=4
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A wisp of fibres before three cameras of 24² under 24 lights, and its model: the truth."""
+    folder = tmp_path_factory.mktemp("assess")
+    rng = np.random.default_rng(3)
+    n = 500
+    roots = np.stack(
+        [rng.uniform(-0.03, 0.03, n), rng.uniform(-0.01, 0.01, n), np.full(n, 0.05)], axis=1
+    )
+    lean = rng.normal(scale=0.05, size=(n, 3)) * [1, 1, 0] + [0, 0, -1]
+    t = np.linspace(0, 0.1, 6)
+    points = (roots[:, None] + t[None, :, None] * lean[:, None]).reshape(-1, 3)
+    strands = Strands(points.astype(np.float32), np.arange(n + 1) * 6, 4e-4)
+    cameras = tuple(
+        Camera.look_at(f"cam_{i}", 24, 24, (x, -0.6, 0.0), (0, 0, 0), 9.0)
+        for i, x in enumerate((-0.2, 0.2, 0.05))
+    )
+    lights = tuple(
+        Light(f"l{i}", p, np.full(3, 5.0)) for i, p in enumerate(dome_positions(24, 1.0, -60.0))
+    )
+    scene = build_scene(strands, None, hair=TRUTH)
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights)]
+    writer = CaptureWriter.create(
+        folder / "capture", Rig("wisp", cameras, lights), {"steps": [s.to_dict() for s in steps]}
+    )
+    model = folder / "model"
+    (model / "masks").mkdir(parents=True)
+    write_strands(model / "strands.npz", strands)
+    bright = []
+    for camera in cameras:
+        images = render_olat(scene, camera, lights, spp=256, seed=7)
+        for step, image in zip(steps, images, strict=True):
+            writer.write_frame(step, camera.name, image, pulse=1, block_id=1, timestamp=0.0)
+        mask = coverage(scene, camera)["hair"] > 0.5
+        bright.append(images[:, mask])
+        cv2.imwrite(str(model / "masks" / f"{camera.name}_hair.png"), mask.astype(np.uint8) * 255)
+    writer.finish("completed", {})
+    exposure = Exposure.of(bright)
+    FittedAppearance(TRUTH, (0.1,) * 3, (0.3,) * 3, exposure, 0.1, 0.1, 0.1).save(model)
+    return Capture(folder / "capture"), model, scene
+
+
+@pytest.fixture(scope="module")
+def result(made):
+    capture, model, _ = made
+    return assess(capture, model, held_out=HELD_OUT, options=OPTIONS)
+
+
+def test_the_true_model_beats_the_trivial_baselines(result):
+    for group in ("held_out_lights", "held_out_camera"):
+        rows = result[group]
+        assert set(rows) == {"ours", "mean_colour", "diffuse", "three_nearest"}
+        for baseline in ("mean_colour", "diffuse"):
+            assert rows["ours"]["psnr"] > rows[baseline]["psnr"] + 2
+            assert rows["ours"]["ssim"] > rows[baseline]["ssim"] + 0.05
+            assert rows["ours"]["relative_error"] < 0.5 * rows[baseline]["relative_error"]
+    assert "HAIRSTAGE_LPIPS" in result["lpips"]
+
+
+def test_pictures_and_report_are_left_in_the_model(made, result):
+    _, model, _ = made
+    stage = Report.load(model / "report.json")["images"]
+    assert stage.figures["held_out_lights"] == result["held_out_lights"]
+    assert not stage.warnings
+    comparison = cv2.imread(str(model / "comparison.png"))
+    assert comparison.shape[1] > comparison.shape[0] / 2 > 200
+    relit, _ = read_exr(model / "relit.exr")
+    picture = cv2.imread(str(model / "relit.png"))
+    assert picture.shape == relit.shape == (32, 32, 3)
+    assert (relit > 0).any()
+    assert picture.max() == 255
+
+
+def test_a_baseline_that_is_not_beaten_is_warned_of():
+    stage = Stage("images")
+    good, bad = {"psnr": 20.0, "ssim": 0.5}, {"psnr": 10.0, "ssim": 0.6}
+    judge({"held_out_lights": {"ours": good, "mean_colour": bad, "diffuse": good}}, stage)
+    assert [w.split("baseline ")[1] for w in stage.warnings] == [
+        "mean_colour is not beaten in ssim",
+        "diffuse is not beaten in psnr",
+        "diffuse is not beaten in ssim",
+    ]
+
+
+def test_a_group_with_nothing_held_out_is_left_out(made):
+    capture, model, _ = made
+    found = assess(capture, model, held_out=HeldOut((), ("l4",)), options=OPTIONS)
+    assert "held_out_lights" in found
+    assert "held_out_camera" not in found
+
+
+def test_three_nearest_lights_are_training_lights(made):
+    capture, _, _ = made
+    light = capture.rig.light("l4")
+    mixed = three_nearest(capture, "cam_0", light, HELD_OUT)
+    positions = {x.name: x.position @ light.position for x in capture.rig.lights}
+    nearest = sorted(set(positions) - {"l4", "l7"}, key=lambda n: -positions[n])[:3]
+    frames = capture.olat("cam_0", nearest)
+    weights = 1 / np.arccos([positions[n] for n in nearest])
+    want = np.tensordot(weights / weights.sum(), frames, 1)
+    np.testing.assert_allclose(mixed, want, rtol=1e-5)
+
+
+def test_smoothing_keeps_the_mean_and_takes_the_noise(made):
+    capture, _, scene = made
+    camera, lights = capture.rig.cameras[0], [capture.rig.light("l4")]
+    mask = coverage(scene, camera)["hair"] > 0.5
+    reference = capture.olat("cam_0", ["l4"])[0]
+    plain = render_olat(scene, camera, lights, spp=9, thrift=0, seed=3)[0]
+    smooth = olat_smoothed(scene, camera, lights, spp=9, seed=3)[0]
+    # light is handed on by share of the pixels, so that a little crosses the mask's edge
+    assert smooth[mask].mean() == pytest.approx(plain[mask].mean(), rel=0.1)
+    error = [np.sqrt(np.mean((x[mask] - reference[mask]) ** 2)) for x in (plain, smooth)]
+    assert error[1] < 0.85 * error[0]
+
+
+def test_smoothing_does_not_cross_from_hair_to_head():
+    share = {k: np.zeros((16, 16), np.float32) for k in ("hair", "head")}
+    share["hair"][:, :8], share["head"][:, 8:] = 1, 1
+    images = np.zeros((1, 16, 16, 3), np.float32)
+    images[:, :, :8] = 2.0
+    out = smoothed(images, share, 1.5)
+    np.testing.assert_allclose(out, images, rtol=1e-5)
+    with pytest.raises(ValueError, match="sigma"):
+        smoothed(images, share, 0.0)
+
+
+def test_smoothing_leaves_no_blot_where_a_rare_path_hit():
+    share = {"hair": np.ones((33, 33), np.float32), "head": np.zeros((33, 33), np.float32)}
+    images = np.ones((1, 33, 33, 3), np.float32)
+    images[0, 16, 16] = 400.0
+    out = smoothed(images, share, 1.0)[0, ..., 0]
+    assert out.max() < 0.2 * 400 / (2 * np.pi)  # a blot of one Gaussian would peak at 64
+    assert out.sum() == pytest.approx(images[0, ..., 0].sum(), rel=0.1)
+
+
+def test_relighting_names_and_views(made):
+    capture, model, _ = made
+    assert capture.head is None
+    strands = Strands.from_list([np.array([[0, 0, 0.1], [0, 0.1, 0], [0.1, 0, 0]])])
+    view = three_quarter_view(strands, 64)
+    pixels, depth = view.project(strands.points)
+    assert view.inside(pixels).all()
+    assert (depth > 0).all()
+    with pytest.raises((ValueError, FileNotFoundError), match="nowhere"):
+        relight_model(model, None, environment="nowhere.hdr", size=16, spp=1)
+
+
+def test_nothing_held_out_is_an_error_that_says_so(tmp_path):
+    with pytest.raises(ValueError, match="held out"):
+        comparison_picture(tmp_path / "x.png", [], ("captured",))

@@ -1,0 +1,153 @@
+"""What is done with fitted maps: edits, moved strands, exports that others open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.bsdf.maps import HairMaps
+from appearance.bsdf.parameters import Place
+from appearance.metrics.scores import Exposure
+from appearance.model.edit import recoloured, wisp_of
+from appearance.model.export import at_points, export_maps, export_mitsuba, export_usd
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.model.fitted_model import FittedModel
+from appearance.render.environment import render_environment
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import HairAppearance
+from reconstruction.files.exr import read_exr
+from reconstruction.files.strands import read_strands, write_strands
+from reconstruction.geometry.cameras import Camera
+
+HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
+CAMERA = Camera.look_at("c", 16, 16, (0, -0.5, 0.1), (0, 0, 0.0), 12)
+
+
+@pytest.fixture(scope="module")
+def model(tufted, tmp_path_factory):
+    """A model folder whose hair is darker at the tips, and half of it red."""
+    folder = tmp_path_factory.mktemp("model")
+    base = HairMaps.of(HAIR, (3, 4, 4))
+    sigma_a = base.sigma_a * np.array([0.5, 1.0, 2.0])[:, None, None, None]
+    half = np.zeros((4, 4))
+    half[:2] = 1
+    maps = recoloured(replace(base, sigma_a=sigma_a), half, (0.02, 1.0, 1.2))
+    write_strands(folder / "strands.npz", tufted.strands)
+    maps.save(folder / "hair_maps.npz", tufted.mapped.root_uv)
+    skin = (0.3, 0.2, 0.1)
+    FittedAppearance(HAIR, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(model):
+    return FittedModel.load(model, None)
+
+
+def test_a_brush_colours_its_wisp_and_nothing_else(fitted):
+    uv = fitted.root_uv
+    left = np.flatnonzero(uv[:, 0] < 0.5)
+    brush = wisp_of(left, uv, (4, 4))
+    np.testing.assert_allclose(brush[:2][brush[:2] > 0], 1)
+    assert (brush[2:] == 0).all()
+    dyed = recoloured(fitted.maps, brush, (3.0, 0.1, 0.1), along=(0.5, 1.0))
+    changed = (dyed.sigma_a != fitted.maps.sigma_a).any(axis=(2, 3))
+    assert changed.tolist() == [[False] * 4, [True, True, False, False], [True, True, False, False]]
+    np.testing.assert_allclose(
+        dyed.sigma_a[2, 0, brush[0] == 1], [[3.0, 0.1, 0.1]] * int((brush[0] == 1).sum())
+    )
+    assert recoloured(HairMaps.of(HAIR), brush, (1, 1, 1)).shape == (1, 4, 4)
+    soft = wisp_of(left, uv, (4, 4), soft=1.0)
+    assert 0 < soft[2].max() < 1
+    with pytest.raises(ValueError, match="brush"):
+        recoloured(fitted.maps, brush + 1, (1, 1, 1))
+    with pytest.raises(ValueError, match="sigma_a"):
+        recoloured(fitted.maps, brush, (-1, 1, 1))
+
+
+def test_dyed_and_smoother_hair_is_so_in_every_light(fitted, small):
+    import mitsuba as mi
+
+    darker = recoloured(fitted.maps, np.ones((1, 1)), (5.0, 5.0, 5.0))
+    lamps = small.lamps()[:1]
+    pictures = [
+        render_olat(fitted.scene(m), CAMERA, lamps, spp=16, max_depth=4) for m in (None, darker)
+    ]
+    assert pictures[1].mean() < 0.7 * pictures[0].mean()
+    smoother = mi.traverse(fitted.scene(replace(fitted.maps, beta_m=0.1)).hair_bsdf)
+    assert smoother["longitudinal_roughness"][0] == pytest.approx(0.1)
+    sky = np.ones((4, 8, 3), np.float32)
+    assert render_environment(fitted.scene(), CAMERA, sky, spp=4, max_depth=4).max() > 0.1
+
+
+def test_maps_stay_on_strands_that_move_and_other_strands_are_refused(fitted, small):
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    moved = fitted.strands.transformed(turn, (0, 0, 0))
+    camera = Camera.look_at("m", 16, 16, turn @ (0, -0.5, 0.1), (0, 0, 0), 12)
+    lamp = replace(small.lamps()[0], position=turn @ small.lamps()[0].position)
+    still = render_olat(fitted.scene(), CAMERA, small.lamps()[:1], spp=64, max_depth=3)
+    turned = render_olat(fitted.scene(strands=moved), camera, [lamp], spp=64, max_depth=3)
+    np.testing.assert_allclose(turned.mean((1, 2)), still.mean((1, 2)), rtol=0.05)
+    with pytest.raises(ValueError, match="same numbers of points"):
+        fitted.scene(strands=small.tuft(5))
+
+
+def test_maps_are_exported_as_layers_that_read_back(fitted, tmp_path):
+    files = export_maps(fitted.maps, tmp_path)
+    assert [f.name for f in files[:3]] == ["sigma_a_00.exr", "sigma_a_01.exr", "sigma_a_02.exr"]
+    image, _ = read_exr(tmp_path / "sigma_a_01.exr")
+    np.testing.assert_allclose(image, fitted.maps.sigma_a[1].transpose(1, 0, 2), rtol=1e-6)
+    assert "beta_m" in (tmp_path / "maps.json").read_text()
+
+
+def test_stock_mitsuba_opens_the_scene_and_sees_about_our_picture(fitted, tmp_path):
+    import mitsuba as mi
+
+    scene = mi.load_file(str(export_mitsuba(fitted, tmp_path, CAMERA, spp=64)))
+    path = mi.load_dict({"type": "path", "max_depth": 16, "hide_emitters": True})
+    stock = np.array(mi.render(scene, integrator=path, seed=0))[..., :3]
+    sky = np.ones((4, 8, 3), np.float32)
+    ours = render_environment(fitted.scene(), CAMERA, sky, spp=64, max_depth=15)
+    np.testing.assert_allclose(stock.mean((0, 1)), ours.mean((0, 1)), rtol=0.35)
+    columns = [x.mean((0, 2)) for x in (stock, ours)]
+    assert np.corrcoef(columns)[0, 1] > 0.9
+
+
+def test_usd_has_the_maps_as_attributes(fitted, tmp_path):
+    from pxr import Usd, UsdGeom
+
+    export_usd(fitted, tmp_path / "hair.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "hair.usdc"))
+    api = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim())
+    sigma_a, _ = at_points(fitted.maps, fitted.strands, fitted.root_uv)
+    found = np.array(api.GetPrimvar("sigma_a").Get())
+    np.testing.assert_allclose(found, sigma_a, rtol=1e-5)
+    assert api.GetPrimvar("scalp_uv").GetInterpolation() == "uniform"
+    assert api.GetPrimvar("beta_m").Get() == pytest.approx(HAIR.beta_m)
+    assert len(read_strands(tmp_path / "hair.usdc")) == len(fitted.strands)
+
+
+def test_values_at_points_are_those_that_the_bsdf_looks_up(fitted):
+    import drjit as dr
+    import mitsuba as mi
+
+    scene = fitted.scene()
+    table = mi.TensorXf(fitted.maps.sigma_a.astype(np.float32))
+    strands = fitted.strands
+    segments = len(strands.points) - len(strands)
+    si = dr.zeros(mi.SurfaceInteraction3f, segments)
+    si.prim_index = dr.arange(mi.UInt32, segments)
+    si.p = mi.Point3f(100 * strands.points[strands.segment_starts].T)
+    place = Place(mapped_of(fitted, scene), si, mi.Bool(True))
+    looked_up = np.array(place.cell(table, mi.Vector3f)).T
+    expected, _ = at_points(fitted.maps, strands, fitted.root_uv)
+    off = np.abs(looked_up - expected[strands.segment_starts]).max(axis=1)
+    assert np.mean(off < 2e-3) > 0.99  # the others are of strands that were respaced for the spline
+
+
+def mapped_of(fitted, scene):
+    from appearance.bsdf.maps import MappedStrands
+
+    return MappedStrands.of(scene, fitted.strands, fitted.root_uv).coordinates

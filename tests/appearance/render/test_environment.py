@@ -1,0 +1,139 @@
+"""Environment maps: absolute radiance, orientation, readers."""
+
+import cv2
+import numpy as np
+import pytest
+
+from appearance.render.environment import render_environment
+from appearance.render.environment_maps import load_environment, sky, studio
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import build_scene
+from reconstruction.files.exr import write_exr
+from reconstruction.geometry.cameras import Camera
+
+HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
+ALBEDO = (0.5, 0.25, 0.8)
+TILT = np.array([0.01, 0.02, 0.01])  # off the axis, where a map has an edge or a pole
+
+
+@pytest.fixture(scope="module")
+def ball(small):
+    return build_scene(small.no_hair, small.ball(), hair=HAIR, skin=ALBEDO)
+
+
+def eye(direction, size=12, fov_deg=4.0):
+    return Camera.look_at("eye", size, size, 1.0 * np.array(direction), (0, 0, 0), fov_deg)
+
+
+def test_a_convex_body_in_a_uniform_world_shows_its_albedo(ball):
+    image = render_environment(ball, eye((0.3, -0.8, 0.2)), np.ones((8, 16, 3)), spp=256)
+    np.testing.assert_allclose(image.mean((0, 1)), ALBEDO, rtol=0.02)
+
+
+def test_clear_hair_in_a_uniform_world_vanishes(small):
+    """White furnace. What is missing is Mitsuba's hair sampler's loss and paths cut short."""
+    clear = HairAppearance((0.0, 0.0, 0.0), 0.3, 0.3)
+    scene = build_scene(small.tuft(60), None, hair=clear)
+    world = np.ones((8, 16, 3))
+    image = render_environment(scene, small.camera(), world, spp=256, max_depth=60, background=True)
+    assert image.mean() == pytest.approx(1, abs=0.015)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "axis"),
+    [
+        (0, 0, (0, 0, 1)),
+        (7, 0, (0, 0, -1)),
+        (4, 8, (1, 0, 0)),
+        (4, 0, (-1, 0, 0)),
+        (4, 12, (0, -1, 0)),
+    ],
+    ids=[
+        "top row is up",
+        "bottom row is down",
+        "middle is +x",
+        "edge is -x",
+        "right of middle is -y",
+    ],
+)
+def test_orientation(ball, row, column, axis):
+    """A lit patch of the map lights the side that faces it, and is seen in its direction."""
+    world = np.zeros((8, 16, 3))
+    if row in (0, 7):
+        world[row] = 1
+    else:
+        world[row - 1 : row + 1, [column - 1, column]] = 1
+    axis = np.array(axis, float)
+    facing = render_environment(ball, eye(axis + TILT), world, spp=64).mean()
+    turned = render_environment(ball, eye(-axis + TILT), world, spp=64).mean()
+    assert facing > 0.02
+    assert turned < 0.02 * facing
+    inside = Camera.look_at("inside", 4, 4, 5 * axis, 6 * axis + TILT, 5)
+    assert render_environment(ball, inside, world, spp=1, background=True).min() == 1
+
+
+def test_rotation_turns_the_map_counter_clockwise(ball):
+    world = np.zeros((8, 16, 3))
+    world[3:5, 7:9] = 1  # towards +x
+    lit = {
+        axis: render_environment(ball, eye(direction), world, spp=32, rotation_deg=90).mean()
+        for axis, direction in (("+y", (0.01, 1, 0)), ("+x", (1, 0.01, 0)), ("-y", (0, -1, 0)))
+    }
+    assert lit["+y"] > 4 * max(lit["+x"], lit["-y"])
+
+
+def test_same_seed_same_bytes(small):
+    scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
+    a, b, other = (
+        render_environment(scene, small.camera(), studio(16), spp=8, seed=s) for s in (3, 3, 4)
+    )
+    assert a.tobytes() == b.tobytes()
+    assert (a != other).any()
+
+
+def test_dark_worlds_are_dark(ball):
+    assert not render_environment(ball, eye((0, -1, 0)), np.zeros((4, 8, 3)), spp=4).any()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.1])
+def test_impossible_radiance_is_refused(ball, value):
+    world = np.ones((4, 8, 3))
+    world[2, 5, 1] = value
+    with pytest.raises(ValueError, match="1 values are not, the first at row 2, column 5"):
+        render_environment(ball, eye((0, -1, 0)), world)
+
+
+def test_maps_of_ones_own():
+    for world in (studio(32), sky(32)):
+        assert world.shape == (32, 64, 3)
+        assert np.isfinite(world).all()
+        assert world.min() >= 0
+        assert world.max() > 10 * world.mean()
+    theta = np.pi * (np.arange(64) + 0.5) / 64
+    sun = sky(64, sun_azimuth_deg=30.0, sun_elevation_deg=50.0)
+    row, column = np.unravel_index(sun.sum(-1).argmax(), sun.shape[:2])
+    assert 90 - np.degrees(theta[row]) == pytest.approx(50, abs=4)
+    assert 360 * (0.5 - (column + 0.5) / 128) == pytest.approx(30, abs=4)
+
+
+def test_reads_radiance_and_openexr(tmp_path):
+    world = np.random.default_rng(0).uniform(0.1, 30, (8, 16, 3)).astype(np.float32)
+    write_exr(tmp_path / "world.exr", world)
+    np.testing.assert_array_equal(load_environment(tmp_path / "world.exr"), world)
+    assert cv2.imwrite(str(tmp_path / "world.hdr"), world[..., ::-1])
+    shared_exponent = world.max(-1, keepdims=True) / 128
+    assert (np.abs(load_environment(tmp_path / "world.hdr") - world) <= shared_exponent).all()
+
+
+def test_files_that_are_no_maps_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"absent\.hdr: no such environment map"):
+        load_environment(tmp_path / "absent.hdr")
+    (tmp_path / "text.hdr").write_text("not an image")
+    with pytest.raises(ValueError, match=r"text\.hdr: cannot be read"):
+        load_environment(tmp_path / "text.hdr")
+    (tmp_path / "map.png").touch()
+    with pytest.raises(ValueError, match=r"must be \.hdr or \.exr"):
+        load_environment(tmp_path / "map.png")
+    write_exr(tmp_path / "negative.exr", np.full((4, 8, 3), -1.0))
+    with pytest.raises(ValueError, match=r"negative\.exr: radiance must be finite"):
+        load_environment(tmp_path / "negative.exr")

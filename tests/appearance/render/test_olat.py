@@ -1,0 +1,234 @@
+"""OLAT images against closed forms, Mitsuba's own path integrator, and Blender Cycles."""
+
+import json
+
+import numpy as np
+import pytest
+from benchmarks.path_reference import PathReference
+
+from appearance.render.coverage import covered_pixels
+from appearance.render.olat import olat_tiles, render_olat
+from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
+from appearance.scene.hair_scene import build_scene
+from reconstruction.files.exr import read_exr
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.strands import Strands
+
+HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
+
+
+@pytest.fixture(scope="module")
+def tufted(small):
+    """A tuft of hair on a plane, a camera, and lamps all around."""
+    return build_scene(small.tuft(), small.plane(), hair=HAIR), small.camera(), small.lamps()
+
+
+def test_lambertian_radiance_is_albedo_over_pi_times_irradiance(small):
+    albedo = np.array([0.35, 0.25, 0.2])
+    scene = build_scene(small.no_hair, small.plane(), hair=HAIR, skin=albedo)
+    camera = Camera.look_at("cam", 32, 24, (0.2, -0.4, 0.6), (0.02, 0.01, 0), 20, roll_deg=30)
+    light = Light("near", np.array([0.1, 0.15, 0.3]), np.array([8.0, 4.0, 2.0]))
+    image = render_olat(scene, camera, [light], spp=64, max_depth=3, thrift=0)[0]
+    column, row = np.meshgrid(np.arange(32), np.arange(24))
+    rays = camera.rays(np.stack([column, row], -1))
+    hit = camera.center - rays * (camera.center[2] / rays[..., 2])[..., None]
+    towards = light.position - hit
+    d2 = (towards**2).sum(-1)
+    expected = albedo / np.pi * light.intensity * (towards[..., 2] / d2**1.5)[..., None]
+    np.testing.assert_allclose(image, expected, rtol=3e-3)
+
+
+SPENDING = {
+    "defaults": {},
+    "all lights, all shadow rays": {"thrift": 0},
+    "few lights, few shadow rays": {"first_lights": 2, "deep_lights": 1, "thrift": 8},
+    "early roulette, small film": {"roulette": 2.0, "memory": 1 << 16},
+}
+
+
+@pytest.fixture(scope="module")
+def path_means(tufted):
+    """Means (4 runs, lights, 3) by Mitsuba's path, light by light."""
+    scene, camera, lights = tufted
+    path, pixels = PathReference(scene, max_depth=8), covered_pixels(scene, camera)
+    runs = [path.render(camera, lights, pixels, spp=128, seed=s).mean(1) for s in range(4)]
+    return np.array(runs, float)
+
+
+@pytest.mark.parametrize("how", SPENDING, ids=str)
+def test_agrees_with_mitsubas_path_however_rays_are_spent(tufted, path_means, how):
+    scene, camera, lights = tufted
+    pixels = covered_pixels(scene, camera)
+    ours = np.array(
+        [
+            render_olat(
+                scene, camera, lights, spp=128, max_depth=8, seed=s, pixels=pixels, **SPENDING[how]
+            ).mean(1)
+            for s in range(4)
+        ],
+        float,
+    )
+    ratio = ours.mean(0) / path_means.mean(0)
+    error = np.sqrt(
+        ours.var(0, ddof=1) / 4 / ours.mean(0) ** 2
+        + path_means.var(0, ddof=1) / 4 / path_means.mean(0) ** 2
+    )
+    assert error.max() < 0.02
+    # four runs make a rough error estimate: Student's t with about 6 degrees of freedom
+    assert (np.abs(ratio - 1) < np.maximum(5 * error, 0.01)).all()
+
+
+def test_diffuse_fibres_agree_with_mitsubas_path(tufted):
+    scene, camera, lights = tufted
+    scene = scene.with_hair(DiffuseHair((0.7, 0.5, 0.2)))
+    pixels = covered_pixels(scene, camera)
+    ours = render_olat(scene, camera, lights, spp=256, max_depth=6, pixels=pixels).mean(1)
+    path = PathReference(scene, max_depth=6).render(camera, lights, pixels, spp=128).mean(1)
+    np.testing.assert_allclose(ours, path, rtol=0.015)
+
+
+def test_memory_is_bounded_by_tiles_that_make_up_the_image(tufted):
+    scene, camera, lights = tufted
+    covered, memory = covered_pixels(scene, camera), 1 << 16
+    tiles = list(olat_tiles(scene, camera, lights, spp=4, seed=2, max_depth=4, memory=memory))
+    assert len(tiles) > 3
+    assert all(3 * radiance.nbytes < memory for _, radiance in tiles)
+    np.testing.assert_array_equal(np.sort(np.concatenate([index for index, _ in tiles])), covered)
+    image = render_olat(scene, camera, lights, spp=4, seed=2, max_depth=4, memory=memory)
+    for index, radiance in tiles:
+        np.testing.assert_array_equal(image.reshape(3, -1, 3)[:, index], radiance)
+
+
+def test_black_and_white_hair_stay_finite(tufted):
+    scene, camera, lights = tufted
+    black, white = (
+        render_olat(
+            scene.with_hair(HairAppearance((s, s, s), 0.3, 0.3)), camera, lights, spp=8, seed=1
+        )
+        for s in (1e4, 0.0)
+    )
+    assert np.isfinite(white).all()
+    assert np.isfinite(black).all()
+    assert 0 < black.mean() < white.mean()
+
+
+def test_a_camera_that_sees_nothing_gets_black_images(tufted):
+    scene, _, lights = tufted
+    away = Camera.look_at("away", 8, 6, (0, 0, 1.0), (0, 0, 2.0), 20)
+    image = render_olat(scene, away, lights)
+    assert image.shape == (3, 6, 8, 3)
+    assert not image.any()
+    assert not list(olat_tiles(scene, away, lights))
+
+
+def test_lights_superpose(tufted):
+    """Two lamps at one place are one lamp of their sum, path by path."""
+    scene, camera, lights = tufted
+    here = lights[0].position
+    parts = [Light("a", here, np.array([8.0, 1.0, 0.0])), Light("b", here, np.array([1, 2, 3.0]))]
+    whole = [Light("ab", here, np.array([9.0, 3.0, 3.0]))]
+    # an equal number of random draws keeps the paths the same: as many lights in both calls
+    two = render_olat(scene, camera, parts, spp=4, thrift=0, seed=5, max_depth=1)
+    one = render_olat(scene, camera, whole * 2, spp=4, thrift=0, seed=5, max_depth=1)
+    np.testing.assert_allclose(two.sum(0), one[0], rtol=1e-5, atol=1e-7)
+
+
+def test_radiance_is_linear_in_intensity(tufted):
+    scene, camera, lights = tufted
+    double = [Light(x.name, x.position, 2 * x.intensity) for x in lights]
+    np.testing.assert_allclose(
+        render_olat(scene, camera, double, spp=4, seed=5),
+        2 * render_olat(scene, camera, lights, spp=4, seed=5),
+        rtol=1e-5,
+    )
+
+
+def test_same_seed_same_bytes(tufted):
+    scene, camera, lights = tufted
+    a, b, other = (render_olat(scene, camera, lights, spp=8, seed=s) for s in (3, 3, 4))
+    assert a.tobytes() == b.tobytes()
+    assert (a != other).any()
+
+
+def test_a_moved_subject_is_a_moved_stage(small):
+    """Turning subject, camera and lamps together changes nothing but the noise's seed."""
+    angle = 0.7
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
+    )
+    shift = np.array([0.01, -0.02, 0.03])
+    strands, floor = small.tuft(), small.plane()
+    camera, lights = small.camera(), small.lamps()
+    moved = build_scene(strands.transformed(turn, shift), floor.transformed(turn, shift), hair=HAIR)
+    still = build_scene(strands, floor, hair=HAIR)
+    a = render_olat(moved, camera, lights, spp=64, max_depth=2).mean((1, 2))
+    b = render_olat(
+        still,
+        camera.moved(turn, shift),
+        [x.moved(turn, shift) for x in lights],
+        spp=64,
+        max_depth=2,
+    ).mean((1, 2))
+    np.testing.assert_allclose(a, b, rtol=0.02)
+
+
+def test_only_the_pixels_asked_for(tufted):
+    scene, camera, lights = tufted
+    pixels = np.array([300, 5, 301])
+    some = render_olat(scene, camera, lights, spp=8, pixels=pixels)
+    assert some.shape == (3, 3, 3)
+    assert render_olat(scene, camera, [], spp=8, pixels=pixels).shape == (0, 3, 3)
+    pixels = np.arange(6, 24 * 24, 4)
+    whole = render_olat(scene, camera, lights, spp=64, max_depth=1).reshape(3, -1, 3)
+    part = render_olat(scene, camera, lights, spp=64, max_depth=1, pixels=pixels)
+    np.testing.assert_allclose(part.mean(1), whole[:, pixels].mean(1), rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"spp": 0}, {"max_depth": 0}, {"deep_lights": 0}, {"thrift": -1}, {"pixels": [-1]}],
+    ids=str,
+)
+def test_bad_arguments_are_refused(tufted, wrong):
+    scene, camera, lights = tufted
+    with pytest.raises(ValueError, match=r"must be"):
+        render_olat(scene, camera, lights, **wrong)
+
+
+def test_agrees_with_blender_cycles(shared_data, small):
+    """Another renderer's capture: mean radiance over the subject, by channel and by light."""
+    folder = shared_data("captures/cycles_wavy")
+    truth = np.load(folder / "strands_gt.npz")
+    params = json.loads((folder / "params.json").read_text())
+    strands = Strands(truth["points"], truth["offsets"], float(truth["radius"]))
+    hair = HairAppearance(
+        tuple(params["sigma_a"]),
+        params["beta_m"],
+        params["beta_n"],
+        params["ior"],
+        params["tilt_deg"],
+    )
+    head = small.ball(tuple(truth["head_axes"]), rows=64)
+    scene = build_scene(strands, head, hair=hair, skin=params["head_albedo"])
+    lights = [
+        Light(str(x["id"]), x["position"], x["intensity"])
+        for x in json.loads((folder / "lights.json").read_text())["lights"]
+    ]
+    ratios = []
+    for c in json.loads((folder / "cameras.json").read_text())["cameras"][:3:2]:
+        camera = Camera(str(c["id"]), c["width"], c["height"], c["K"], c["R"], c["t"])
+        pixels = covered_pixels(scene, camera)[::6]
+        ours = render_olat(scene, camera, lights, spp=64, max_depth=48, pixels=pixels)
+        theirs = np.array(
+            [
+                read_exr(folder / f"images/cam_{c['id']:02d}/light_{i:02d}.exr")[0].reshape(-1, 3)[
+                    pixels
+                ]
+                for i in range(len(lights))
+            ]
+        )
+        ratios.append(ours.mean(1) / theirs.mean(1))
+    by_channel = np.mean(ratios, axis=(0, 1))
+    np.testing.assert_allclose(by_channel, 1, atol=0.03)
+    np.testing.assert_allclose(ratios, 1, atol=0.12)

@@ -1,0 +1,98 @@
+"""What is said where no back end can run: before Mitsuba is imported and Dr.Jit aborts."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appearance.scene.backend import BackendError, ensure_backend, find_libllvm
+from reconstruction.array_backend import for_kernels
+
+
+def test_an_old_libllvm_is_refused_with_what_to_install(tmp_path, monkeypatch):
+    old = tmp_path / "libLLVM-15.so"
+    old.touch()
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(old))
+    with pytest.raises(BackendError, match=r"libLLVM-15\.so \(LLVM 15\).*libllvm19"):
+        find_libllvm()
+
+
+def test_an_absent_library_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "libLLVM-19.so"))
+    with pytest.raises(BackendError, match="apt-get install libllvm19"):
+        find_libllvm()
+
+
+def test_a_newer_name_that_does_not_load_is_refused(tmp_path, monkeypatch):
+    broken = tmp_path / "libLLVM-19.so"
+    broken.write_text("not a library")
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(broken))
+    with pytest.raises(BackendError, match="needs libLLVM 16 or newer"):
+        find_libllvm()
+
+
+def test_the_message_comes_before_the_crash(tmp_path):
+    """In a fresh process: the sentence, and no abort of Dr.Jit's."""
+    old = tmp_path / "libLLVM-15.so"
+    old.touch()
+    done = subprocess.run(
+        [sys.executable, "-m", "appearance.scene.backend"],
+        env={**os.environ, "DRJIT_LIBLLVM_PATH": str(old)},
+        cwd=Path(__file__).parents[3],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert "apt-get install libllvm19" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_usable_library_is_found_and_the_variant_is_set():
+    assert Path(find_libllvm()).is_file()
+    chosen = ensure_backend()
+    import mitsuba as mi
+
+    assert mi.variant() == chosen == ensure_backend()
+
+
+_AT_AN_EDGE = """
+import ctypes, mmap
+import numpy as np
+from appearance.scene.backend import ensure_backend
+from reconstruction.array_backend import for_kernels
+page = mmap.PAGESIZE
+memory = mmap.mmap(-1, 2 * page)
+start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+protect = ctypes.CDLL(None, use_errno=True).mprotect
+protect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+assert protect(start + page, page, 0) == 0
+five = np.frombuffer(memory, np.float32, count=5, offset=page - 20)
+five[:] = range(5)
+ensure_backend("llvm_ad_rgb")
+import mitsuba as mi
+print((mi.Float(for_kernels(five)) + 1).numpy().tolist())
+"""
+
+
+def test_an_array_that_ends_where_memory_ends_does_not_end_the_process():
+    """Without `for_kernels` this is a segfault: kernels read the last packet whole."""
+    done = subprocess.run([sys.executable, "-c", _AT_AN_EDGE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[1.0, 2.0, 3.0, 4.0, 5.0]"
+
+
+@pytest.mark.parametrize("shape", [(1,), (17,), (3, 5, 2)])
+def test_arrays_for_kernels_begin_at_a_packet_and_have_room_after_their_end(shape):
+    values = np.asfortranarray(np.arange(np.prod(shape)).reshape(shape))
+    copy = for_kernels(values, np.uint32)
+    assert copy.flags.c_contiguous
+    assert (copy == values).all()
+    owner = copy
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    assert copy.ctypes.data % 128 == 0
+    assert owner.ctypes.data + owner.nbytes - copy.ctypes.data - copy.nbytes >= 128

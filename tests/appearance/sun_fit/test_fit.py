@@ -1,0 +1,162 @@
+"""The whole fit on a small capture that was rendered with a known appearance."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from appearance.metrics.scores import Exposure
+from appearance.model.fitted_appearance import FittedAppearance
+from appearance.observations import HeldOut, chosen, model_mask, observe
+from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import build_scene
+from appearance.sun_fit.fit import FitOptions, fit
+from appearance.sun_fit.longitudinal import variance_of_roughness
+from reconstruction.capture.folder import Capture, CaptureError, Step
+from reconstruction.capture.writer import CaptureWriter
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from reconstruction.report.report import Report
+
+TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.25, 0.2)
+SKIN = (0.4, 0.3, 0.2)
+OPTIONS = FitOptions(
+    hair_pixels=200, skin_pixels=40, roughness_cameras=2, roughness_spp=36, colour_spp=16
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A board of skin behind a curtain of fibres: 2 cameras of 24², 40 lights, one of them dark."""
+    folder = tmp_path_factory.mktemp("fit")
+    rng = np.random.default_rng(3)
+    n = 700
+    roots = np.stack(
+        [rng.uniform(-0.04, 0.0, n), rng.uniform(-0.01, 0.0, n), np.full(n, 0.05)], axis=1
+    )
+    lean = rng.normal(scale=0.02, size=(n, 3)) * [1, 1, 0] + [0, 0, -1]
+    t = np.linspace(0, 0.1, 6)
+    points = (roots[:, None] + t[None, :, None] * lean[:, None]).reshape(-1, 3)
+    strands = Strands(points.astype(np.float32), np.arange(n + 1) * 6, 4e-4)
+    corners = np.array([[-0.06, 0.012, -0.06], [0.06, 0.012, -0.06], [0, 0.012, 0.09]])
+    head = Mesh(corners, np.array([[0, 1, 2]]))
+    cameras = tuple(
+        Camera.look_at(f"cam_{i}", 24, 24, (x, -0.6, 0.0), (0, 0, 0), 8.0)
+        for i, x in enumerate((-0.2, 0.2, 0.05))
+    )
+    lights = [
+        Light(f"l{i}", p, np.full(3, 5.0)) for i, p in enumerate(dome_positions(40, 1.0, -60.0))
+    ]
+    lights.append(Light("dark", np.array([0.0, 1.0, 0.0]), np.zeros(3)))
+    rig = Rig("board", cameras, tuple(lights))
+    scene = build_scene(strands, head, hair=TRUTH, skin=SKIN)
+    steps = [Step(i, "olat", 0.02, level=0.5, light=x.name) for i, x in enumerate(lights)]
+    writer = CaptureWriter.create(
+        folder / "capture", rig, {"steps": [s.to_dict() for s in steps]}, head=head
+    )
+    model = folder / "model"
+    (model / "masks").mkdir(parents=True)
+    write_strands(model / "strands.npz", strands)
+    for camera in cameras:
+        images = render_olat(scene, camera, lights, spp=16, deep_lights=16, seed=7)
+        for step, image in zip(steps, images, strict=True):
+            writer.write_frame(step, camera.name, 0.5 * image, pulse=1, block_id=1, timestamp=0.0)
+        share = coverage(scene, camera)
+        for kind, mask in (("hair", share["hair"] > 0.5), ("skin", share["head"] > 0.95)):
+            path = model / "masks" / f"{camera.name}_{kind}.png"
+            cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
+    writer.finish("completed", {})
+    return Capture(folder / "capture"), model
+
+
+@pytest.fixture(scope="module")
+def fitted(made):
+    capture, model = made
+    report = fit(capture, model, held_out=HeldOut(("cam_2",), ("l5",)), options=OPTIONS)
+    return FittedAppearance.load(model), report
+
+
+def test_fit_recovers_the_appearance_that_was_rendered(fitted):
+    appearance, _ = fitted
+    assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.25)
+    np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.2)
+    np.testing.assert_allclose(appearance.skin, SKIN, rtol=0.05)
+    assert appearance.v == pytest.approx(float(variance_of_roughness(appearance.hair.beta_m)))
+
+
+def test_fit_reports_what_it_did(made, fitted):
+    _, report = fitted
+    assert [s.name for s in report.stages[-3:]] == ["samples", "roughness", "colour"]
+    samples = report["samples"]
+    assert samples.figures["cameras"] == 2
+    assert samples.figures["lights"] == 40
+    dark = [x for x in samples.left_out if "reach no hair" in x.why]
+    assert len(dark) == 1
+    assert "dark" in dark[0].what
+    errors = [e for _, e in report["colour"].series[0].points]
+    assert min(errors) < 0.05
+    assert len(report["roughness"].series[0].points) == 4
+    assert Report.load(made[1] / "report.json").to_dict() == report.to_dict()
+
+
+def test_missing_frames_and_masks_are_named(made, tmp_path):
+    capture, model = made
+    (tmp_path / "masks").mkdir()
+    write_strands(tmp_path / "strands.npz", Strands.from_list([np.eye(3)[:2]]))
+    with pytest.raises(CaptureError, match="hairstage reconstruct"):
+        fit(capture, tmp_path, options=OPTIONS)
+    write_strands(tmp_path / "strands.npz", Strands.from_list([]))
+    with pytest.raises(ValueError, match="no strands"):
+        fit(capture, tmp_path, options=OPTIONS)
+    with pytest.raises(CaptureError, match="cam_9"):
+        fit(capture, model, held_out=HeldOut(("cam_9",)), options=OPTIONS)
+    with pytest.raises(CaptureError, match="every camera"):
+        HeldOut(("cam_0", "cam_1", "cam_2")).check(capture)
+
+
+def test_observations_are_responses_at_full_level(made):
+    capture, model = made
+    mask = model_mask(model, "cam_0", "hair", capture)
+    pixels = chosen(mask, 10, np.random.default_rng(0))
+    o = observe(capture, "cam_0", ["l3", "l0"], pixels)
+    full = capture.olat("cam_0", ["l3", "l0"]).reshape(2, -1, 3)
+    np.testing.assert_array_equal(o.radiance, full[:, pixels])
+    assert [x.name for x in o.lights] == ["l3", "l0"]
+    assert o.valid.all()
+
+
+def test_saturated_samples_are_not_valid(made, tmp_path):
+    capture, _ = made
+    light = capture.rig.lights[0]
+    steps = [Step(0, "olat", 0.02, light=light.name)]
+    writer = CaptureWriter.create(
+        tmp_path / "c", capture.rig, {"steps": [s.to_dict() for s in steps]}
+    )
+    image = np.zeros((24, 24, 3), np.float32)
+    image[0, 1] = 2.0
+    writer.write_frame(steps[0], "cam_0", image, full_scale=2.0, pulse=1, block_id=1, timestamp=0.0)
+    writer.finish("completed", {})
+    o = observe(Capture(tmp_path / "c"), "cam_0", [light.name, "l1"], np.array([0, 1]))
+    assert o.valid.tolist() == [[True, False], [False, False]]
+
+
+def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
+    a = FittedAppearance(TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3)
+    a.save(tmp_path)
+    assert FittedAppearance.load(tmp_path) == a
+    path = tmp_path / "appearance.json"
+    data = json.loads(path.read_text())
+    del data["skin"]
+    path.write_text(json.dumps(data))
+    with pytest.raises(ValueError, match="skin"):
+        FittedAppearance.load(tmp_path)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match="hairstage fit"):
+        FittedAppearance.load(tmp_path)

@@ -1,0 +1,221 @@
+"""Sun §5 on data whose answer is known: synthetic lobes, and small rendered scenes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.observations import Observed
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
+from appearance.scene.hair_scene import build_scene
+from appearance.sun_fit.longitudinal import longitudinal, variance_of_roughness
+from appearance.sun_fit.mirror_samples import (
+    LobeBins,
+    MirrorSamples,
+    binned,
+    mirror_lights,
+    mirror_samples,
+)
+from appearance.sun_fit.roughness_and_colour import (
+    fit_colour,
+    fit_diffuse,
+    fit_lobe,
+    fit_lobe_as_printed,
+    match_roughness,
+    next_colour,
+)
+from appearance.sun_fit.visible_fibres import visible_fibres
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.strands import Strands
+
+
+def synthetic_bins(v, floor=0.0, spread=0.0, seed=0):
+    """Bins of a lobe of variance `v` with a floor of `floor` times its peak."""
+    rng = np.random.default_rng(seed)
+    n = 20000
+    theta_i = rng.uniform(-0.8, 0.8, (n, 1)) + spread * rng.normal(size=(n, 8))
+    deviation = rng.uniform(-np.pi / 6, np.pi / 6, n)
+    theta_o = deviation[:, None] - theta_i[:, :1] + (theta_i - theta_i[:, :1])
+    lobe = longitudinal(theta_i, theta_o, v).mean(axis=1)
+    value = 0.05 * (lobe + floor * float(longitudinal(0.0, 0.0, v)))
+    return binned(MirrorSamples(deviation, value, theta_i, theta_o, np.ones(theta_i.shape, bool)))
+
+
+@pytest.mark.parametrize("beta", [0.05, 0.1, 0.3])
+@pytest.mark.parametrize("floor", [0.0, 0.2, 1.0])
+def test_fit_reads_the_variance_under_any_floor(beta, floor):
+    v = float(variance_of_roughness(beta))
+    lobe = fit_lobe(synthetic_bins(v, floor))
+    assert lobe.v == pytest.approx(v, rel=0.06)
+    assert lobe.beta_m == pytest.approx(beta, rel=0.05)
+    assert lobe.residual < 0.03
+
+
+def test_equation_10_as_printed_reads_twice_the_variance_under_a_floor():
+    v = float(variance_of_roughness(0.1))
+    assert fit_lobe_as_printed(synthetic_bins(v)) == pytest.approx(v, rel=0.06)
+    assert fit_lobe_as_printed(synthetic_bins(v, 0.2)) > 1.7 * v
+
+
+def test_spread_of_tangents_in_a_pixel_does_not_broaden_the_lobe():
+    v = float(variance_of_roughness(0.1))
+    assert fit_lobe(synthetic_bins(v, spread=0.1)).v == pytest.approx(v, rel=0.1)
+
+
+def test_too_few_samples_are_an_error_that_says_what_to_do():
+    few = MirrorSamples(
+        np.zeros(10), np.ones(10), np.zeros((10, 1)), np.zeros((10, 1)), np.ones((10, 1), bool)
+    )
+    with pytest.raises(ValueError, match="needs more lights"):
+        binned(few)
+
+
+def test_matching_cancels_the_bias_of_the_estimator():
+    def biased(beta):
+        return 1.4 * beta**0.8
+
+    beta, pairs = match_roughness(biased(0.23), biased, biased(0.23))
+    assert beta == pytest.approx(0.23, rel=1e-6)
+    assert len(pairs) == 4
+
+
+def test_matching_survives_one_reading_that_is_far_off():
+    readings = iter([0.33, 0.24, 0.02, 0.28])
+    beta, _ = match_roughness(0.3, lambda beta: next(readings), 0.3)
+    assert 0.2 < beta < 0.5
+
+
+def test_colour_iteration_solves_a_line_in_three_steps():
+    slope, offset = np.array([0.5, 0.3, 0.2]), np.array([0.02, 0.01, 0.0])
+    target = slope * np.array([0.3, 0.4, 0.6]) + offset
+    pairs = []
+    colour = np.full(3, 0.5)
+    for _ in range(3):
+        pairs.append((colour, slope * colour + offset))
+        colour = next_colour(pairs, target)
+    np.testing.assert_allclose(colour, [0.3, 0.4, 0.6], rtol=1e-12)
+
+
+def test_colour_iteration_stays_a_colour():
+    pairs = [(np.full(3, 0.9), np.full(3, 0.1))]
+    assert (next_colour(pairs, np.full(3, 5.0)) <= 0.995).all()
+    assert (next_colour(pairs, np.zeros(3)) >= 0.005).all()
+
+
+@pytest.fixture(scope="module")
+def wisp():
+    """A wisp of straight vertical fibres that covers a 16² camera, under a dome of 60 lights."""
+    rng = np.random.default_rng(3)
+    n = 900
+    roots = np.stack(
+        [rng.uniform(-0.04, 0.04, n), rng.uniform(-0.01, 0.01, n), np.full(n, 0.05)], axis=1
+    )
+    lean = rng.normal(scale=0.02, size=(n, 3)) * [1, 1, 0] + [0, 0, -1]
+    t = np.linspace(0, 0.1, 6)
+    points = (roots[:, None] + t[None, :, None] * lean[:, None]).reshape(-1, 3)
+    strands = Strands(points.astype(np.float32), np.arange(n + 1) * 6, 4e-4)
+    camera = Camera.look_at("front", 16, 16, (0.0, -0.6, 0.0), (0, 0, 0), 5.0)
+    lights = tuple(
+        Light(f"l{i}", p, np.array([5.0, 5.0, 5.0]))
+        for i, p in enumerate(dome_positions(60, 1.0, -60.0))
+    )
+    return strands, camera, lights
+
+
+def observed(scene, camera, lights, spp):
+    pixels = np.arange(camera.width * camera.height)
+    radiance = render_olat(scene, camera, lights, spp=spp, pixels=pixels, deep_lights=20, seed=9)
+    return Observed(camera, lights, pixels, radiance, np.ones(radiance.shape[:2], bool))
+
+
+def test_visible_fibres_know_position_and_direction(wisp):
+    strands, camera, _ = wisp
+    scene = build_scene(strands, None, hair=HairAppearance((0.1, 0.1, 0.1), 0.3, 0.2))
+    fibres = visible_fibres(scene, camera, np.arange(256), samples=9)
+    assert fibres.share.min() > 0.85  # one of nine samples may pass between the fibres
+    met = fibres.hair
+    np.testing.assert_allclose(np.linalg.norm(fibres.tangent[met], axis=1), 1, atol=1e-5)
+    assert (fibres.tangent[met][:, 2] < -0.9).all()  # root to tip is down
+    assert np.abs(fibres.point[met][:, 1]).max() < 0.016
+    assert np.median(fibres.spread()) == pytest.approx(2 * 0.02**2, rel=0.7)
+
+
+def centre(samples):
+    """Centroid of the lobe: the mean of bins, as the lights do not lie evenly."""
+    edges = np.linspace(-0.5, 0.5, 21)
+    which = np.digitize(samples.deviation, edges)
+    means = [samples.value[which == k].mean() for k in range(1, 21) if (which == k).any()]
+    middles = [samples.deviation[which == k].mean() for k in range(1, 21) if (which == k).any()]
+    return np.average(middles, weights=np.maximum(means - np.min(means), 0))
+
+
+def test_mirror_direction_is_where_the_highlight_is(wisp):
+    strands, camera, lights = wisp
+    truth = HairAppearance((0.5, 0.8, 2.0), 0.15, 0.2, tilt_deg=3.0)
+    scene = build_scene(strands, None, hair=truth)
+    o = observed(scene, camera, lights, 16)
+    fibres = visible_fibres(scene, camera, o.pixels, samples=9)
+    use = mirror_lights(o, fibres, tilt_deg=3.0)
+    assert 3 < len(use) < len(lights)
+    samples = mirror_samples(o, fibres, tilt_deg=3.0, channel=2)
+    near = np.abs(samples.deviation) < 0.06
+    far = np.abs(samples.deviation) > 0.4
+    assert samples.value[near].mean() > 4 * samples.value[far].mean()
+    assert abs(centre(samples)) < 0.03
+    # with the tilt's sign wrong the lobe lies at four times the tilt, 0.21 rad
+    wrong = mirror_samples(o, fibres, tilt_deg=-3.0, channel=2)
+    assert centre(wrong) < -0.1
+
+
+def test_roughness_of_dark_fibres_is_read_off_their_highlight(wisp):
+    strands, camera, lights = wisp
+    for beta in (0.12, 0.3):
+        truth = HairAppearance((2.0, 2.0, 3.0), beta, 0.2)
+        scene = build_scene(strands, None, hair=truth)
+        o = observed(scene, camera, lights, 16)
+        fibres = visible_fibres(scene, camera, o.pixels, samples=9)
+        lobe = fit_lobe(binned(mirror_samples(o, fibres, tilt_deg=2.0, channel=2)))
+        assert lobe.beta_m == pytest.approx(beta, rel=0.25)
+
+
+def test_colour_of_rendered_hair_is_recovered(wisp):
+    strands, camera, lights = wisp
+    truth = HairAppearance((0.1, 0.3, 0.9), 0.3, 0.2)
+    scene = build_scene(strands, None, hair=truth)
+    o = observed(scene, camera, lights[::3], 64)
+    start = scene.with_hair(replace(truth, sigma_a=(0.5, 0.5, 0.5)))
+    found = fit_colour(start, [o], [], iterations=5, spp=32)
+    np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.12)
+    assert found.errors[-1] < 0.06  # of two noisy renderings; 0.036 measured
+    assert found.errors[-1] < found.errors[0]
+
+
+def test_diffuse_baseline_recovers_its_own_albedo(wisp):
+    strands, camera, lights = wisp
+    scene = build_scene(strands, None, hair=DiffuseHair((0.6, 0.4, 0.2)))
+    o = observed(scene, camera, lights[::3], 32)
+    np.testing.assert_allclose(fit_diffuse(scene, [o]), (0.6, 0.4, 0.2), rtol=0.05)
+
+
+def test_fit_colour_refuses_diffuse_fibres(wisp):
+    strands, camera, lights = wisp
+    scene = build_scene(strands, None, hair=DiffuseHair((0.6, 0.4, 0.2)))
+    with pytest.raises(TypeError, match="HairAppearance"):
+        fit_colour(scene, [observed(scene, camera, lights[:2], 1)], [])
+
+
+def test_bins_average_the_lobe_over_the_tangents_of_a_pixel():
+    one = np.ones(1)
+    bins = LobeBins(
+        deviation=one,
+        value=one,
+        error=one,
+        count=np.ones(1, int),
+        theta_i=np.array([[[-0.2, 0.2]]]),
+        theta_o=np.zeros((1, 1, 2)),
+        weight=np.full((1, 1, 2), 0.5),
+    )
+    want = 0.5 * (longitudinal(-0.2, 0, 0.01) + longitudinal(0.2, 0, 0.01))
+    assert bins.lobe(0.01)[0] == pytest.approx(float(want))

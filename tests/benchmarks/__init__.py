@@ -1,0 +1,1 @@
+"""Benchmarks: error against run time beside named peers; run by `make bench`."""

@@ -1,0 +1,186 @@
+"""The ablation table: baselines, fits and the truth itself, scored on held-out frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.bsdf.maps import HairMaps, MappedStrands
+from appearance.inverse_rendering.loop import ROWS, Stage1Options, run
+from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.start import hair_inverse
+from appearance.inverse_rendering.unknowns import Lamps
+from appearance.metrics.scores import mean_scores, scores, scores_unavailable
+from appearance.observations import Observed
+from appearance.render.olat import render_olat
+from appearance.sun_fit.fit import FitOptions
+from benchmarks.known_subjects import Captured
+from reconstruction.geometry.lights import Light
+from reconstruction.report.report import Progress, Stage, silent
+
+Array = NDArray[np.float64]
+GROUPS = ("train views", "held-out views")
+TRUTH = "truth, fresh numbers"
+"""The true parameters on the true strands: how far a PSNR can go with this much noise."""
+
+
+class Table:
+    """All rows of one subject; each fit starts from the last."""
+
+    def __init__(
+        self,
+        captured: Captured,
+        options: Stage1Options,
+        *,
+        lights: Sequence[Light] | None = None,
+        progress: Progress = silent,
+        seed: int = 0,
+    ) -> None:
+        self.captured, self.options = captured, options
+        self.progress, self.seed = progress, seed
+        self.training = captured.training(lights)
+        self.rows: dict[str, dict[str, Any]] = {}
+
+    def run(self, rows: Sequence[str] = tuple(ROWS)) -> dict[str, dict[str, Any]]:
+        """Baselines, then `rows`, then the truth itself."""
+        captured = self.captured
+        colour = np.mean([o.radiance.mean((0, 1)) for o in self.training], axis=0)
+        views, pairs = captured.views, self._truth()
+        flat = [np.broadcast_to(colour, views[k].radiance[0].shape) for k, _ in pairs]
+        self._score("mean colour", [(x, x) for x in flat])
+        self._score(
+            "three nearest",
+            [
+                (
+                    self._nearest(views[k], captured.halves[k][0], i),
+                    self._nearest(views[k], captured.halves[k][1], i),
+                )
+                for k, i in pairs
+            ],
+        )
+        begun = time.perf_counter()
+        self.progress("HairInverse", 0.0)
+        stage = Stage("start")
+        quick = FitOptions(hair_pixels=200, roughness_spp=12, colour_spp=8)
+        hair, _ = hair_inverse(
+            captured.mapped.scene, self.training, options=quick, stage=stage, seed=self.seed
+        )
+        maps = HairMaps.of(hair)
+        self.score_maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
+        self.rows["HairInverse"]["warnings"] = stage.warnings
+        lamps = None
+        problem = Problem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
+        for row in rows:
+            begun = time.perf_counter()
+            self.progress(row, 0.0)
+            found = run(
+                problem,
+                maps,
+                lamps,
+                options=replace(self.options, row=row),
+                seed=self.seed,
+                progress=named(self.progress, row),
+            )
+            maps, lamps = found.maps, found.lamps
+            self.score_maps(row, maps, captured.mapped, time.perf_counter() - begun)
+            self.rows[row] |= {
+                "ended": found.ended,
+                "steps": found.steps,
+                "gain_spread": float(found.lamps.gain.std()),
+                "history": found.history,
+            }
+        self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
+        self.found = maps, lamps or Lamps.calibrated(len(self.training[0].lights))
+        return self.rows
+
+    def _truth(self) -> list[tuple[int, int]]:
+        """Numbers of the views and of the held-out lights that are compared."""
+        return [(k, i) for k in range(len(self.captured.views)) for i in self.captured.held_lights]
+
+    def score_maps(self, row: str, maps: HairMaps, mapped: MappedStrands, seconds: float) -> None:
+        """Render `maps` on `mapped` with fresh random numbers and score them as `row`."""
+        scene = mapped.painted(maps).with_skin(self.captured.skin)
+        held = list(self.captured.held_lights)
+        pictures: list[tuple[Array, Array]] = []
+        for k, o in enumerate(self.captured.views):
+            one, other = (
+                render_olat(
+                    scene,
+                    o.camera,
+                    [o.lights[i] for i in held],
+                    spp=self.captured.judged_spp // 2,
+                    max_depth=self.captured.max_depth,
+                    pixels=o.pixels,
+                    seed=(self.seed << 8) + 31 + 2 * k + h,
+                ).astype(float)
+                for h in (0, 1)
+            )
+            pictures += list(zip(one, other, strict=True))
+        self._score(row, pictures)
+        hair, true = maps.mean(), self.captured.truth.mean()
+        self.rows[row] |= {
+            "seconds": seconds,
+            "sigma_a": list(hair.sigma_a),
+            "beta_m": hair.beta_m,
+            "beta_n": hair.beta_n,
+            "eta": hair.eta,
+            "beta_m_error": hair.beta_m / true.beta_m - 1,
+            "beta_n_error": hair.beta_n / true.beta_n - 1,
+            "sigma_a_error": float(np.abs(np.array(hair.sigma_a) / true.sigma_a - 1).max()),
+        }
+
+    def _score(self, row: str, pictures: Sequence[tuple[Array, Array]]) -> None:
+        """Scores over held-out lights, in the training and in the held-out views.
+
+        `pictures` are pairs of independent renderings `(P, 3)`. "psnr" and "ssim" compare their
+        mean with the frames; "psnr_clean" is the PSNR without either side's noise, from the product
+        of differences between independent halves.
+        """
+        captured, exposure = self.captured, self.captured.exposure
+        groups: dict[str, list[dict[str, float]]] = {n: [] for n in GROUPS}
+        for (one, other), (k, i) in zip(pictures, self._truth(), strict=True):
+            o, (true_one, true_other) = captured.views[k], captured.halves[k]
+            size = (o.camera.height, o.camera.width)
+            shown, true = (
+                _image(exposure(x), o.pixels, size)
+                for x in (0.5 * (one + other), o.radiance[i].astype(float))
+            )
+            mask = np.zeros(size, bool)
+            mask.reshape(-1)[o.pixels] = True
+            clean = (exposure(one) - exposure(true_one[i])) * (
+                exposure(other) - exposure(true_other[i])
+            )
+            group = GROUPS[int(k in captured.held_views)]
+            groups[group].append({**scores(shown, true, mask), "clean": float(clean.mean())})
+        figures: dict[str, Any] = scores_unavailable()
+        for group, values in groups.items():
+            mean = mean_scores(values)
+            mean["psnr_clean"] = float(-10 * np.log10(max(mean.pop("clean"), 1e-5)))
+            figures[group] = mean
+        self.rows[row] = figures
+
+    def _nearest(self, o: Observed, frames: NDArray[np.float32], light: int) -> Array:
+        """The view's own frames under the three nearest training lights, by inverse angle."""
+        towards = np.array([x.position / np.linalg.norm(x.position) for x in o.lights])
+        others = list(self.captured.train_lights)
+        angle = np.arccos(np.clip(towards[others] @ towards[light], -1, 1))
+        three = np.argsort(angle)[:3]
+        share = 1 / np.maximum(angle[three], 1e-6)
+        near = frames[[others[i] for i in three]].astype(float)
+        return np.asarray(np.tensordot(share / share.sum(), near, 1))
+
+
+def _image(values: Array, pixels: NDArray[np.int64], size: tuple[int, int]) -> Array:
+    out = np.zeros((size[0] * size[1], 3))
+    out[pixels] = values
+    return out.reshape(*size, 3)
+
+
+def named(progress: Progress, name: str) -> Progress:
+    """`progress` that says first what it is about."""
+    return lambda what, share: progress(f"({name}) {what}", share)

@@ -1,0 +1,307 @@
+"""Benchmark: the fit's ablations beside baselines, on subjects of known appearance."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering.loop import Stage1Options, run
+from appearance.inverse_rendering.problem import Effort, Problem
+from appearance.observations import Observed
+from appearance.scene.hair_appearance import HairAppearance
+from benchmarks.ablation_table import GROUPS, Table, named
+from benchmarks.known_subjects import SUBJECTS, Captured, Rig, on_bent, subject
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+from reconstruction.report.report import Progress, silent
+
+Array = NDArray[np.float64]
+
+QUICK = Stage1Options(
+    steps=30,
+    check_every=30,
+    shape=(6, 24, 24),
+    effort=Effort(pixels=400, spp=512, gradient_spp=64, max_depth=8),
+)
+STAGE = Rig(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
+STARTS = (
+    (0.4, 0.2, 1.45, (0.75, 1.25, 1.3)),
+    (0.9, 0.9, 1.55, (1.0, 1.0, 1.0)),
+    (0.02, 0.3, 1.55, (1.0, 1.0, 1.0)),
+    (0.15, 0.6, 1.55, (8.0, 4.0, 2.0)),
+)
+"""beta_m, beta_n and eta to start from, and factors on the true absorption."""
+PLAIN = Effort(spp=16, gradient_spp=16)
+"""Paths of the plain version: as many for the picture as for its gradient."""
+
+
+def run_bench(
+    out: Path,
+    strands: Strands,
+    head: Mesh | None,
+    hair: HairAppearance,
+    skin: Array,
+    *,
+    names: Sequence[str] = SUBJECTS,
+    seeds: int = 1,
+    options: Stage1Options = QUICK,
+    rig: Rig = STAGE,
+    plain: bool = True,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The table of every subject; recovery, also from afar, on (a); error against time on (b).
+
+    The rows up to "spatial" of (b) for all `seeds`. Writes `appearance.json` and `appearance.md`
+    into `out`, as far as it is, and returns the former.
+    """
+    result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
+    made: dict[str, Captured] = {}
+    for name in names:
+        if name == "c" and "b" in made:
+            captured = on_bent(made["b"], strands, head, seed)
+        else:
+            captured = subject(name, strands, head, hair, skin, rig, seed)
+        made[name] = captured
+        rows = Table(captured, options, progress=named(progress, name), seed=seed).run()
+        result["subjects"][name] = rows
+        _write(out, result)
+        if name == "a":
+            result["recovery"] = recovery(captured, rows, options, named(progress, name), seed)
+            result["starts"] = from_afar(captured, options, named(progress, name), seed)
+        if name == "b":
+            result["seeds"] = [
+                _final(Table(captured, options, seed=seed + k).run(("original", "spatial")))
+                for k in range(1, seeds)
+            ]
+            if plain:
+                result["time"] = error_against_time(captured, options, progress, seed)
+        _write(out, result)
+    return result
+
+
+def _write(out: Path, result: dict[str, Any]) -> None:
+    """What there is so far: a benchmark of an hour may be interrupted."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "appearance.json").write_text(json.dumps(result, indent=1) + "\n")
+    (out / "appearance.md").write_text(markdown(result))
+
+
+def recovery(
+    captured: Captured,
+    rows: dict[str, dict[str, Any]],
+    options: Stage1Options,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """What is recovered from frames with noise, and with lamps 2 mm and 3 % off their calibration.
+
+    `rows` are those of the table of the frames as they are. The row "original" (lamps as
+    calibrated) and, with lamps off, "lights" (lamps fitted too).
+    """
+    rng = np.random.default_rng([seed, 9])
+    lights = captured.views[0].lights
+    off = [
+        replace(
+            x,
+            position=x.position + 2e-3 * rng.normal(size=3) / np.sqrt(3),
+            intensity=x.intensity * (1 + 0.03 * rng.normal()),
+        )
+        for x in lights
+    ]
+    white = 1 / captured.exposure.scale
+    noisy = [
+        replace(
+            o,
+            radiance=(
+                o.radiance
+                + 0.02 * white * rng.normal(size=o.radiance.shape)
+                + np.sqrt(2e-3 * white * np.maximum(o.radiance, 0))
+                * rng.normal(size=o.radiance.shape)
+            ).astype(np.float32),
+        )
+        for o in captured.views
+    ]
+    out = {"as captured": _recovered(rows)}
+    name = "noise of 2 % of white and 500 electrons at white"
+    table = Table(
+        replace(captured, views=tuple(noisy)), options, progress=named(progress, name), seed=seed
+    )
+    out[name] = _recovered(table.run(("original",)))
+    name = "lamps 2 mm and 3 % off"
+    table = Table(captured, options, lights=off, progress=named(progress, name), seed=seed)
+    out[name] = _recovered(table.run(("original", "lights")))
+    true = np.array([lights[i].intensity[0] for i in captured.train_lights])
+    known = np.array([off[i].intensity[0] for i in captured.train_lights])
+    out[name]["original"]["lamps_off"] = _relative_spread(known / true)
+    out[name]["lights"]["lamps_off"] = _relative_spread(known * table.found[1].gain / true)
+    return out
+
+
+def from_afar(
+    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+) -> list[dict[str, Any]]:
+    """What the row "original" finds of one colour from `STARTS`, and in how many CPU seconds."""
+    true, out = captured.truth.mean(), []
+    problem = Problem(captured.mapped, captured.training(), captured.exposure.scale, captured.skin)
+    for beta_m, beta_n, eta, (r, g, b) in STARTS:
+        sigma_a = (r * true.sigma_a[0], g * true.sigma_a[1], b * true.sigma_a[2])
+        start = replace(true, sigma_a=sigma_a, beta_m=beta_m, beta_n=beta_n, eta=eta)
+        progress(f"from β_M {beta_m:g}, β_N {beta_n:g}", 0.0)
+        begun = time.process_time()
+        found = run(
+            problem, HairMaps.of(start), options=replace(options, row="original"), seed=seed
+        )
+        hair = found.maps.mean()
+        out.append(
+            {
+                "start": start.to_dict(),
+                "ended": found.ended,
+                "beta_m_error": hair.beta_m / true.beta_m - 1,
+                "beta_n_error": hair.beta_n / true.beta_n - 1,
+                "eta": hair.eta,
+                "sigma_a_error": (np.array(hair.sigma_a) / true.sigma_a - 1).tolist(),
+                "cpu_seconds": time.process_time() - begun,
+            }
+        )
+    return out
+
+
+def _recovered(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    wanted = ("beta_m_error", "beta_n_error", "sigma_a_error")
+    return {
+        name: {"psnr_clean": row[GROUPS[1]]["psnr_clean"], **{k: row[k] for k in wanted}}
+        for name, row in rows.items()
+        if name in ("HairInverse", "original", "lights")
+    }
+
+
+def _relative_spread(ratio: Array) -> float:
+    """RMS of what lamps differ by from each other: all of them together is the hair's colour."""
+    return float(np.std(ratio / ratio.mean()))
+
+
+def error_against_time(
+    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+) -> dict[str, list[dict[str, float]]]:
+    """Held-out PSNR of "spatial" against CPU seconds: ours, by steps alone, and those undone.
+
+    "steps" begins with the cells' colours and descends from there; the next three are that with one
+    choice undone. "plain" draws pairs evenly, renders whole frames one at a time to a fixed number
+    of bounces, as many paths for a picture as for its gradient, and starts from one colour.
+    Watching is not counted.
+    """
+    training = captured.training()
+    scale, skin = captured.exposure.scale, captured.skin
+    ours = replace(options, row="spatial", check_every=max(2, options.steps // 3))
+    steps = replace(ours, gauss_newton=False)
+    frame = captured.views[0].camera.width * captured.views[0].camera.height
+    depth = options.effort.max_depth
+    versions = {
+        "ours": ours,
+        "steps": steps,
+        "steps, one colour first": replace(steps, cell_start=False),
+        "steps, common numbers": replace(steps, common_numbers=True),
+        "steps, even batches": replace(steps, residual_weighted=False),
+        "plain": replace(
+            steps,
+            effort=replace(PLAIN, pixels=frame, max_depth=depth, rr_depth=depth),
+            levels=1,
+            residual_weighted=False,
+            cell_start=False,
+            shared_paths=False,
+        ),
+    }
+    start = HairMaps.of(replace(captured.truth.mean(), sigma_a=(0.3, 0.3, 0.3), beta_m=0.4))
+    curves = {}
+    for name, version in versions.items():
+        progress(f"time: {name}", 0.0)
+        views = [_framed(o) for o in training] if name == "plain" else training
+        points: list[tuple[float, HairMaps]] = []
+        problem = Problem(captured.mapped, views, scale, skin)
+        run(
+            problem,
+            start,
+            options=version,
+            snapshot=_into(points),
+            seed=seed,
+        )
+        table = Table(captured, options, seed=seed)
+        curve = []
+        for seconds, maps in points:
+            table.score_maps("now", maps, captured.mapped, seconds)
+            psnr_clean = table.rows["now"][GROUPS[1]]["psnr_clean"]
+            curve.append({"cpu_seconds": seconds, "psnr_clean": psnr_clean})
+        curves[name] = curve
+    return curves
+
+
+def _framed(o: Observed) -> Observed:
+    """All pixels of the camera, of which those beside the hair do not count."""
+    pixels = np.arange(o.camera.width * o.camera.height)
+    radiance = np.zeros((len(o.lights), len(pixels), 3), np.float32)
+    valid = np.zeros(radiance.shape[:2], bool)
+    radiance[:, o.pixels], valid[:, o.pixels] = o.radiance, o.valid
+    return Observed(o.camera, o.lights, pixels, radiance, valid)
+
+
+def _into(points: list[tuple[float, HairMaps]]) -> Callable[[float, HairMaps], None]:
+    return lambda seconds, maps: points.append((seconds, maps))
+
+
+def _final(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
+    return {name: row[GROUPS[1]]["psnr_clean"] for name, row in rows.items()}
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The tables, for people."""
+    lines = []
+    for name, rows in result["subjects"].items():
+        lines += [
+            f"## Subject ({name})",
+            "",
+            "| row | held-out views, lights: PSNR without noise | PSNR | SSIM | training views, "
+            "held-out lights: PSNR without noise | β_M off | β_N off | mean σ off | s |",
+            "|---|---|---|---|---|---|---|---|---|",
+        ]
+        for row, figures in rows.items():
+            held, train = figures[GROUPS[1]], figures[GROUPS[0]]
+            off = [
+                f"{100 * figures[k]:+.1f} %" if k in figures else ""
+                for k in ("beta_m_error", "beta_n_error", "sigma_a_error")
+            ]
+            lines.append(
+                f"| {row} | {held['psnr_clean']:.2f} | {held['psnr']:.2f} | {held['ssim']:.3f} | "
+                f"{train['psnr_clean']:.2f} | {' | '.join(off)} | "
+                f"{figures.get('seconds', 0):.0f} |"
+            )
+        lines.append("")
+    for case, rows in result.get("recovery", {}).items():
+        for row, found in rows.items():
+            lamps = f", lamps {100 * found['lamps_off']:.1f} % off" if "lamps_off" in found else ""
+            lines.append(
+                f"- {case}, {row}: {found['psnr_clean']:.2f} dB, "
+                f"β_M {100 * found['beta_m_error']:+.1f} %, "
+                f"β_N {100 * found['beta_n_error']:+.1f} %, "
+                f"σ {100 * found['sigma_a_error']:.1f} %{lamps}"
+            )
+    for row in result.get("starts", []):
+        start = row["start"]
+        sigma_a = ", ".join(f"{100 * e:+.1f}" for e in row["sigma_a_error"])
+        lines.append(
+            f"- from β_M {start['beta_m']:g}, β_N {start['beta_n']:g}, η {start['eta']:g}: "
+            f"β_M {100 * row['beta_m_error']:+.1f} %, β_N {100 * row['beta_n_error']:+.1f} %, "
+            f"η {row['eta']:.3f}, σ {sigma_a} %, {row['cpu_seconds']:.0f} CPU s"
+        )
+    for name, curve in result.get("time", {}).items():
+        points = ", ".join(f"{p['cpu_seconds']:.0f} s: {p['psnr_clean']:.2f}" for p in curve)
+        lines.append(f"- {name}: {points}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,222 @@
+"""Subjects of known appearance, captured by our own renderer, to judge a fit on.
+
+(a) one colour on true strands; (b) a gradient from root to tip and dyed wisps on true strands;
+(c) the frames of (b), to be fitted on strands bent by 5° RMS of tangent noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.bsdf.maps import HairMaps, MappedStrands, root_normals, scalp_coordinates
+from appearance.bsdf.strand_coordinates import transported
+from appearance.metrics.scores import Exposure
+from appearance.observations import Observed
+from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import build_scene
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+
+Array = NDArray[np.float64]
+SUBJECTS = ("a", "b", "c")
+TANGENT_NOISE_DEG = 5.0
+_BEND = 0.1
+"""Metres of a bend's wave along the strand."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A small stage: cameras on a ring, lamps on a dome; every other lamp is held out.
+
+    Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`.
+    """
+
+    size: int = 64
+    cameras: int = 6
+    lights: int = 16
+    fov_deg: float = 24.0
+    spp: int = 384
+    judged_spp: int = 384
+    max_depth: int = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """Frames of a subject: `views` under all `lights`, and what is held out of a fit.
+
+    `mapped` holds the strands to fit on; `truth` the maps behind the frames, on `true_mapped`.
+    `halves` are two independent renderings of each view `(L, P, 3)`, whose means `views` hold.
+    """
+
+    mapped: MappedStrands
+    true_mapped: MappedStrands
+    truth: HairMaps
+    skin: Array
+    views: tuple[Observed, ...]
+    halves: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+    held_views: tuple[int, ...]
+    held_lights: tuple[int, ...]
+    exposure: Exposure
+    judged_spp: int
+    max_depth: int
+
+    @property
+    def train_lights(self) -> tuple[int, ...]:
+        """Indices of the lights that a fit sees."""
+        return tuple(i for i in range(len(self.views[0].lights)) if i not in self.held_lights)
+
+    def training(self, lights: Sequence[Light] | None = None) -> list[Observed]:
+        """What a fit sees; with other descriptions of the lights where `lights` are given."""
+        keep = list(self.train_lights)
+        known = self.views[0].lights if lights is None else tuple(lights)
+        return [
+            replace(
+                o,
+                lights=tuple(known[i] for i in keep),
+                radiance=o.radiance[keep],
+                valid=o.valid[keep],
+            )
+            for i, o in enumerate(self.views)
+            if i not in self.held_views
+        ]
+
+
+def subject(
+    name: str,
+    strands: Strands,
+    head: Mesh | None,
+    hair: HairAppearance,
+    skin: Array,
+    rig: Rig | None = None,
+    seed: int = 0,
+) -> Captured:
+    """Subject `name` of `SUBJECTS`, its base colour and roughness those of `hair`."""
+    if name not in SUBJECTS:
+        raise ValueError(f"there is no subject {name!r}; there are {SUBJECTS}")
+    if name == "c":
+        return on_bent(subject("b", strands, head, hair, skin, rig, seed), strands, head, seed)
+    rig = rig or Rig()
+    scene = build_scene(strands, head, hair=hair, skin=skin)
+    mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, head))
+    truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed)
+    shown = mapped.painted(truth)
+    cameras, lights = _ring(strands, rig), _dome(rig)
+    views, halves = [], []
+    for k, camera in enumerate(cameras):
+        pixels = np.flatnonzero((coverage(shown, camera)["hair"] > 0.7).ravel())
+        half = [
+            render_olat(
+                shown,
+                camera,
+                lights,
+                spp=rig.spp // 2,
+                max_depth=rig.max_depth,
+                pixels=pixels,
+                seed=(seed << 8) + 7777 + 2 * k + h,
+            )
+            for h in (0, 1)
+        ]
+        halves.append((half[0], half[1]))
+        valid = np.ones(half[0].shape[:2], bool)
+        views.append(Observed(camera, tuple(lights), pixels, 0.5 * (half[0] + half[1]), valid))
+    held_views = (0, len(cameras) // 2)
+    held_lights = tuple(range(1, len(lights), 2))
+    exposure = Exposure.of([o.radiance[::2] for i, o in enumerate(views) if i not in held_views])
+    return Captured(
+        mapped,
+        mapped,
+        truth,
+        skin,
+        tuple(views),
+        tuple(halves),
+        held_views,
+        held_lights,
+        exposure,
+        rig.judged_spp,
+        rig.max_depth,
+    )
+
+
+def on_bent(captured: Captured, strands: Strands, head: Mesh | None, seed: int = 0) -> Captured:
+    """The frames of `captured`, whose strands are `strands`, to be fitted on bent ones."""
+    uv = captured.mapped.root_uv
+    noisy = bent(strands, uv, TANGENT_NOISE_DEG, seed)
+    scene = build_scene(noisy, head, hair=captured.truth.mean(), skin=captured.skin)
+    return replace(captured, mapped=MappedStrands.of(scene, noisy, uv))
+
+
+def dyed(hair: HairAppearance, seed: int, shape: tuple[int, int, int] = (6, 24, 24)) -> HairMaps:
+    """`hair`, bleached to a quarter of its absorption at the tips, with wisps dyed red and blue."""
+    rng = np.random.default_rng(seed)
+    maps = HairMaps.of(hair, shape)
+    along = np.linspace(1.0, 0.25, shape[0])[:, None, None, None]
+    sigma_a = maps.sigma_a * along
+    u, v = np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape[1:]), indexing="ij")
+    dyes = np.array([[0.05, 1.2, 1.6], [1.4, 0.7, 0.1]])
+    for k in range(10):
+        middle, radius = rng.uniform(0.1, 0.9, 2), rng.uniform(0.06, 0.12)
+        wisp = (u - middle[0]) ** 2 + (v - middle[1]) ** 2 < radius**2
+        sigma_a[:, wisp] = dyes[k % 2]
+    return replace(maps, sigma_a=sigma_a)
+
+
+def bent(strands: Strands, uv: Array, rms_deg: float, seed: int) -> Strands:
+    """`strands` offset along a wave, so that tangents turn by `rms_deg` RMS and roots stay.
+
+    Direction and phase of the wave, in the strands' own frames, vary smoothly over the scalp:
+    neighbours are wrong alike, as in reconstructions. About 2 mm of offset for 5°.
+    """
+    rng = np.random.default_rng([seed, 5])
+    waves = rng.normal(size=(2, 4, 2)) * 3.0
+    shift = rng.uniform(0, 2 * np.pi, (2, 4))
+    phase, turn = (
+        1.5 * np.sin(uv @ w.T + s).sum(axis=1) for w, s in zip(waves, shift, strict=True)
+    )
+    tangents = strands.tangents().astype(float)
+    offsets = strands.offsets
+    points = np.arange(len(tangents))
+    normals = transported(tangents, np.diff(offsets), root_normals(strands))
+    strand = strands.strand_of_point
+    across = np.cos(turn)[strand, None] * normals
+    across += np.sin(turn)[strand, None] * np.cross(tangents, normals)
+    step = np.linalg.norm(np.diff(strands.points.astype(float), axis=0, prepend=0), axis=1)
+    arc = np.cumsum(np.where(points == offsets[strand], 0, step))
+    angle = 2 * np.pi * (arc - arc[offsets[strand]]) / _BEND
+    wave = (np.sin(angle + phase[strand]) - np.sin(phase[strand]))[:, None] * across
+    size = np.radians(rms_deg) * np.sqrt(2) * _BEND / (2 * np.pi)
+    for _ in range(3):
+        out = replace(strands, points=strands.points + size * wave)
+        size *= np.radians(rms_deg) / _rms_angle(tangents, out.tangents().astype(float))
+    return out
+
+
+def _rms_angle(one: Array, other: Array) -> float:
+    sine = np.linalg.norm(np.cross(one, other), axis=1)
+    return float(np.sqrt((np.arctan2(sine, (one * other).sum(axis=1)) ** 2).mean()))
+
+
+def _ring(strands: Strands, rig: Rig) -> list[Camera]:
+    low, high = strands.points.min(axis=0).astype(float), strands.points.max(axis=0).astype(float)
+    middle = 0.5 * (low + high)
+    reach = 0.5 * float(np.linalg.norm(high - low))
+    distance = reach / np.sin(np.radians(rig.fov_deg / 2))
+    out = []
+    for k in range(rig.cameras):
+        angle = 2 * np.pi * k / rig.cameras - np.pi / 2
+        height = 0.25 if k % 2 else 0.05
+        place = middle + distance * np.array([np.cos(angle), np.sin(angle), height])
+        out.append(Camera.look_at(f"cam_{k}", rig.size, rig.size, place, middle, rig.fov_deg))
+    return out
+
+
+def _dome(rig: Rig) -> list[Light]:
+    places = dome_positions(rig.lights, 1.2, lowest_deg=-30)
+    return [Light(f"light_{i:02d}", p, np.full(3, 8.0)) for i, p in enumerate(places)]

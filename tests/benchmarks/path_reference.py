@@ -1,0 +1,86 @@
+"""The readable reference for `render_olat`: Mitsuba's own `path` integrator, light by light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance.render.paths import passes, wave
+from appearance.scene.hair_scene import HairScene, light_arrays
+from reconstruction.array_backend import for_kernels
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+
+_LANES = 1 << 20
+
+
+class PathReference:
+    """A scene's geometry under one Mitsuba point light that moves from lamp to lamp.
+
+    Built once for many lights, so that its time against `render_olat`'s is spent on paths only.
+    """
+
+    def __init__(self, scene: HairScene, max_depth: int, rr_depth: int = 4) -> None:
+        import mitsuba as mi
+
+        light = {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": 1}}
+        self._scene = mi.load_dict({"type": "scene", **scene.material_shapes(), "light": light})
+        self._parameters = mi.traverse(self._scene)
+        # Mitsuba counts segments: its depth 2 is our one vertex.
+        self._integrator = mi.load_dict(
+            {"type": "path", "max_depth": max_depth + 1, "rr_depth": rr_depth + 1}
+        )
+
+    def render(
+        self,
+        camera: Camera,
+        lights: Sequence[Light],
+        pixels: NDArray[np.int64],
+        *,
+        spp: int,
+        seed: int = 0,
+    ) -> NDArray[np.float32]:
+        """Radiance `(L, P, 3)` of the flat `pixels (P,)` under each light alone, W/(sr m²).
+
+        Raises `ValueError` for lamps that are not isotropic points.
+        """
+        if shaped := [x.name for x in lights if x.radius or x.size or x.profile]:
+            raise ValueError(f"the reference knows point lamps only, and {shaped} are none")
+        out = np.empty((len(lights), len(pixels), 3), np.float32)
+        positions, intensities = light_arrays(lights)
+        for i in range(len(lights)):
+            self._move(positions[i], intensities[i])
+            out[i] = self._light(camera, pixels, spp, (seed, i))
+        return out
+
+    def _move(self, position: NDArray[np.float32], intensity: NDArray[np.float32]) -> None:
+        import mitsuba as mi
+
+        self._parameters["light.position"] = mi.Point3f(*(float(p) for p in position))
+        self._parameters["light.intensity.value"] = mi.Color3f(*(float(c) for c in intensity))
+        self._parameters.update()
+
+    def _light(
+        self, camera: Camera, pixels: NDArray[np.int64], spp: int, seed: tuple[int, int]
+    ) -> NDArray[np.float32]:
+        import drjit as dr
+        import mitsuba as mi
+
+        index = mi.UInt32(for_kernels(pixels, np.uint32))
+        film = dr.zeros(mi.Float, 3 * len(pixels))
+        for first, count in passes(spp, max(1, _LANES // len(pixels))):
+            paths = wave(camera, index, len(pixels), first, count, spp, *seed)
+            sampler: Any = mi.load_dict({"type": "independent"})
+            state = np.random.SeedSequence([*seed, first]).generate_state(1)[0]
+            sampler.seed(dr.opaque(mi.UInt32, int(state)), count * len(pixels))
+            value = self._integrator.sample(self._scene, sampler, mi.RayDifferential3f(paths.rays))[
+                0
+            ]
+            for channel in range(3):
+                dr.scatter_add(film, value[channel], paths.slot * 3 + channel)
+            dr.eval(film)
+        image = np.array(film, dtype=np.float32).reshape(len(pixels), 3)
+        return np.asarray(image / np.float32(spp), dtype=np.float32)

@@ -1,0 +1,88 @@
+"""The benchmark's subjects are what they say, and its table has every row."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from benchmarks.ablation_table import GROUPS, Table
+from benchmarks.appearance import from_afar, markdown, recovery
+from benchmarks.known_subjects import Rig, bent, dyed, subject
+
+from appearance.bsdf.maps import scalp_coordinates
+from appearance.inverse_rendering.loop import Stage1Options
+from appearance.inverse_rendering.problem import Effort
+from appearance.scene.hair_appearance import HairAppearance
+
+HAIR = HairAppearance((0.1, 0.2, 0.4), 0.28, 0.3)
+SKIN = np.full(3, 0.3)
+
+
+def test_bent_strands_turn_by_five_degrees_and_keep_their_roots(small):
+    strands = small.tuft(300).resampled(2e-3)
+    uv = scalp_coordinates(strands, None)
+    noisy = bent(strands, uv, 5.0, seed=0)
+    cosine = (noisy.tangents() * strands.tangents()).sum(axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.sqrt((angle**2).mean()) == pytest.approx(5.0, rel=0.01)
+    np.testing.assert_allclose(noisy.roots, strands.roots, atol=1e-7)
+    assert np.linalg.norm(noisy.points - strands.points, axis=1).max() < 6e-3
+
+
+def test_dyed_hair_is_lighter_at_the_tips_and_has_wisps_of_other_hues():
+    maps = dyed(HAIR, 0)
+    usual = np.median(maps.sigma_a, axis=(1, 2))
+    np.testing.assert_allclose(usual[0], HAIR.sigma_a)
+    np.testing.assert_allclose(usual[-1], 0.25 * np.array(HAIR.sigma_a))
+    assert (maps.sigma_a[0, ..., 0] > 1).any()
+    with pytest.raises(ValueError, match="no subject 'd'"):
+        subject("d", None, None, HAIR, SKIN)
+
+
+QUICK = Stage1Options(
+    steps=2,
+    check_every=2,
+    shape=(2, 2, 2),
+    effort=Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4),
+)
+
+
+@pytest.fixture(scope="module")
+def captured(small):
+    rig = Rig(size=14, cameras=3, lights=6, spp=64, max_depth=4)
+    return subject("a", small.tuft(150), None, HAIR, SKIN, rig)
+
+
+def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
+    assert captured.held_views == (0, 1)
+    assert captured.train_lights == (0, 2, 4)
+    assert len(captured.training()) == 1
+    rows = Table(captured, QUICK).run(("original",))
+    assert list(rows) == [
+        "mean colour",
+        "three nearest",
+        "HairInverse",
+        "original",
+        "truth, fresh numbers",
+    ]
+    clean = {k: v[GROUPS[1]]["psnr_clean"] for k, v in rows.items()}
+    assert clean["truth, fresh numbers"] > max(clean["mean colour"], clean["three nearest"])
+    assert "| HairInverse |" in markdown({"subjects": {"a": rows}})
+
+
+def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
+    rows = Table(captured, QUICK).run(("original", "lights"))
+    found = recovery(captured, rows, QUICK)
+    as_is, noisy, off = found.values()
+    assert list(as_is) == list(off) == ["HairInverse", "original", "lights"]
+    assert list(noisy) == ["HairInverse", "original"]
+    # three training lamps of one seed are this far off each other; two steps learn no gain
+    assert off["original"]["lamps_off"] == pytest.approx(0.03, abs=0.02)
+    assert off["lights"]["lamps_off"] < 1.5 * off["original"]["lamps_off"]
+    assert as_is["original"] != noisy["original"]
+    starts = from_afar(captured, QUICK)
+    assert [x["start"]["beta_m"] for x in starts] == [0.4, 0.9, 0.02, 0.15]
+    assert all(abs(x["beta_m_error"]) <= abs(x["start"]["beta_m"] / 0.28 - 1) for x in starts)
+    text = markdown({"subjects": {}, "recovery": found, "starts": starts})
+    assert text.count("CPU s") == 4
+    assert text.count("dB") == 8
+    assert text.count("lamps") == 5

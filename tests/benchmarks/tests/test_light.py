@@ -1,0 +1,49 @@
+"""The renderers' benchmark's arithmetic, and one small run of it."""
+
+import json
+
+import numpy as np
+import pytest
+from benchmarks.light import Effort, Subject, relative_mse, run, with_count
+
+from appearance.scene.hair_appearance import HairAppearance
+
+
+def test_the_references_own_noise_is_subtracted():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.5, 2, (3, 4000, 3))
+    power = (truth**2).mean()
+    first, second, image = (truth + rng.normal(scale=s, size=truth.shape) for s in (0.3, 0.3, 0.2))
+    assert relative_mse(image, first, second) == pytest.approx(0.2**2 / power, rel=0.05)
+
+
+def test_lights_that_reach_nothing_are_left_out():
+    truth = np.ones((2, 10, 3))
+    truth[1] = 0
+    assert relative_mse(truth * 1.1, truth, truth) == pytest.approx(0.01)
+    with pytest.raises(ValueError, match="no light reaches the subject"):
+        relative_mse(truth * 0, truth * 0, truth * 0)
+
+
+def test_a_small_run_writes_figures_and_plots(tmp_path, small):
+    subject = Subject(
+        small.tuft(100), small.plane(), HairAppearance((0.5, 0.6, 0.8), 0.3, 0.3), (0.3, 0.3, 0.3)
+    )
+    effort = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2, 16)
+    result = run(tmp_path, {"tuft": subject}, small.camera(), effort=effort)
+    assert json.loads((tmp_path / "light.json").read_text()) == result
+    assert all((tmp_path / f).stat().st_size > 5000 for f in ("light.png", "light_growth.png"))
+    tuft = result["subjects"]["tuft"]
+    assert tuft["agreement"]["ratio"] == pytest.approx(1, abs=0.1)
+    errors = [p["rel_mse"] for p in tuft["lights"]["3"]["series"] if p["method"] == "ours"]
+    assert errors[1] < errors[0]
+    assert result["scanlines"]["one by one"]["gain"] > 1
+    assert set(result["growth"]["strands"]) == {"50", "200"}
+
+
+def test_strands_are_thinned_and_doubled_at_the_same_coverage(small):
+    tuft = small.tuft(100)
+    for count in (30, 100, 250):
+        other = with_count(tuft, count, seed=0)
+        assert len(other) == count
+        assert other.radius * count == pytest.approx(float(np.mean(tuft.radius)) * 100)

@@ -1,0 +1,41 @@
+"""The benchmark's own measures: depths against their cost, the filter bank beside OpenCV's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from benchmarks import light_code_study as study
+
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.images.orientation import LogGaborBank
+from reconstruction.light_codes.options import LightCodeOptions
+
+
+def test_opencvs_loop_gives_what_our_bank_gives() -> None:
+    y, x = np.mgrid[:96, :96]
+    image = np.sin(2 * np.pi * (0.17 * x + 0.09 * y)).astype(np.float32)
+    bank = LogGaborBank(count=12, spread=1.0, wavelength=5.0)
+    found = study.compare_filters(bank, image)
+    assert found["difference"] < 0.03
+    assert found["faster"] > 0
+
+
+def test_brute_force_agrees_with_itself_and_worse_searches_find_less(
+    fibres: Any, monkeypatch: Any
+) -> None:
+    variants = {
+        "candidates": {"1": {"candidates": 1}, "8": {"candidates": 8}, "all": {"candidates": 0}},
+        "coarse-to-fine": {"2": {"coarse": 2}},
+        "neighbours": {"1": {"neighbours": 1}},
+    }
+    monkeypatch.setattr(study, "VARIANTS", variants)
+    inside = np.ones((16, 16, 16), bool)
+    volume = VoxelGrid(np.full(3, -0.032), 4e-3, inside)
+    found = study.study_depths(fibres.views, volume, fibres.strands, LightCodeOptions(), [0, 1])
+    candidates = found["candidates"]
+    assert candidates["all"]["as_brute_force"] == 1
+    assert candidates["1"]["as_brute_force"] <= candidates["8"]["as_brute_force"]
+    assert candidates["8"]["as_brute_force"] > 0.95
+    assert found["coarse-to-fine"]["2"]["as_brute_force"] > 0.95
+    assert found["neighbours"]["1"]["right"] < candidates["8"]["right"]

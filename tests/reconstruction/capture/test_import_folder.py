@@ -1,0 +1,202 @@
+"""Captures made elsewhere, whole and broken."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.import_folder import ImportProblem, import_folder
+from reconstruction.capture.verify import verify
+from reconstruction.files.exr import read_exr, write_exr
+
+CAMERAS = ("cam_00", "left")
+LIGHTS = ("light_00", "light_07")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two cameras and two lights; picture (i, j) is all 10 i + j."""
+    root = tmp_path / "elsewhere"
+    K = [[50, 0, 3.5], [0, 50, 2.5], [0, 0, 1]]
+    cameras = [
+        {
+            "id": i,
+            "width": 8,
+            "height": 6,
+            "K": K,
+            "R": np.eye(3).tolist(),
+            "t": [0, 0, 1 + n],
+            "center": [0, 0, -1 - n],
+        }
+        for n, i in enumerate((0, "left"))
+    ]
+    lights = [
+        {"id": 0, "position": [0, 0, -1], "intensity": [1, 2, 3], "colocated_camera": "left"},
+        {"id": 7, "position": [0, 1, 0], "intensity": [1, 1, 1], "colocated_camera": None},
+    ]
+    units = {"position": "m", "intensity": "W/sr"}
+    for i, camera in enumerate(CAMERAS):
+        (root / "images" / camera).mkdir(parents=True)
+        for j, light in enumerate(LIGHTS):
+            image = np.full((6, 8, 3), 10 * i + j, np.float32)
+            write_exr(root / "images" / camera / f"{light}.exr", image)
+    (root / "masks").mkdir()
+    mask = np.zeros((6, 8), np.uint8)
+    mask[2:4] = 128
+    cv2.imwrite(str(root / "masks" / "left.png"), mask)
+    (root / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    (root / "lights.json").write_text(json.dumps({"units": units, "lights": lights}))
+    return root
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def test_lenses_are_imported(folder: Path, tmp_path: Path) -> None:
+    lens = [-0.1, 0.02, 1e-3, 0, 0]
+    edit(folder / "cameras.json", lambda d: d["cameras"][1].update(distortion=lens))
+    capture = import_folder(folder, tmp_path / "out", lambda _, share: None)
+    straight, bent = capture.rig.cameras
+    assert not straight.distorted
+    assert bent.distortion.tolist() == lens
+
+
+def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
+    shares: list[float] = []
+    capture = import_folder(folder, tmp_path / "out", lambda _, share: shares.append(share))
+    assert verify(tmp_path / "out") == []
+    assert [c.name for c in capture.rig.cameras] == list(CAMERAS)
+    assert capture.olat_lights() == list(LIGHTS)
+    assert capture.olat("left")[:, 0, 0, 0].tolist() == [10, 11]
+    assert [light.beside for light in capture.rig.lights] == ["left", None]
+    mask = capture.mask("left")
+    assert mask is not None
+    assert mask.sum() == 16
+    assert capture.mask("cam_00") is None
+    assert capture.head is None
+    assert capture.manifest is not None
+    assert shares == [0.25, 0.5, 0.75, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "words"),
+    [
+        ("cameras.json", lambda d: d.pop("cameras"), "the field 'cameras' is missing"),
+        ("cameras.json", lambda d: d.update(cameras=[]), "cameras: expected a list"),
+        ("cameras.json", lambda d: d.update(cameras=[3]), r"cameras\[0\]: expected an object"),
+        ("cameras.json", lambda d: d["cameras"][1].pop("K"), r"cameras\[1\]: the field 'K'"),
+        ("cameras.json", lambda d: d["cameras"][0].update(t=[1, 2]), r"cameras\[0\]\.t: expected"),
+        ("cameras.json", lambda d: d["cameras"][0].update(t="abc"), r"cameras\[0\]\.t: expected"),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(distortion=[1]),
+            r"\.distortion: expected",
+        ),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(distortion=[-999, 0, 0, 0, 0]),
+            r"cameras\[0\]: .*folds over",
+        ),
+        ("cameras.json", lambda d: d["cameras"][0].update(width=8.5), r"\.width: expected a whole"),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(R=(2 * np.eye(3)).tolist()),
+            "R is not a rotation",
+        ),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(center=[0, 0, 1]),
+            r"cameras\[0\]\.center: .* is not -Rᵀt",
+        ),
+        ("cameras.json", lambda d: d["cameras"][1].update(id=0), r"cameras\[1\]\.id: 0 is there"),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][1].update(id="../x"),
+            r"cameras\[1\]\.id: expected",
+        ),
+        ("lights.json", lambda d: d["lights"][0].pop("intensity"), r"lights\[0\]: the field"),
+        (
+            "lights.json",
+            lambda d: d["lights"][0].update(intensity=[-1, 0, 0]),
+            r"lights\[0\]\.intensity: must not be negative",
+        ),
+        (
+            "lights.json",
+            lambda d: d["lights"][0].update(colocated_camera=5),
+            r"lights\[0\]\.colocated_camera: no camera has the id 5",
+        ),
+        ("lights.json", lambda d: d["units"].update(position="cm"), r"units\.position: expected"),
+    ],
+)
+def test_wrong_fields_are_named(
+    folder: Path, tmp_path: Path, file: str, change: Callable[[Any], object], words: str
+) -> None:
+    edit(folder / file, change)
+    with pytest.raises(ImportProblem, match=rf"{file}: .*{words}|{file}: {words}"):
+        import_folder(folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("file", ["cameras.json", "lights.json", "images/left/light_07.exr"])
+def test_absent_and_broken_files_are_named(folder: Path, tmp_path: Path, file: str) -> None:
+    (folder / file).write_bytes(b"{ nothing")
+    with pytest.raises(ImportProblem, match=file):
+        import_folder(folder, tmp_path / "out")
+    (folder / file).unlink()
+    with pytest.raises(ImportProblem, match=f"{file}: no such file"):
+        import_folder(folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
+    path = folder / "images" / "left" / "light_07.exr"
+    write_exr(path, np.zeros((8, 6, 3), np.float32))
+    with pytest.raises(ImportProblem, match=r"light_07\.exr: 6x8 pixels, cameras.json gives left"):
+        import_folder(folder, tmp_path / "out")
+    write_exr(path, np.full((6, 8, 3), np.nan, np.float32))
+    with pytest.raises(ImportProblem, match=r"light_07\.exr: has pixels that are not finite"):
+        import_folder(folder, tmp_path / "out")
+    cv2.imwrite(str(folder / "masks" / "left.png"), np.zeros((3, 3), np.uint8))
+    with pytest.raises(ImportProblem, match=r"left\.png: expected a PNG"):
+        import_folder(folder, tmp_path / "out")
+    (folder / "head.obj").write_text("v 0 0 0\n")
+    (folder / "masks" / "left.png").unlink()
+    with pytest.raises(ImportProblem, match=r"head\.obj: no faces"):
+        import_folder(folder, tmp_path / "out")
+
+
+def test_never_writes_over_something(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="new or empty"):
+        import_folder(folder, tmp_path)
+    with pytest.raises(ImportProblem, match="nowhere: no such folder"):
+        import_folder(tmp_path / "nowhere", tmp_path / "out")
+
+
+def test_a_capture_rendered_by_cycles(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    source = shared_data("captures/cycles_wavy")
+    capture = import_folder(source, tmp_path / "out")
+    assert isinstance(capture, Capture)
+    assert len(capture.rig.cameras) == 8
+    assert len(capture.olat_lights()) == 10
+    besides = [light.beside for light in capture.rig.lights]
+    assert besides == [*(c.name for c in capture.rig.cameras), None, None]
+    for light, camera in zip(capture.rig.lights, capture.rig.cameras, strict=False):
+        assert np.allclose(light.position, camera.center, atol=1e-6)
+    original, _ = read_exr(source / "images" / "cam_03" / "light_05.exr")
+    step = capture.of_kind("olat")[5]
+    np.testing.assert_array_equal(capture.response(step, "cam_03"), original)
+    for camera in capture.rig.cameras:
+        mask = capture.mask(camera.name)
+        assert mask is not None
+        assert 0.1 < mask.mean() < 0.6
+    assert verify(tmp_path / "out") == []

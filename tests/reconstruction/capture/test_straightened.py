@@ -1,0 +1,118 @@
+"""Lenses that bend lines: what is reconstructed through them is what pinholes give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.undistorted import StraightenedCapture, _Lens, as_shot, straightened
+from reconstruction.geometry.cameras import Camera
+from reconstruction.images.silhouettes import silhouette
+from reconstruction.light_planes import solve_motion, triangulate
+from reconstruction.report.report import Report
+
+BARREL, PINCUSHION = [-3.5, 6.0, 0.03, -0.03], [4.0, 0.0, -0.03, 0.05]
+POSES = [(np.eye(3), np.array([0.0, 2e-4 * k, -3e-4 * k])) for k in range(4)]
+
+
+@pytest.fixture(scope="module")
+def cameras(stage_camera: Callable[..., Camera]) -> list[Camera]:
+    return [stage_camera(n, a, 10.0, size=80) for n, a in (("left", -40), ("right", 35))]
+
+
+@pytest.fixture(scope="module")
+def bent(shoot: Callable[..., Capture], cameras: list[Camera]) -> Capture:
+    lenses = [replace(c, distortion=k) for c, k in zip(cameras, (BARREL, PINCUSHION), strict=True)]
+    return shoot(cameras=lenses, poses=POSES, full_scale=0.9)
+
+
+@pytest.fixture(scope="module")
+def plain(shoot: Callable[..., Capture], cameras: list[Camera]) -> Capture:
+    return shoot(cameras=cameras, poses=POSES, full_scale=0.9)
+
+
+def test_a_lens_moves_pixels_by_more_than_the_test_allows(bent: Capture) -> None:
+    for device in bent.rig.cameras:
+        point = device.center + device.rays([70, 40]) * 0.9
+        assert np.abs(replace(device, distortion=[0]).project(point)[0] - [70, 40]).max() > 0.8
+
+
+def test_points_and_motion_are_those_of_pinholes(bent: Capture, plain: Capture) -> None:
+    report = Report()
+    capture = straightened(bent, report)
+    assert all(0.85 < share <= 1 for share in report["lenses"].figures["pixels_kept"].values())
+    clouds, shifts = [], []
+    for source in (plain, capture):
+        cloud = triangulate(source)
+        motion = solve_motion(source, cloud)
+        assert motion.determined == 6
+        shifts.append(motion.translations[-1])
+        cloud = triangulate(source, motion=replace(motion, between="hold"))
+        clouds.append(np.abs(np.linalg.norm(cloud.points, axis=1) - 0.1))
+    assert len(clouds[1]) > 0.9 * len(clouds[0])
+    assert np.median(clouds[1]) < 1.3 * np.median(clouds[0]) + 1e-5
+    assert np.percentile(clouds[1], 90) < 2 * np.percentile(clouds[0], 90)
+    assert np.abs(shifts[1] - shifts[0]).max() < 5e-5
+
+
+def test_through_the_bent_pictures_the_points_are_off(bent: Capture, plain: Capture) -> None:
+    """What the test above is worth: pinholes that were bent are seen."""
+    off = []
+    for source in (plain, StraightenedCapture(bent)):
+        if source is not plain:
+            source.rig = plain.rig
+            source._lenses = {}
+        cloud = triangulate(source)
+        off.append(np.median(np.abs(np.linalg.norm(cloud.points, axis=1) - 0.1)))
+    assert off[1] > 2 * off[0]
+
+
+def test_frames_masks_and_saturation_are_straight(bent: Capture) -> None:
+    (bent.path / "masks").mkdir(exist_ok=True)
+    capture = StraightenedCapture(bent)
+    for device in bent.rig.cameras:
+        shot = silhouette(bent, device.name)
+        cv2.imwrite(str(bent.path / "masks" / f"{device.name}.png"), shot.astype(np.uint8) * 255)
+        straight, mask = silhouette(capture, device.name), capture.mask(device.name)
+        assert mask is not None
+        assert mask.shape == straight.shape
+        assert (mask ^ straight).sum() < 0.04 * mask.sum()
+        again = as_shot(capture, device.name, straight)
+        assert (again ^ shot).sum() < 0.04 * shot.sum()
+        assert as_shot(bent, device.name, shot) is shot
+        step = next(s for s in bent.of_kind("scanline") if s.row == 20)
+        for image in (capture.frame(step, device.name), bent.frame(step, device.name)):
+            assert image.min() == 0  # nothing rings
+        response, full = capture.response_and_saturated(step, device.name)
+        assert full.any() == bent.saturated(step, device.name).any()
+        assert response[~full].max() < 0.95
+        assert np.array_equal(capture.saturated(step, device.name), full)
+
+
+def test_a_wave_of_eleven_pixels_is_resampled_to_two_hundredths() -> None:
+    camera = Camera.look_at("c", 96, 80, (0, -1, 0), (0, 0, 0), 30.0)
+    lens = replace(camera, distortion=[-0.4, 0.1, 0.005, 0.002])
+    way = _Lens.of(lens)
+
+    def wave(device: Camera) -> np.ndarray:
+        x, y = np.meshgrid(np.arange(device.width), np.arange(device.height))
+        rays = device.rays(np.stack([x, y], axis=-1))
+        u, v = rays[..., 0] / rays[..., 1], rays[..., 2] / rays[..., 1]
+        picture = 1 + 0.5 * np.sin(100 * u) * np.cos(80 * v)
+        return np.repeat(picture[..., None], 3, axis=-1).astype(np.float32)
+
+    assert way.straight.width > 96  # a barrel's middle is drawn out
+    error = np.abs(way.straighten(wave(lens)) - wave(way.straight))
+    assert np.percentile(error, 99) < 0.02
+    assert error.max() < 0.04
+
+
+def test_cameras_without_a_lens_are_read_as_they_are(plain: Capture) -> None:
+    report = Report()
+    assert straightened(plain, report) is plain
+    assert not report.stages

@@ -1,0 +1,255 @@
+"""Strands beside the true ones: errors, lengths, wholeness, roots, regions, pictures."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from reconstruction.evaluation import oriented_points
+from reconstruction.evaluation import regions as hair_regions
+from reconstruction.evaluation.assessment import assess_strands, input_warnings, root_figures
+from reconstruction.evaluation.connectivity import length_figures
+from reconstruction.evaluation.error_pictures import draw_errors
+from reconstruction.evaluation.oriented_points import OrientedPoints
+from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+
+
+def lines(starts: NDArray[np.floating], ends: NDArray[np.floating]) -> Strands:
+    points = np.stack([starts, ends], axis=1).reshape(-1, 3)
+    return Strands(points.astype(np.float32), 2 * np.arange(len(starts) + 1))
+
+
+def row(count: int = 5, length: float = 0.1, apart: float = 0.02) -> Strands:
+    """Lines along x from x = 0, far from each other."""
+    starts = np.column_stack([np.zeros(count), apart * np.arange(count), np.zeros(count)])
+    return lines(starts, starts + np.array([length, 0, 0]))
+
+
+def brush(count: int = 3000, radius: float = 0.09, length: float = 0.03) -> Strands:
+    """Hair that stands off a sphere, all but a face towards -y and a neck below."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z**2)
+    out = np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+    out = out[(z > -0.6) & ~((out[:, 1] < -0.5) & (z < 0.4))]
+    return lines(radius * out, (radius + length) * out)
+
+
+@pytest.mark.parametrize("shift", [5e-4, 2.5e-3, 8e-3])
+def test_a_shift_is_the_distance_that_is_reported(shift: float) -> None:
+    errors = assess_strands(row().transformed(np.eye(3), [0, 0, shift]), row()).figures["errors"]
+    for which in ("pred", "true"):
+        for mark in ("mean", "p5", "p50", "p95"):
+            assert errors[which]["distance_mm"][mark] == pytest.approx(1e3 * shift, rel=1e-4)
+        assert errors[which]["angle_deg"]["p95"] == pytest.approx(0, abs=0.1)
+        assert errors[which]["reversed"] == 0.0
+
+
+def test_a_turn_is_the_angle_that_is_reported_and_turned_round_is_not_an_angle() -> None:
+    true = lines(np.zeros((1, 3)), np.array([[0.1, 0, 0]]))
+    c, s = np.cos(np.radians(7)), np.sin(np.radians(7))
+    turned = true.transformed([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.zeros(3))
+    for pred, other_way in ((turned, 0.0), (Strands(turned.points[::-1], turned.offsets), 1.0)):
+        errors = assess_strands(pred, true).figures["errors"]["pred"]
+        assert errors["angle_deg"]["p5"] == pytest.approx(7, abs=0.05)
+        assert errors["angle_deg"]["p95"] == pytest.approx(7, abs=0.05)
+        assert errors["reversed"] == other_way
+
+
+def test_lengths_and_how_far_their_distributions_are_apart() -> None:
+    figures = length_figures(row(4, 0.05), row(10, 0.08))
+    assert figures["pred"]["strands"] == 4
+    assert figures["pred"]["total_m"] == pytest.approx(0.2, rel=1e-6)
+    for mark in ("mean", "p5", "p50", "p95"):
+        assert figures["true"][mark] == pytest.approx(80, rel=1e-5)
+    assert figures["distance_mm"] == pytest.approx(30, rel=1e-5)
+    starts = np.zeros((101, 3))
+    even = lines(starts, np.column_stack([np.linspace(0, 0.1, 101), *starts.T[:2]]))
+    marks = length_figures(even, row(1, 0.1))
+    assert [marks["pred"][p] for p in ("p5", "p25", "p50", "p75", "p95")] == pytest.approx(
+        [5, 25, 50, 75, 95], rel=1e-5
+    )
+    assert marks["distance_mm"] == pytest.approx(50, rel=1e-5)  # from a uniform one to its end
+    assert "distance_mm" not in length_figures(Strands.from_list([]), row())
+
+
+def test_whole_strands_are_whole() -> None:
+    figures = assess_strands(row(), row()).figures["connectivity"]
+    for of, name in (("pred", "on_one"), ("true", "by_one"), ("true", "covered")):
+        assert figures[of][name]["p5"] == 1.0
+        assert figures[of][name]["error"] == 0.0
+    for name in ("covering", "fragments"):
+        assert figures["true"][name]["mean"] == 1.0
+
+
+def test_a_strand_cut_in_four_has_four_fragments() -> None:
+    cuts = np.linspace(0, 0.1, 5)
+    pieces = Strands.from_list(
+        [
+            np.array([[a + 3e-3, y, 0], [b - 3e-3, y, 0]])
+            for y in 0.02 * np.arange(5)
+            for a, b in pairwise(cuts)
+        ]
+    )
+    figures = assess_strands(pieces, row()).figures["connectivity"]
+    assert figures["pred"]["on_one"]["mean"] == 1.0
+    assert figures["true"]["fragments"]["mean"] == 4.0
+    assert figures["true"]["covering"]["mean"] == 4.0
+    # each covers its 19 mm and 2 mm to both sides
+    assert figures["true"]["by_one"]["mean"] == pytest.approx(0.23, abs=0.015)
+    assert figures["true"]["covered"]["mean"] == pytest.approx(0.88, abs=0.03)
+
+
+def test_doubles_lie_along_a_strand_but_do_not_break_it() -> None:
+    doubled = Strands.from_list([row()[i] for i in range(5) for _ in range(3)])
+    figures = assess_strands(doubled, row()).figures["connectivity"]["true"]
+    assert figures["covering"]["mean"] == 3.0
+    assert figures["fragments"]["mean"] == 1.0
+
+
+def test_a_strand_that_changes_hairs_lies_on_one_of_them_by_half() -> None:
+    jump = np.array([[0, 0, 0], [0.049, 0, 0], [0.051, 0.02, 0], [0.1, 0.02, 0]])
+    figures = assess_strands(Strands.from_list([jump]), row()).figures["connectivity"]
+    assert figures["pred"]["on_one"]["mean"] == pytest.approx(49 / 118, abs=0.02)
+    missing = assess_strands(row(2), row(5)).figures["connectivity"]["true"]
+    assert missing["covered"]["mean"] == pytest.approx(0.4)
+    assert missing["fragments"]["mean"] == 1.0  # of those that are covered at all
+
+
+def test_wholeness_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = row(12, apart=1e-3)
+    pred = true.transformed(np.eye(3), [0, 5e-4, 1e-3]).subset(np.arange(3, 9))
+    whole = assess_strands(pred, true).figures
+    assert whole["connectivity"]["true"]["covering"]["mean"] >= 2
+    monkeypatch.setattr(oriented_points, "BLOCK", 250)
+    monkeypatch.setattr(oriented_points, "MOST_PAIRS", 300)
+    assert assess_strands(pred, true).figures == whole
+
+
+def test_strands_that_reach_the_scalp_with_root_or_tip() -> None:
+    true = brush()
+    loose = true.subset([2]).transformed(np.eye(3), 0.3 * true.roots[2])
+    turned = Strands(true.subset([1]).points[::-1], [0, 2])
+    pred = Strands.from_list([true[0], turned[0], loose[0], true[3]])
+    assert root_figures(pred, true)["pred"] == {"rooted": 0.5, "upside_down": 0.25}
+    assert root_figures(pred, true)["true"] == {"rooted": 1.0, "upside_down": 0.0}
+    floor = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0.0]])
+    head = Mesh(floor, np.array([[0, 1, 2]]), np.array([True]))
+    up = lines(np.array([[0, 0, 4e-3], [0, 0, 6e-3]]), np.array([[0, 0, 0.1], [0, 0, 0.1]]))
+    assert root_figures(up, true, head)["scalp"] == "marked"
+    assert root_figures(up, true, head)["pred"]["rooted"] == 0.5
+
+
+def test_regions_of_the_scalp() -> None:
+    sphere = HeadSphere.of(brush())
+    assert sphere is not None
+    np.testing.assert_allclose(sphere.center, 0, atol=1e-5)
+    assert sphere.radius == pytest.approx(0.09, rel=1e-4)
+    for name, *at in [
+        ("front", 0, -0.9, 0.4),
+        ("top", 0, 0, 1),
+        ("sides", 0.9, 0.1, 0),
+        ("sides", -0.9, -0.1, 0.2),
+        ("back", 0.1, 0.9, 0.2),
+        ("nape", 0, 0.8, -0.5),
+    ]:
+        assert SCALP[sphere.scalp_regions(0.09 * np.array([at]))[0]] == name
+    assert HeadSphere.of(row(30)) is None
+    assert HeadSphere.of(Strands.from_list([])) is None
+
+
+def test_what_is_missing_in_one_region_is_missed_there_only() -> None:
+    true = brush()
+    sphere = HeadSphere.of(true)
+    assert sphere is not None
+    region = sphere.scalp_regions(true.roots)
+    pred = true.subset(region != SCALP.index("nape"))
+    regions = assess_strands(pred, true, samples=None).figures["regions"]["scalp"]
+    assert set(regions) == set(SCALP)
+    for name, scores in regions.items():
+        missing = name == "nape"
+        assert scores["1mm_10deg"]["precision"] == (0.0 if missing else 1.0)
+        assert (scores["1mm_10deg"]["recall"] < 0.1) if missing else scores["1mm_10deg"]["f"] == 1.0
+        assert (scores["points"]["pred"] == 0) == missing
+    assert sum(s["points"]["true"] for s in regions.values()) == OrientedPoints(true).count
+
+
+def test_depth_below_the_surface() -> None:
+    true = brush(6000)
+    depth = HairDepth(OrientedPoints(true), HeadSphere.of(true))
+    up = np.outer([0.118, 0.112, 0.095, 0.0, 0.14, 9], [0, 0, 1])
+    names = [DEPTHS[k] for k in depth.regions(up)]
+    assert names == ["outer", "inner", "inner", "inner", "outer", "outer"]
+    tips = lines(true.roots + (true.points[1::2] - true.roots) * 0.9, true.points[1::2])
+    figures = assess_strands(tips, true).figures["regions"]["depth"]
+    assert figures["outer"]["1mm_10deg"]["recall"] > 0.5
+    assert figures["inner"]["1mm_10deg"]["recall"] < 0.05
+
+
+def test_input_that_looks_wrong_is_said() -> None:
+    assert input_warnings(row(), row()) == []
+    millimetres = Strands(row().points * np.float32(1e3), row().offsets)
+    assert "span 128 m" in input_warnings(millimetres, row())[0]
+    assert "both in metres?" in input_warnings(millimetres, row())[0]
+    assert "one frame" in input_warnings(row().transformed(np.eye(3), [3, 0, 0]), row())[0]
+    still = Strands(np.repeat(row().points[:2], 2, axis=0), [0, 2, 4])
+    assert "2 of 2 predicted strands have no length" in input_warnings(still, still)[-1]
+
+
+@pytest.mark.parametrize(
+    "pred",
+    [
+        Strands.from_list([]),
+        Strands.from_list([np.zeros((2, 3))]),
+        Strands(row(1).points * np.float32(1e3), [0, 2]),
+        Strands.from_list([np.array([[0, 0, 0.09], [0, 0, 1e-12]])]),
+    ],
+    ids=["none", "a point", "millimetres", "one"],
+)
+def test_degenerate_predictions_give_finite_figures(pred: Strands) -> None:
+    figures = assess_strands(pred, brush(400), samples=2000).figures
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    assert figures["all"]["1mm_10deg"]["recall"] <= 0.1
+
+
+@pytest.mark.parametrize("pred", [Strands.from_list([]), row()], ids=["none", "some"])
+def test_pictures(pred: Strands, tmp_path: Path) -> None:
+    pictures = draw_errors(assess_strands(pred, brush(400), samples=500), tmp_path)
+    assert {p.name for p in pictures} == {"distance.png", "angle.png", "regions.png", "lengths.png"}
+    assert all(p.stat().st_size > 5000 for p in pictures)
+
+
+def test_a_single_true_strand() -> None:
+    true = row(1)
+    figures = assess_strands(true, true).figures
+    assert figures["all"]["1mm_10deg"]["f"] == 1.0
+    assert "scalp" not in figures["regions"]
+    assert "do not lie on a head" in figures["warnings"][0]
+    with pytest.raises(ValueError, match="no true strands"):
+        assess_strands(true, Strands.from_list([]))
+
+
+def test_a_truth_of_hundreds_of_metres_fits_into_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hair_regions, "MOST_VOXELS", 100_000)
+    true = Strands.from_list([np.array([[0, 0, 0], [0, 0, 90.0]]), np.zeros((2, 3))])
+    figures = assess_strands(row(1), true, samples=500).figures
+    assert figures["regions"]["depth"]["outer"]["points"]["true"] > 400
+    assert "are both in metres?" in figures["warnings"][0]
+
+
+def test_sampled_wholeness_says_its_error() -> None:
+    rng = np.random.default_rng(0)
+    true = row(3000, 0.02, 5e-3)
+    keep = rng.random(len(true)) < 0.7
+    covered = assess_strands(true.subset(keep), true, samples=500).figures["connectivity"]["true"]
+    assert covered["followed"] == 1000
+    error = covered["covered"]["error"]
+    assert error == pytest.approx(np.sqrt(0.7 * 0.3 / 1000), rel=0.1)
+    assert abs(covered["covered"]["mean"] - keep.mean()) < 4 * error

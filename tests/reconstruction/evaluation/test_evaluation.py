@@ -1,0 +1,252 @@
+"""Strands scored against true ones, and what counts as visible."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from reconstruction.evaluation import oriented_points
+from reconstruction.evaluation.matching import compare_strands
+from reconstruction.evaluation.oriented_points import OrientedPoints
+from reconstruction.evaluation.visibility import Visibility
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.strands import Strands
+
+NAMES = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
+
+
+def curtain(depth: float = 0.0, tilt_deg: float = 0.0, spacing: float = 4e-3) -> Strands:
+    """Parallel lines 60 mm long in the plane y = depth, turned by `tilt_deg` within it."""
+    c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    along = np.array([s, 0, -c])
+    return Strands.from_list(
+        [
+            np.array([[x, depth, 0.03], np.array([x, depth, 0.03]) + 0.06 * along])
+            for x in np.arange(-0.05, 0.05, spacing)
+        ],
+        radius=3e-4,
+    )
+
+
+def moved(strands: Strands, offset: tuple[float, float, float]) -> Strands:
+    return strands.transformed(np.eye(3), offset)
+
+
+@pytest.fixture
+def front() -> Camera:
+    return Camera.look_at("front", 120, 100, [0, -1, 0], [0, 0, 0], 12)
+
+
+def test_a_set_matches_itself(front: Camera) -> None:
+    scores = compare_strands(curtain(), curtain(), cameras=[front])
+    for part in ("visible", "all"):
+        for name in NAMES:
+            assert scores[part][name]["f"] == 1.0
+            assert scores[part][name]["recall_error"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("offset", "expected"),
+    [(0.0009, (1, 1, 1)), (0.0015, (0, 1, 1)), (0.0025, (0, 0, 1)), (0.0031, (0, 0, 0))],
+)
+def test_distances(offset: float, expected: tuple[int, int, int]) -> None:
+    scores = compare_strands(moved(curtain(), (0, offset, 0)), curtain())["all"]
+    assert tuple(scores[n]["f"] for n in NAMES) == expected
+    assert set(scores) == set(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("angle", "expected"), [(9, (1, 1, 1)), (11, (0, 1, 1)), (21, (0, 0, 1)), (31, (0, 0, 0))]
+)
+def test_angles(angle: float, expected: tuple[int, int, int]) -> None:
+    """Short, turned pieces on a true line: every point is near enough, only the angle counts."""
+    true = Strands.from_list([np.array([[0, 0, -0.1], [0, 0, 0.1]])])
+    half = 3e-4 * np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+    centers = [np.array([0, 0, z]) for z in np.arange(-0.09, 0.09, 1e-3)]
+    pred = Strands.from_list([np.stack([c - half, c + half]) for c in centers])
+    scores = compare_strands(pred, true)["all"]
+    assert tuple(scores[n]["precision"] for n in NAMES) == expected
+
+
+def test_direction_of_travel_counts_only_where_it_is_asked_for(front: Camera) -> None:
+    true = curtain()
+    flipped = Strands.from_list([true[i][::-1] for i in range(len(true))])
+    scores = compare_strands(flipped, true, cameras=[front])
+    for part in ("visible", "all"):
+        for name in NAMES:
+            assert scores[part][name]["f"] == 1.0
+            assert scores["directed"][part][name]["f"] == 0.0
+    same = compare_strands(true, true, cameras=[front])
+    assert same["directed"] == {part: same[part] for part in ("visible", "all")}
+
+
+def test_half_of_the_strands_upside_down() -> None:
+    true = curtain()
+    n = len(true)
+    pred = Strands.from_list([true[i][:: -1 if i < 10 else 1] for i in range(n)])
+    scores = compare_strands(pred, true)
+    assert scores["all"]["1mm_10deg"]["f"] == 1.0
+    assert scores["directed"]["all"]["1mm_10deg"]["precision"] == pytest.approx((n - 10) / n)
+
+
+def test_any_point_within_reach_may_match() -> None:
+    """A nearer strand of the wrong direction does not take the match away."""
+    true = Strands.from_list([np.array([[0, 0, -0.02], [0, 0, 0.02]])])
+    across = Strands.from_list([np.array([[-0.02, 1e-4, z], [0.02, 1e-4, z]]) for z in (-0.01, 0)])
+    both = Strands.from_list([*(across[i] for i in range(2)), true[0] + np.array([5e-4, 0, 0])])
+    assert compare_strands(both, true)["all"]["1mm_10deg"]["recall"] == 1.0
+
+
+def test_half_of_the_truth() -> None:
+    true = curtain()
+    half = true.subset(np.arange(0, len(true), 2))
+    scores = compare_strands(half, true)["all"]["1mm_10deg"]
+    assert scores["precision"] == 1.0
+    assert scores["recall"] == pytest.approx(0.52, abs=1e-9)  # 13 of 25 lines
+    assert scores["f"] == pytest.approx(2 * 0.52 / 1.52)
+
+
+def test_no_prediction_scores_nothing(front: Camera) -> None:
+    scores = compare_strands(Strands.from_list([]), curtain(), cameras=[front])
+    assert scores["visible"]["3mm_30deg"] == dict.fromkeys(
+        ("precision", "recall", "f", "precision_error", "recall_error"), 0.0
+    )
+
+
+def test_no_truth_is_an_error(front: Camera) -> None:
+    with pytest.raises(ValueError, match="no true strands"):
+        compare_strands(curtain(), Strands.from_list([]))
+    with pytest.raises(ValueError, match="no camera sees any"):
+        compare_strands(curtain(), moved(curtain(), (5, 0, 0)), cameras=[front])
+
+
+def test_sampling_is_within_its_error_and_repeats() -> None:
+    true = curtain(spacing=5e-4)
+    pred = Strands.from_list(
+        [true[i] + np.array([0, 2e-3 * (i % 3 == 0), 0]) for i in range(len(true))]
+    )
+    pred = pred.subset(np.arange(0, len(pred), 5))
+    exact = compare_strands(pred, true, samples=None)["all"]["1mm_10deg"]
+    some = compare_strands(pred, true, samples=500, seed=3)["all"]["1mm_10deg"]
+    assert 0.3 < exact["precision"] < 0.9
+    assert 0.005 < some["precision_error"] < 0.025
+    assert exact["precision_error"] == 0.0
+    for key in ("precision", "recall"):
+        assert abs(some[key] - exact[key]) < 4 * some[f"{key}_error"] + 1e-12
+    assert compare_strands(pred, true, samples=500, seed=3)["all"]["1mm_10deg"] == some
+
+
+def test_any_number_of_blocks_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = curtain(spacing=1e-3)
+    pred = moved(curtain(spacing=2e-3, tilt_deg=4), (0, 8e-4, 0))
+    whole = compare_strands(pred, true, samples=1500)
+    assert 0.1 < whole["all"]["1mm_10deg"]["precision"] < 0.99
+    for block in (1, 150, 2000):
+        monkeypatch.setattr(oriented_points, "BLOCK", block)
+        assert compare_strands(pred, true, samples=1500) == whole
+        monkeypatch.setattr(oriented_points, "MOST_PAIRS", 50)
+    assert compare_strands(pred, true, samples=1500) == whole
+
+
+def test_points_are_those_of_the_resampled_strands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oriented_points, "BLOCK", 500)
+    strands = curtain(tilt_deg=3)
+    points, expected = OrientedPoints(strands), strands.resampled(1e-3)
+    blocks = list(points.blocks())
+    assert len(blocks) > 2
+    np.testing.assert_array_equal(np.concatenate([b.points for b in blocks]), expected.points)
+    tangents = np.concatenate([b.tangents for b in blocks])
+    np.testing.assert_array_equal(tangents, expected.tangents())
+    some = points.of_strands(np.array([7, 2]))
+    wanted = expected.subset([7, 2])
+    np.testing.assert_array_equal(some.points, wanted.points)
+    np.testing.assert_allclose(some.tangents, wanted.tangents(), atol=1e-6)
+    assert set(some.strand) == {2, 7}
+
+
+def test_strands_of_no_length_match_nothing() -> None:
+    true = curtain()
+    still = Strands(np.repeat(true.roots, 2, axis=0), 2 * np.arange(len(true) + 1))
+    scores = compare_strands(still, true)["all"]["3mm_30deg"]
+    assert scores["precision"] == scores["recall"] == scores["f"] == 0.0
+
+
+def test_strands_in_another_unit_are_refused_before_they_fill_the_memory() -> None:
+    huge = Strands(curtain().points * np.float32(1e6), curtain().offsets).subset([0, 1])
+    with pytest.raises(ValueError, match=r"longest strand is 60,\d+ m .*in metres"):
+        compare_strands(huge, curtain())
+    many = Strands.from_list([np.array([[0, 0, 0], [0, 0, 900.0]])] * 400)
+    with pytest.raises(ValueError, match=r"360 km long together.*in metres"):
+        compare_strands(many, curtain())
+
+
+def test_what_hangs_behind_strands_is_hidden(front: Camera) -> None:
+    dense = curtain(spacing=2.5e-4)
+    visible = Visibility([front], dense)
+    inner = dense.subset(np.arange(40, len(dense) - 40)).resampled(1e-3).points
+    inner = inner[np.abs(inner[:, 2]) < 0.02]
+    assert visible(inner).all()
+    assert visible(inner + np.array([0, 0.9e-3, 0], np.float32)).all()
+    assert not visible(inner + np.array([0, 1.2e-3, 0], np.float32)).any()
+    back = Camera.look_at("back", 120, 100, [0, 1, 0], [0, 0, 0], 12)
+    assert Visibility([front, back], dense)(inner + np.array([0, 1.2e-3, 0], np.float32)).all()
+
+
+def test_gaps_between_strands_are_open(front: Camera) -> None:
+    visible = Visibility([front], curtain(spacing=4e-3))
+    rng = np.random.default_rng(0)
+    points = np.column_stack(
+        [rng.uniform(-0.045, 0.045, 4000), np.full(4000, 0.01), rng.uniform(-0.02, 0.02, 4000)]
+    )
+    # lines of 0.6 mm every 4 mm, a pixel of 0.6 mm: between 0.6 and 1.2 of 4 mm are covered
+    assert 0.70 < visible(points).mean() < 0.86
+
+
+def test_the_head_hides_and_the_image_ends(front: Camera) -> None:
+    plate = Mesh(
+        np.array([[-0.1, 0, -0.1], [0.1, 0, -0.1], [0.1, 0, 0], [-0.1, 0, 0.0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    behind = curtain(depth=5e-3)
+    points = behind.resampled(1e-3).points
+    seen = Visibility([front], behind, plate)(points)
+    below = points[:, 2] < -1.5e-3
+    assert not seen[below].any()
+    assert seen[points[:, 2] > 1.5e-3].all()
+    assert not Visibility([front], behind)(points + np.float32(0.2)).any()
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_strands_are_scored_in_half_a_gigabyte() -> None:
+    """20 million points on both sides: docs/evaluation.md tells the figures."""
+    code = """
+import resource, time
+import subprocess
+import sys
+
+import numpy as np
+from reconstruction.evaluation.matching import compare_strands
+from reconstruction.geometry.strands import Strands
+
+def hair(seed):
+    rng = np.random.default_rng(seed)
+    out = rng.normal(size=(100_000, 1, 3))
+    out /= np.linalg.norm(out, axis=2, keepdims=True)
+    s = np.linspace(0, 0.2, 20)[:, None]
+    points = (0.09 + s) * out - np.array([0, 0, 3.0]) * s**2
+    return Strands(points.reshape(-1, 3), 20 * np.arange(100_001))
+
+pred, true = hair(1), hair(2)
+start = time.process_time()
+f = compare_strands(pred, true)["all"]["1mm_10deg"]["f"]
+print(f, time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    f, seconds, kilobytes = map(float, done.stdout.split())
+    print(f"F {f:.3f}, {seconds:.0f} s of processor time, {kilobytes / 1e6:.2f} GB")
+    assert 0.3 < f < 1
+    assert kilobytes < 512_000

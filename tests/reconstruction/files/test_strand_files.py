@@ -1,0 +1,414 @@
+"""Strand files: what is written is read back, and no broken file is believed."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from reconstruction.files.strands import (
+    READABLE,
+    WRITABLE,
+    StrandFileError,
+    read_strands,
+    write_strands,
+)
+from reconstruction.geometry.strands import Strands
+
+BOTH_WAYS = [suffix for suffix in WRITABLE if suffix in READABLE]
+
+metres = st.floats(-2, 2, width=32)
+radii = st.floats(2**-17, 2**-10, width=32)
+
+
+@st.composite
+def some_strands(draw: st.DrawFn) -> Strands:
+    counts = np.array(draw(st.lists(st.integers(2, 6), max_size=6)), np.int64)
+    total = int(counts.sum())
+    points = draw(hnp.arrays(np.float32, (total, 3), elements=metres))
+    radius = draw(st.one_of(radii, hnp.arrays(np.float32, total, elements=radii)))
+    return Strands(points, np.concatenate([[0], np.cumsum(counts)]), radius)
+
+
+@pytest.fixture
+def two() -> Strands:
+    line = np.array([[0, 0, 0], [0, 0, 0.01], [0, 0.01, 0.02]])
+    return Strands.from_list([line, line[:2] + 0.1], radius=2e-4)
+
+
+@pytest.mark.parametrize("suffix", BOTH_WAYS)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@given(strands=some_strands())
+def test_read_back(suffix: str, strands: Strands, tmp_path: Path) -> None:
+    path = tmp_path / f"hair{suffix}"
+    write_strands(path, strands)
+    again = read_strands(path)
+    np.testing.assert_array_equal(again.points, strands.points)
+    np.testing.assert_array_equal(again.offsets, strands.offsets)
+    if len(strands):
+        widths = [np.broadcast_to(s.radius, len(s.points)) for s in (again, strands)]
+        np.testing.assert_allclose(widths[0], widths[1], rtol=1e-6)
+    assert not list(tmp_path.glob("*.part*"))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hair", ".usdc"])
+def test_a_scalar_radius_stays_a_scalar(suffix: str, two: Strands, tmp_path: Path) -> None:
+    write_strands(tmp_path / f"hair{suffix}", two)
+    radius = read_strands(tmp_path / f"hair{suffix}").radius
+    assert isinstance(radius, float)
+    assert radius == pytest.approx(2e-4, rel=1e-6)
+
+
+@pytest.mark.parametrize("suffix", BOTH_WAYS)
+def test_cut_files_are_errors_that_name_the_file(suffix: str, two: Strands, tmp_path: Path) -> None:
+    path = tmp_path / f"hair{suffix}"
+    write_strands(path, two)
+    whole = path.read_bytes()
+    for keep in (0, 3, len(whole) // 4, len(whole) // 2, len(whole) - 5):
+        path.write_bytes(whole[:keep])
+        with pytest.raises(StrandFileError, match=f"hair{suffix}"):
+            read_strands(path)
+
+
+@pytest.mark.parametrize("suffix", READABLE)
+def test_another_files_bytes_are_an_error(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"hair{suffix}"
+    path.write_bytes(b"PNG not hair at all " * 30)
+    with pytest.raises(StrandFileError, match=f"hair{suffix}"):
+        read_strands(path)
+
+
+def test_unknown_formats_and_absent_files(two: Strands, tmp_path: Path) -> None:
+    with pytest.raises(StrandFileError, match=r"readable are .*\.hair"):
+        read_strands(tmp_path / "hair.abc")
+    with pytest.raises(StrandFileError, match=r"writable are .*\.usdc"):
+        write_strands(tmp_path / "hair.tfx", two)
+    with pytest.raises(StrandFileError, match="no such file"):
+        read_strands(tmp_path / "hair.npz")
+
+
+def hair_bytes(
+    magic: bytes = b"HAIR",
+    strands: int = 2,
+    points: int = 6,
+    flags: int = 2,
+    default: int = 2,
+    body: bytes | None = None,
+) -> bytes:
+    xyz = np.arange(3 * 6, dtype="<f4")
+    header = struct.pack(
+        "<4s4I5f88s", magic, strands, points, flags, default, 1e-3, 0, 1, 1, 1, b""
+    )
+    return header + (xyz.tobytes() if body is None else body)
+
+
+@pytest.mark.parametrize("magic", [b"HAIR", b"hair"])
+def test_hair_without_segments_uses_the_default_count(magic: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "x.hair"
+    path.write_bytes(hair_bytes(magic))
+    strands = read_strands(path)
+    assert strands.offsets.tolist() == [0, 3, 6]
+    assert strands.points[4].tolist() == [12, 13, 14]
+    assert strands.radius == pytest.approx(5e-4)
+
+
+def test_hair_with_every_array_and_an_empty_strand(tmp_path: Path) -> None:
+    segments = np.array([1, 0, 2], "<u2").tobytes()
+    xyz = np.arange(18, dtype="<f4").tobytes()
+    thickness = np.array([2, 2, 9, 4, 4, 4], "<f4").tobytes()
+    path = tmp_path / "x.hair"
+    body = segments + xyz + thickness + bytes(4 * 6) + bytes(12 * 6)
+    path.write_bytes(hair_bytes(strands=3, flags=31, body=body))
+    strands = read_strands(path)
+    assert strands.offsets.tolist() == [0, 2, 5]
+    assert strands.radius.tolist() == [1, 1, 2, 2, 2]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"magic": b"RIAH"}, "not a .hair file"),
+        ({"flags": 1}, "no points"),
+        ({"flags": 2 | 64}, "unknown bits"),
+        ({"strands": 4_000_000_000, "points": 4_000_000_000}, "need .* bytes, the file has"),
+        ({"strands": 3}, "do not make"),
+        ({"flags": 3, "body": b"\x07\0\x07\0" + bytes(72)}, "the segments make"),
+        ({"body": np.full(18, np.nan, "<f4").tobytes()}, "byte 128: expected a finite position"),
+    ],
+)
+def test_lying_hair_headers(bad: dict[str, object], words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.hair"
+    path.write_bytes(hair_bytes(**bad))  # type: ignore[arg-type]
+    with pytest.raises(StrandFileError, match=rf"x\.hair: .*{words}"):
+        read_strands(path)
+
+
+def test_hair_cannot_hold_endless_strands(tmp_path: Path) -> None:
+    long = Strands(np.zeros((65537, 3), np.float32), np.array([0, 65537]))
+    with pytest.raises(StrandFileError, match="65536 segments"):
+        write_strands(tmp_path / "x.hair", long)
+
+
+def tfx_bytes(
+    version: float = 4,
+    strands: int = 2,
+    vertices: int = 3,
+    start: int | None = None,
+    xyz: object = None,
+) -> bytes:
+    """A `.tfx` file whose vertex i is at (3i, 3i + 1, 3i + 2)."""
+    points = np.arange(18, dtype="<f4").reshape(6, 3) if xyz is None else np.asarray(xyz, "<f4")
+    counts = struct.pack("<f2I", version, strands, vertices)
+    if version == 3:
+        header = counts + bytes(132) + struct.pack("<I", 296 if start is None else start)
+        return header.ljust(296, b"\0") + points.tobytes()
+    header = counts + struct.pack("<I", 160 if start is None else start)
+    masses = np.full((len(points), 1), 7, "<f4")
+    return header.ljust(160, b"\0") + np.hstack([points, masses]).tobytes()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_tfx_of_both_versions_and_turned(version: int, tmp_path: Path) -> None:
+    path = tmp_path / "x.TFX"
+    path.write_bytes(tfx_bytes(version))
+    strands = read_strands(path)
+    assert strands.offsets.tolist() == [0, 3, 6]
+    np.testing.assert_array_equal(strands.points.ravel(), np.arange(18))
+    assert read_strands(path, up_axis="y").points[1].tolist() == [3, -5, 4]
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"vertices": 1}, "byte 8: 1 vertices a strand, at least 2"),
+        ({"strands": 2**32 - 1, "vertices": 2**32 - 1}, "end at byte .*, the file has"),
+        ({"strands": 3}, "3 strands of 3 vertices .* the file has"),
+        ({"start": 8}, "from byte 8"),
+        ({"start": 2**32 - 1}, "from byte 4294967295"),
+        ({"xyz": np.full((6, 3), np.inf)}, r"byte \d+: expected a finite .*6 of 6"),
+    ],
+)
+def test_lying_tfx_headers(
+    version: int, bad: dict[str, object], words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.tfx"
+    path.write_bytes(tfx_bytes(version, **bad))  # type: ignore[arg-type]
+    with pytest.raises(StrandFileError, match=rf"x\.tfx: .*{words}"):
+        read_strands(path)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_cut_tfx_files(version: int, tmp_path: Path) -> None:
+    path = tmp_path / "x.tfx"
+    whole = tfx_bytes(version)
+    for keep in (0, 11, 100, 159, len(whole) - 1):
+        path.write_bytes(whole[:keep])
+        with pytest.raises(StrandFileError, match=r"x\.tfx: .*truncated"):
+            read_strands(path)
+
+
+def test_other_tfx_versions_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.tfx"
+    path.write_bytes(tfx_bytes(2))
+    with pytest.raises(StrandFileError, match="byte 0: TressFX version 2, only 3 and 4"):
+        read_strands(path)
+
+
+def data_bytes(*strands: list[list[float]], count: int | None = None) -> bytes:
+    out = struct.pack("<i", len(strands) if count is None else count)
+    for points in strands:
+        out += struct.pack("<i", len(points)) + np.asarray(points, "<f4").tobytes()
+    return out
+
+
+A_STRAND = [[0.0, 0, 0], [0, 0, 1], [0, 1, 2]]
+
+
+def test_data_leaves_out_roots_without_hair(tmp_path: Path) -> None:
+    path = tmp_path / "x.data"
+    path.write_bytes(data_bytes([[9, 9, 9]], A_STRAND, [], [[5, 6, 7]], [[1, 2, 3], [4, 5, 6]]))
+    strands = read_strands(path)
+    assert strands.offsets.tolist() == [0, 3, 5]
+    assert strands.points.tolist() == [*A_STRAND, [1, 2, 3], [4, 5, 6]]
+    assert strands.radius == 4e-5
+    path.write_bytes(data_bytes())
+    assert len(read_strands(path)) == 0
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@given(strands=some_strands())
+def test_data_of_any_strands(strands: Strands, tmp_path: Path) -> None:
+    path = tmp_path / "x.data"
+    path.write_bytes(data_bytes(*(strands[i].tolist() for i in range(len(strands)))))
+    again = read_strands(path)
+    np.testing.assert_array_equal(again.points, strands.points)
+    np.testing.assert_array_equal(again.offsets, strands.offsets)
+
+
+@pytest.mark.parametrize(
+    ("raw", "words"),
+    [
+        (b"", "0 bytes, a .data file has at least 4"),
+        (data_bytes(count=-1), "byte 0: -1 strands"),
+        (data_bytes(A_STRAND, count=2**31 - 1), "byte 0: 2147483647 strands need at least"),
+        (data_bytes(A_STRAND, count=2), "byte 44: strand 1 of 2 .* the file has 44"),
+        (data_bytes(A_STRAND)[:-1], "byte 4: strand 0 of 1 has 3 points, .* byte 44, .* has 43"),
+        (data_bytes(A_STRAND)[:9], "byte 4: strand 0"),
+        (data_bytes(A_STRAND) + b"abc", "byte 44: the 1 strands end here, the file has 47"),
+        (struct.pack("<ii", 1, -5), "byte 4: strand 0 of 1 has -5 points"),
+        (struct.pack("<ii", 1, 2**31 - 1), "byte 4: strand 0 of 1 has 2147483647 points"),
+        (data_bytes(A_STRAND, [[0, 0, 0], [0, np.nan, 0]]), r"byte 60: .*nan.*1 of 5"),
+    ],
+)
+def test_lying_data_files(raw: bytes, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.data"
+    path.write_bytes(raw)
+    with pytest.raises(StrandFileError, match=rf"x\.data: {words}"):
+        read_strands(path)
+
+
+@pytest.mark.parametrize("vary", [False, True])
+def test_alembic_curves_are_y_up(vary: bool, two: Strands, tmp_path: Path) -> None:
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    from alembic3d import Abc, AbcGeom
+
+    radius = np.arange(1, 6, dtype=np.float32) * 1e-5 if vary else 2e-4
+    path = tmp_path / "hair.abc"
+    write_strands(path, Strands(two.points, two.offsets, radius))
+    schema = AbcGeom.ICurves(Abc.IArchive(str(path)).getTop(), "hair").getSchema()
+    sample = schema.getValue()
+    assert sample.getType() == AbcGeom.CurveType.kLinear
+    assert np.asarray(memoryview(sample.getCurvesNumVertices())).tolist() == [3, 2]
+    points = np.asarray(memoryview(sample.getPositions()))
+    np.testing.assert_array_equal(points, two.points[:, [0, 2, 1]] * np.float32([1, 1, -1]))
+    widths = schema.getWidthsParam().getExpandedValue()
+    np.testing.assert_allclose(list(widths.getVals()), 2 * np.atleast_1d(radius), rtol=1e-6)
+
+
+def test_alembic_that_is_not_installed_or_has_no_folder(
+    two: Strands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imath", None)
+    with pytest.raises(StrandFileError, match=r"hair\.abc: .*pip install 'hairstage\[alembic\]'"):
+        write_strands(tmp_path / "hair.abc", two)
+    monkeypatch.undo()
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    with pytest.raises(StrandFileError, match=r"hair\.abc: cannot be written"):
+        write_strands(tmp_path / "absent" / "hair.abc", two)
+    write_strands(tmp_path / "bald.abc", Strands.from_list([]))
+    assert (tmp_path / "bald.abc").stat().st_size > 0
+
+
+def write_npy(path: Path, name: str, header: bytes, data: bytes) -> None:
+    with zipfile.ZipFile(path, "a") as archive:
+        text = header.ljust(117) + b"\n"
+        archive.writestr(name, b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (b"{'descr':'<f4','fortran_order':False,'shape':(99999999999,3)}", "needs .* bytes"),
+        (b"{'descr':'|O','fortran_order':False,'shape':(1,3)}", "unexpected type"),
+        (b"{'descr':'<f4','fortran_order':False,'shape':(-1,3)}", "absurd shape"),
+        (b"{'descr':'<f4','fortran_order':False,'shape':(6,)}", r"must be \(N, 3\)"),
+        (b"nonsense", "points"),
+    ],
+)
+def test_lying_npz_headers(header: bytes, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    np.savez(path, offsets=np.array([0, 2]))
+    write_npy(path, "points.npy", header, bytes(24))
+    with pytest.raises(StrandFileError, match=words):
+        read_strands(path)
+
+
+def test_npz_members(tmp_path: Path, two: Strands) -> None:
+    path = tmp_path / "x.npz"
+    np.savez(path, points=two.points)
+    with pytest.raises(StrandFileError, match=r"offsets is missing; the archive holds \['points'"):
+        read_strands(path)
+    np.savez_compressed(path, points=two.points, offsets=two.offsets, more=np.ones(3))
+    assert read_strands(path).radius == 4e-5
+    np.savez(path, points=two.points, offsets=two.offsets + 1)
+    with pytest.raises(StrandFileError, match="offsets must run from 0"):
+        read_strands(path)
+
+
+USDA = """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Y"
+)
+def Xform "head" {{
+    double3 xformOp:translate = (0, 0, 5)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    def BasisCurves "fringe" {{
+        uniform token type = "{type}"
+        int[] curveVertexCounts = [2]
+        point3f[] points = [(1, 2, 3), (4, 5, 6)]
+        float[] widths = {widths}
+    }}
+}}
+"""
+
+
+def test_usd_axes_units_and_transforms(tmp_path: Path) -> None:
+    path = tmp_path / "x.usda"
+    path.write_text(USDA.format(type="linear", widths="[0.02]"))
+    strands = read_strands(path)
+    np.testing.assert_allclose(
+        strands.points, [[0.01, -0.08, 0.02], [0.04, -0.11, 0.05]], atol=1e-9
+    )
+    assert strands.radius == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "widths", "words"),
+    [
+        ("cubic", "[0.02]", "only linear curves"),
+        ("linear", "[0.02, 0.03, 0.04]", "3 widths for 1 curves"),
+    ],
+)
+def test_usd_that_cannot_be_read(kind: str, widths: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.usda"
+    path.write_text(USDA.format(type=kind, widths=widths))
+    with pytest.raises(StrandFileError, match=f"/head/fringe: {words}"):
+        read_strands(path)
+
+
+def test_usd_without_curves(tmp_path: Path) -> None:
+    path = tmp_path / "x.usda"
+    path.write_text('#usda 1.0\ndef Xform "head" {}\n')
+    with pytest.raises(StrandFileError, match="no BasisCurves"):
+        read_strands(path)
+
+
+def test_sintels_groom(shared_data: Callable[[str], Path]) -> None:
+    folder = shared_data("sintel")
+    files = sorted(folder.glob("*.tfx"))
+    strands = read_strands(files[0], up_axis="y")
+    truth = read_strands(folder / "sintel.npz")
+    assert len(strands) == 11_400
+    np.testing.assert_array_equal(strands.offsets, truth.offsets)
+    moved = strands.points - np.array([0, 0, 1.56])
+    np.testing.assert_allclose(moved, truth.points, atol=2e-6)
+
+
+def test_the_ponytail(shared_data: Callable[[str], Path]) -> None:
+    folder = shared_data("ponytail")
+    names = ("front_top", "side", "back", "tail")
+    parts = [read_strands(folder / f"{name}.tfx", up_axis="y") for name in names]
+    truth = read_strands(folder / "ponytail.npz")
+    assert [len(part) for part in parts] == [876, 3066, 517, 474]
+    points = np.concatenate([part.points for part in parts]) * 0.003 - np.array([0, 0, 0.24])
+    np.testing.assert_allclose(points, truth.points, atol=1e-6)

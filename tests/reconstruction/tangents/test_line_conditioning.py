@@ -1,0 +1,125 @@
+"""Lines from planes that cross at known angles."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.masks import HairMask
+from reconstruction.tangents.conditioning import condition_lines
+from reconstruction.tangents.estimate import MeasureOptions, measure_tangents
+from reconstruction.tangents.line_evidence import LineEvidence
+
+UP = np.array([0.0, 0.0, 1.0])
+BINS = 36
+
+
+def around(azimuth_deg: float) -> Camera:
+    a = np.radians(azimuth_deg)
+    return Camera.look_at("c", 64, 64, (np.sin(a), -np.cos(a), 0.0), (0, 0, 0), 20.0)
+
+
+def sees(camera: Camera, direction: np.ndarray, contrast: float = 1.0) -> LineEvidence:
+    """A view whose every pixel shows a line in the direction's image at the origin."""
+    a, b = camera.project(np.stack([-1e-4 * direction, 1e-4 * direction]))[0]
+    own = np.arctan2(*(b - a)[::-1])
+    peak = np.cos(np.arange(BINS) * np.pi / BINS - own) ** 20
+    support = contrast * (peak / peak.mean() - 1)
+    whole = np.broadcast_to(support[:, None, None], (BINS, 64, 64)).astype(np.float32)
+    return LineEvidence(camera, whole, np.ones((64, 64), bool), np.ones((64, 64)))
+
+
+@pytest.mark.parametrize("degrees", [2.0, 10.0, 45.0, 90.0])
+def test_the_spread_of_two_planes_is_the_tangent_of_half_their_angle(degrees: float) -> None:
+    views = [sees(around(0.0), UP), sees(around(degrees), UP)]
+    found = condition_lines(views, np.zeros((1, 3)), np.ones((1, 2), bool))
+    assert found.views[0] == 2
+    assert found.spread[0] == pytest.approx(np.tan(np.radians(degrees) / 2), rel=1e-3)
+    assert found.misfit[0] < 1e-3  # two planes always meet in a line
+    assert found.figures()["undetermined_share"] == float(degrees < 11)
+
+
+def test_one_view_and_none_determine_nothing() -> None:
+    views = [sees(around(0.0), UP), sees(around(60.0), UP)]
+    seen = np.array([[True, False], [False, False], [True, True]])
+    found = condition_lines(views, np.zeros((3, 3)), seen)
+    assert found.views.tolist() == [1, 0, 2]
+    assert found.spread[:2].tolist() == [0, 0]
+    assert not found.misfit[:2].any()
+    figures = found.figures()
+    assert figures["views_per_point"] == {"0": 1, "1": 1, "2": 1}
+    assert figures["undetermined_share"] == pytest.approx(2 / 3)
+    json.dumps(figures, allow_nan=False)
+
+
+def test_views_that_disagree_are_a_misfit() -> None:
+    tilted = np.array([0.3, 0.0, 1.0]) / np.linalg.norm([0.3, 0, 1])
+    good = [sees(around(a), UP) for a in (0, 45, 90)]
+    bad = [*good[:2], sees(around(90), UP), sees(around(0), tilted)]
+    seen = np.ones((1, 4), bool)
+    agree = condition_lines(good, np.zeros((1, 3)), seen[:, :3]).misfit[0]
+    differ = condition_lines(bad, np.zeros((1, 3)), seen).misfit[0]
+    assert agree < 1e-3
+    assert differ > 0.1
+
+
+def test_a_view_without_texture_does_not_count_and_a_weak_one_counts_less() -> None:
+    points, seen = np.zeros((1, 3)), np.ones((1, 2), bool)
+    flat = LineEvidence(
+        around(90), np.zeros((BINS, 64, 64), np.float32), np.ones((64, 64), bool), np.ones((64, 64))
+    )
+    alone = condition_lines([sees(around(0), UP), flat], points, seen)
+    assert alone.views[0] == 1
+    assert alone.spread[0] == 0
+    weak = condition_lines([sees(around(0), UP), sees(around(90), UP, 0.3)], points, seen)
+    assert weak.spread[0] == pytest.approx(np.sqrt(0.3), rel=1e-3)
+
+
+def test_no_points_are_no_trouble() -> None:
+    found = condition_lines([sees(around(0), UP)], np.zeros((0, 3)), np.zeros((0, 1), bool))
+    assert len(found.spread) == 0
+    json.dumps(found.figures(), allow_nan=False)
+    with pytest.raises(ValueError, match="seen must be"):
+        condition_lines([], np.zeros((2, 3)), np.zeros((2, 1), bool))
+
+
+@pytest.mark.parametrize("groups", [1, 6, 10_000], ids=["sum", "groups", "each light"])
+def test_orientations_come_from_the_sum_of_lights_or_from_each(
+    shoot: Callable[..., Capture], stage_camera: Callable[..., Camera], groups: int
+) -> None:
+    lights = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(8, 1.2, 0.0))]
+
+    def meridians(step: dict[str, object], camera: Camera) -> np.ndarray:
+        grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+        rays = camera.rays(grid)
+        b = rays @ camera.center
+        inside = b**2 - (camera.center @ camera.center - 0.01)
+        p = camera.center + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
+        azimuth = np.arctan2(p[..., 1], p[..., 0])
+        shade = p @ next(x for x in lights if x.name == step["light"]).position
+        bright = (1.2 + np.cos(40 * azimuth)) * (0.05 + np.maximum(shade, 0))
+        return np.where(inside > 0, bright, 0.0)
+
+    cameras = [stage_camera(f"c{a}", a, 0.0, size=80) for a in (-40, 0, 40)]
+    capture = shoot(cameras=cameras, projectors=[], lights=lights, extra=meridians, samples=1)
+    z, a = (v.ravel() for v in np.meshgrid(np.linspace(-0.05, 0.05, 9), np.linspace(-0.6, 0.6, 9)))
+    r = np.sqrt(0.01 - z**2)
+    points = np.stack([r * np.sin(a), -r * np.cos(a), z], axis=1)
+    whole = np.ones((80, 80), bool)
+    masks = {c.name: HairMask(whole, whole, ~whole, "user", 1.0) for c in cameras}
+    depths = {c.name: np.full((80, 80), 1.0) for c in cameras}
+    grid = VoxelGrid(np.zeros(3), 0.01, np.ones((1, 1, 1), bool))
+    options = MeasureOptions(light_groups=groups)
+    found = measure_tangents(capture, points, masks, depths, grid, options)
+    n = found.points / np.linalg.norm(found.points, axis=1, keepdims=True)
+    t = UP - n[:, 2:] * n
+    t /= np.linalg.norm(t, axis=1, keepdims=True)
+    off = np.degrees(np.arccos(np.abs((found.directions * t).sum(axis=1)).clip(0, 1)))
+    assert np.median(off) < 8

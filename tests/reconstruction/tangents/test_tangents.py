@@ -1,0 +1,190 @@
+"""3D directions from several cameras' lines, and from reflection."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.tangents.line_evidence import (
+    LineEvidence,
+    decide,
+    half_sphere,
+    line_scores,
+    line_support,
+    pool,
+    seen_by,
+)
+from reconstruction.tangents.reflection import (
+    Reflection,
+    observe,
+    reflection_scores,
+    surface_normals,
+)
+
+BINS = 36
+
+
+def camera(position: tuple[float, float, float]) -> Camera:
+    return Camera.look_at("cam", 64, 64, position, (0, 0, 0), 20.0)
+
+
+def image_angle(c: Camera, point: np.ndarray, direction: np.ndarray) -> float:
+    a, b = c.project(np.stack([point - 1e-4 * direction, point + 1e-4 * direction]))[0]
+    return float(np.arctan2(*(b - a)[::-1]))
+
+
+def evidence_of(c: Camera, direction: np.ndarray) -> LineEvidence:
+    """Support that peaks at the angle at which `direction` at the origin appears."""
+    angles = np.arange(BINS) * np.pi / BINS
+    peak = np.cos(angles - image_angle(c, np.zeros(3), direction)) ** 40
+    support = np.broadcast_to((peak - peak.mean())[:, None, None], (BINS, 64, 64))
+    depth = np.full((64, 64), np.linalg.norm(c.center))
+    return LineEvidence(c, support.astype(np.float32), np.ones((64, 64), bool), depth)
+
+
+def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip(np.abs((a * b).sum(axis=-1)), 0, 1)))
+
+
+def test_half_sphere_is_even() -> None:
+    d = half_sphere(500)
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1)
+    cosine = np.abs(d @ d.T) - np.eye(500)
+    nearest = np.degrees(np.arccos(cosine.max(axis=1)))
+    assert nearest.min() > 2.5
+    assert nearest.max() < 6.5
+
+
+@pytest.mark.parametrize("direction", [(0.2, 0.3, 0.9), (0.6, 0.6, -0.3), (-0.5, 0.2, 0.8)])
+def test_cameras_fix_a_direction(direction: tuple[float, float, float]) -> None:
+    t = np.array(direction) / np.linalg.norm(direction)
+    candidates, point = half_sphere(2000), np.zeros((1, 3))
+    scores = np.zeros((1, 2000), np.float32)
+    for position in ((1.0, -0.3, 0.1), (0.3, -1.0, 0.3), (0.7, -0.7, 0.6)):
+        e = evidence_of(camera(position), t)
+        scores += line_scores(e, point, candidates, np.array([True]))
+    found = decide(scores, candidates)
+    assert degrees_between(found.directions[0], t) < 6  # the support is 13 degrees wide
+    assert found.confidence[0] > 0.5
+
+
+def test_one_camera_leaves_a_plane() -> None:
+    candidates = half_sphere(1000)
+    t = np.array([0.0, 0.0, 1.0])
+    e = evidence_of(camera((0.0, -1.0, 0.0)), t)
+    one = decide(line_scores(e, np.zeros((1, 3)), candidates, np.array([True])), candidates)
+    two = evidence_of(camera((1.0, 0.0, 0.0)), t)
+    both = line_scores(e, np.zeros((1, 3)), candidates, np.array([True])) + line_scores(
+        two, np.zeros((1, 3)), candidates, np.array([True])
+    )
+    assert decide(both, candidates).confidence[0] > one.confidence[0]
+
+
+def test_a_line_along_the_ray_is_not_spoken_about() -> None:
+    c = camera((0.0, -1.0, 0.0))
+    e = evidence_of(c, np.array([0.0, 0.0, 1.0]))
+    along = line_scores(e, np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.array([True]))
+    assert abs(along[0, 0]) < 1e-6
+
+
+def test_no_texture_gives_no_confidence() -> None:
+    support = line_support(np.ones((8, 4, 4)))
+    assert np.abs(support).max() == 0
+    candidates = half_sphere(50)
+    assert decide(np.zeros((3, 50), np.float32), candidates).confidence.max() == 0
+
+
+def test_points_behind_the_seen_surface_are_not_seen() -> None:
+    c = camera((0.0, -1.0, 0.0))
+    e = evidence_of(c, np.array([0.0, 0.0, 1.0]))
+    points = np.array([[0, 0, 0], [0, 0.003, 0], [0, 0.02, 0], [5.0, 0, 0], [0, -3.0, 0]])
+    assert seen_by(e, points, 4e-3).tolist() == [True, True, False, False, False]
+
+
+def test_pooling_averages_over_near_points_only() -> None:
+    points = np.array([[0, 0, 0], [1e-3, 0, 0], [0.1, 0, 0]])
+    table = pool(points, 5e-3).toarray()
+    np.testing.assert_allclose(table.sum(axis=1), 1)
+    assert table[0, 1] > 0.3
+    assert table[0, 2] == 0
+    assert table[2, 2] == 1
+
+
+def test_reflection_finds_directions_that_texture_does_not_know() -> None:
+    """A patch whose direction turns from point to point; a third of the points are known."""
+    rng = np.random.default_rng(3)
+    lights = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(200, 1.2))]
+    cameras = [
+        Camera.look_at(f"c{i}", 48, 48, p, (0, 0, 0), 12.0)
+        for i, p in enumerate([(0.9, -0.2, 0.1), (0.8, 0.4, 0.2)])
+    ]
+    y, z = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.05, 0.05, 24)] * 2))
+    points = np.stack([np.zeros_like(y), y, z], axis=1)
+    angle = 12 * y + 8 * z
+    truth = np.stack([0.2 * np.ones_like(y), np.sin(angle), np.cos(angle)], axis=1)
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    olats = {}
+    positions = np.stack([light.position for light in lights])
+    for c in cameras:
+        away = positions[None] - points[:, None]
+        far = np.linalg.norm(away, axis=2, keepdims=True)
+        to_camera = c.center - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        sines = np.einsum("pld,pd->pl", away / far, truth)
+        s = sines + (to_camera * truth).sum(axis=1, keepdims=True)
+        answer = 0.15 + np.exp(-(s**2) / (2 * 0.3**2))
+        answer = answer * np.maximum((away / far)[..., 0], 0.02) / far[..., 0] ** 2
+        x_, y_ = np.rint(c.project(points)[0]).astype(int).T
+        image = np.zeros((len(lights), 48, 48))
+        image[:, y_, x_] = answer.T
+        olats[c.name] = image
+    first = truth.copy()
+    wrong = rng.random(len(points)) > 0.45
+    first[wrong] = rng.normal(size=(int(wrong.sum()), 3))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    candidates = half_sphere(800)
+    scores, table = reflection_scores(
+        cameras,
+        olats,
+        lights,
+        points,
+        np.ones((len(points), 2), bool),
+        candidates,
+        (first, np.where(wrong, 0.1, 0.9)),
+    )
+    assert table.contrast > 2
+    error = degrees_between(decide(scores, candidates).directions, truth)
+    assert np.median(error) < 4
+    assert np.median(error[wrong]) < 4
+    assert (error < 15).mean() > 0.9
+
+
+def test_normals_face_the_viewer() -> None:
+    rng = np.random.default_rng(0)
+    plane = np.column_stack([rng.random((200, 2)), np.zeros(200)])
+    towards = np.tile([0.1, 0.2, -1.0], (200, 1))
+    np.testing.assert_allclose(
+        surface_normals(plane, towards), np.tile([0, 0, -1.0], (200, 1)), atol=1e-9
+    )
+
+
+def test_observations_undo_distance_and_intensity() -> None:
+    """A matte point answers to near and far, weak and strong lamps alike."""
+    c = camera((1.0, 0.0, 0.0))
+    lights = [
+        Light("a", np.array([1.0, 0.2, 0]), np.full(3, 2.0)),
+        Light("b", np.array([2.0, -0.4, 0]), np.full(3, 5.0)),
+    ]
+    cosines = np.array([1 / np.hypot(1, 0.2), 1 / np.hypot(1, 0.2)])
+    far2 = np.array([1.04, 4.16])
+    olat = (np.array([2.0, 5.0]) * cosines / far2)[:, None, None] * np.ones((2, 64, 64))
+    seen = np.array([True])
+    o = observe(c, olat, lights, np.zeros((1, 3)), np.array([[1.0, 0, 0]]), seen)
+    np.testing.assert_allclose(o.response, 1, rtol=1e-5)
+    np.testing.assert_allclose(o.facing[0], cosines, rtol=1e-6)
+
+
+def test_a_flat_table_has_no_contrast() -> None:
+    assert Reflection(np.ones(8), np.ones(72)).contrast == pytest.approx(1)

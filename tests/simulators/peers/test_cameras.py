@@ -1,0 +1,227 @@
+"""The camera link, and the frames that pulses lead to."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from simulators.frames.responses import Response
+from simulators.peers.faults import Fault
+
+BLACK, GAIN, EXPOSURE = 64, 50_000, 0.01
+
+
+def expected(radiance):
+    return BLACK + GAIN * EXPOSURE * radiance
+
+
+def armed(bench, name="cam_a"):
+    camera = bench.camera(name)
+    assert camera.ask(op="arm", exposure=EXPOSURE) == {"ok": True}
+    return camera
+
+
+def pulse(bench):
+    assert bench.trigger.ask("PULSE 10000").startswith("OK ")
+
+
+def lit(image):
+    """Mean counts of the pixels that see the subject in `Known`."""
+    return image.reshape(-1, 3)[:100].mean()
+
+
+def test_hello_describes_the_camera(bench):
+    answer = bench.camera("cam_b").ask(op="hello", camera="cam_b")
+    assert answer == {
+        "ok": True,
+        "width": 16,
+        "height": 16,
+        "full_scale": 4095,
+        "black": BLACK,
+        "gain": GAIN,
+    }
+
+
+def test_a_lamp_that_was_never_on_makes_a_dark_frame(bench):
+    camera = armed(bench)
+    pulse(bench)
+    image = camera.frame().astype(float)
+    assert image.mean() == pytest.approx(BLACK, abs=0.3)
+    assert image.std() == pytest.approx(4.0 / 2.48, rel=0.2)  # read noise alone
+
+
+def test_frames_follow_the_selected_lamp_and_its_level(bench):
+    camera = armed(bench)
+    bench.select(3)
+    pulse(bench)
+    bench.lights.write_register(2, 32768)
+    pulse(bench)
+    bench.select(0)
+    pulse(bench)
+    full, half, dark = camera.frame(), camera.frame(), camera.frame()
+    assert lit(full) == pytest.approx(expected(0.3), rel=0.02)
+    assert lit(half) == pytest.approx(expected(0.15), rel=0.02)
+    assert lit(dark) == pytest.approx(BLACK, abs=0.5)
+    assert full.reshape(-1, 3)[100:].mean() == pytest.approx(BLACK, abs=0.5)
+
+
+def test_the_state_at_the_pulse_counts_not_the_state_at_the_reading(bench):
+    camera = armed(bench)
+    bench.select(1)
+    pulse(bench)
+    bench.select(65535)
+    assert lit(camera.frame()) == pytest.approx(expected(0.1), rel=0.03)
+
+
+def test_lamps_that_the_watchdog_put_off_make_dark_frames(bench):
+    camera = armed(bench)
+    bench.select(65535)
+    bench.now[0] += 2.01
+    pulse(bench)
+    assert lit(camera.frame()) == pytest.approx(BLACK, abs=0.5)
+
+
+def test_saturation_and_exposure(bench):
+    camera = bench.camera("cam_a")
+    camera.ask(op="arm", exposure=0.2)
+    bench.select(65535)
+    pulse(bench)
+    image = camera.frame().reshape(-1, 3)
+    assert (image[:100] == 4095).all()
+
+
+def test_block_ids_and_queue_order(bench):
+    camera = armed(bench)
+    for lamp in (1, 2):
+        bench.select(lamp)
+        pulse(bench)
+    first, second, nothing = camera.read(), camera.read(), camera.read()
+    assert [first["block_id"], second["block_id"]] == [1, 2]
+    assert first["bytes"] == 16 * 16 * 3 * 2
+    assert first["exposure"] == EXPOSURE
+    assert second["timestamp"] >= first["timestamp"]
+    assert nothing == {"ok": True, "status": "empty"}
+    camera.ask(op="hello", camera="cam_a")
+    camera.ask(op="arm", exposure=EXPOSURE)
+    pulse(bench)
+    assert camera.read()["block_id"] == 1
+
+
+def test_arming_empties_the_queue_and_disarming_stops_frames(bench):
+    camera = armed(bench)
+    pulse(bench)
+    camera.ask(op="arm", exposure=EXPOSURE)
+    assert camera.read()["status"] == "empty"
+    pulse(bench)
+    camera.ask(op="disarm")
+    pulse(bench)
+    assert camera.read()["status"] == "frame"
+    assert camera.read()["status"] == "empty"
+
+
+def test_a_dropped_frame_is_missing_once_and_on_one_camera(start):
+    bench = start(Fault("camera", "drop", 2, "cam_a"))
+    a, b = armed(bench), armed(bench, "cam_b")
+    for _ in range(3):
+        pulse(bench)
+    assert [a.read().get("block_id") for _ in range(3)] == [1, 2, None]
+    assert [b.read().get("block_id") for _ in range(3)] == [1, 2, 3]
+    bench.trigger.ask("RESET")
+    for _ in range(2):
+        pulse(bench)
+    assert [a.read()["block_id"] for _ in range(2)] == [3, 4]
+
+
+def test_a_mute_camera_leaves_the_other_alone(start):
+    bench = start(Fault("camera", "mute", 1, "cam_a"))
+    a, b = armed(bench), armed(bench, "cam_b")
+    pulse(bench)
+    a.socket.settimeout(0.2)
+    with pytest.raises(TimeoutError):
+        a.ask(op="read")
+    assert b.read()["status"] == "frame"
+
+
+@pytest.mark.parametrize(
+    ("request_", "said"),
+    [
+        ({"op": "hello", "camera": "nobody"}, "cam_a"),
+        ({"op": "arm", "exposure": 0}, "exposure"),
+        ({"op": "arm", "exposure": "long"}, "exposure"),
+        ({"op": "arm"}, "exposure"),
+        ({"op": "zoom"}, "unknown op"),
+        ([1, 2], "unknown op"),
+    ],
+)
+def test_bad_requests_are_answered_with_what_is_wrong(bench, request_, said):
+    camera = bench.camera("cam_a")
+    answer = camera.raw(json.dumps(request_).encode())
+    assert answer["ok"] is False
+    assert said in answer["error"]
+    assert camera.ask(op="read") == {"ok": True, "status": "empty"}
+
+
+def test_bytes_that_are_not_json_are_an_error(bench):
+    assert bench.camera("cam_a").raw(b"\xff{")["ok"] is False
+
+
+class Slow:
+    """A responder that waits for permission."""
+
+    def __init__(self, known, gate):
+        self.known, self.gate = known, gate
+
+    def lamps(self, camera):
+        assert self.gate.wait(10)
+        return self.known.lamps(camera)
+
+
+def test_busy_while_the_frame_is_rendered(start):
+    gate = threading.Event()
+
+    class Known:
+        def lamps(self, camera):
+            return Response(np.arange(100), np.full((5, 100, 3), 0.5, np.float32))
+
+    bench = start(responder=Slow(Known(), gate))
+    camera = armed(bench)
+    bench.select(1)
+    pulse(bench)
+    assert camera.ask(op="read") == {"ok": True, "status": "busy"}
+    begun = time.monotonic()
+    assert bench.lights.read_input_registers(1).registers == [1]
+    assert time.monotonic() - begun < 1
+    gate.set()
+    assert lit(camera.frame()) == pytest.approx(expected(0.5), rel=0.02)
+
+
+def test_a_renderer_that_fails_is_the_cameras_error(start):
+    class Broken:
+        def lamps(self, camera):
+            raise RuntimeError("no libLLVM")
+
+    bench = start(responder=Broken())
+    camera = armed(bench)
+    bench.select(1)
+    pulse(bench)
+    answer = camera.read()
+    assert answer["ok"] is False
+    assert "no libLLVM" in answer["error"]
+
+
+def test_same_seed_same_bytes_and_another_seed_other_noise(start):
+    def shoot(seed):
+        bench = start(seed=seed)
+        camera = armed(bench)
+        bench.select(2)
+        pulse(bench)
+        pulse(bench)
+        return camera.read()["payload"], camera.read()["payload"]
+
+    assert shoot(1) == shoot(1)
+    assert shoot(1)[0] != shoot(1)[1]
+    assert shoot(1)[0] != shoot(2)[0]

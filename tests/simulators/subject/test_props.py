@@ -1,0 +1,69 @@
+"""Boards and spheres in front of the simulated cameras."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reconstruction.calibration.boards import Board
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig
+from simulators.__main__ import main
+from simulators.subject.props import BoardProp, PropResponder, SphereProp, board_pose, named_prop
+
+CAMERA = Camera.look_at("front", 64, 48, (0.9, 0.1, 0.1), (0, 0, 0), 20.0)
+LAMPS = (Light("side", (0.6, 0.9, 0.3), (8, 8, 8)), Light("behind", (-1.2, 0, 0), (8, 8, 8)))
+BEAM = Projector.look_at("beam", 12, 12, (1.0, -0.2, 0.2), (0, 0, 0), 20.0)
+RIG = Rig("props", (CAMERA,), LAMPS, (BEAM,))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("board:3", BoardProp), ("mirror:1", SphereProp), ("diffuse:0", SphereProp)]
+)
+def test_props_have_names(name: str, kind: type) -> None:
+    assert isinstance(named_prop(name), kind)
+
+
+@pytest.mark.parametrize("name", ["wavy", "board", "board:x", "hair.npz"])
+def test_other_names_are_no_props(name: str) -> None:
+    assert named_prop(name) is None
+
+
+def test_a_diffuse_sphere_shines_by_lambert_and_inverse_square() -> None:
+    sphere = SphereProp(np.zeros(3), 0.05, 0.6)
+    response = PropResponder(RIG, sphere).lamps("front")
+    middle = np.rint(CAMERA.project(np.zeros(3))[0]).astype(int)
+    at = int(np.flatnonzero(response.pixels == middle[1] * 64 + middle[0])[0])
+    ray = CAMERA.rays(middle.astype(float))
+    b = -(ray @ CAMERA.center)
+    point = CAMERA.center + ray * (b - np.sqrt(b * b - CAMERA.center @ CAMERA.center + 0.05**2))
+    v = LAMPS[0].position - point
+    expected = 0.6 / np.pi * 8 * (point / 0.05 @ v) / np.linalg.norm(v) ** 3
+    assert response.images[0, at] == pytest.approx(expected, rel=2e-3)
+    assert not response.images[1].any()  # the lamp behind it
+
+
+def test_rows_of_a_sweep_sum_to_the_beam_on_the_board() -> None:
+    prop = board_pose(0, Board())
+    sweep = PropResponder(RIG, prop).sweep("front", 0)["beam"]
+    points = prop.see(CAMERA, np.zeros((1, 2)))
+    row = BEAM.project(points.points[:, 0])[0][:, 1]
+    brightest = sweep.images.sum(axis=-1).argmax(axis=0)
+    shared = np.isin(sweep.pixels, points.pixels)
+    index = np.searchsorted(points.pixels, sweep.pixels[shared])
+    lit = (sweep.images.sum(axis=(0, 2))[shared] > 0.1) & (np.abs(row[index] - 5.5) < 5)
+    assert lit.sum() > 100
+    assert np.abs(brightest[shared][lit] - row[index][lit]).max() < 1.1
+
+
+def test_the_truth_of_a_prop_is_its_place(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.json"
+    rig.write_text(json.dumps(RIG.to_dict()))
+    assert main(["--rig", str(rig), "--subject", "board:2", "--truth-only", str(tmp_path)]) == 0
+    told = json.loads((tmp_path / "prop.json").read_text())
+    assert told["rotation"] == board_pose(2, Board()).rotation.tolist()

@@ -1,0 +1,143 @@
+"""The procedural head and grooms, and strand files as subjects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from reconstruction.head.generic import generic_head, skin_distance
+from simulators.subject.subject import SubjectError, check_fits, load_subject, make_subject
+
+NAMES = ("wavy", "straight", "curly")
+
+
+@pytest.fixture(scope="module")
+def subjects():
+    return {name: make_subject(name, 3, strands=1500) for name in NAMES}
+
+
+def test_the_head_is_closed_and_human_in_size():
+    head = generic_head()
+    edges = np.sort(head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts == 2).all()
+    volume = np.einsum(
+        "ij,ij->",
+        head.vertices[head.faces[:, 0]],
+        np.cross(*head.vertices[head.faces[:, 1:]].swapaxes(0, 1)),
+    )
+    assert 0.003 < volume / 6 < 0.007  # outward normals, litres of a head with its neck
+    low, high = head.vertices.min(axis=0), head.vertices.max(axis=0)
+    assert high[0] - low[0] == pytest.approx(0.17, abs=0.02)  # over the ears
+    assert high[1] - low[1] == pytest.approx(0.22, abs=0.02)  # with the nose
+    assert high[2] == pytest.approx(0.115, abs=0.003)
+    assert head.vertices[head.vertices[:, 1].argmin(), 2] == pytest.approx(-0.02, abs=0.02)
+
+
+def test_the_scalp_is_the_top_and_the_back():
+    head = generic_head()
+    middle = head.vertices[head.faces].mean(axis=1)
+    assert head.face_areas()[head.scalp].sum() == pytest.approx(0.055, abs=0.01)
+    assert not head.scalp[(middle[:, 1] < -0.07) & (middle[:, 2] < 0.05)].any()  # the face
+    assert not head.scalp[np.abs(middle[:, 0]) > 0.08].any()  # the ears
+    assert head.scalp[middle[:, 2] > 0.1].all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_roots_lie_on_the_scalp(subjects, name):
+    head = generic_head()
+    faces = head.vertices[head.faces[head.scalp]]
+    i, j = np.divmod(np.arange(81), 9)
+    w = np.stack([i, j, 8 - i - j], axis=1)[i + j <= 8] / 8
+    on_scalp = np.einsum("kc,fcd->fkd", w, faces).reshape(-1, 3)
+    distance, _ = cKDTree(on_scalp).query(subjects[name].strands.roots)
+    assert distance.max() < 0.6e-3  # the grid's own gaps
+    assert np.abs(skin_distance(subjects[name].strands.roots)).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hair_stays_out_of_the_head(subjects, name):
+    points = subjects[name].strands.points.astype(float)
+    assert skin_distance(points).min() > -1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_lengths_are_human_and_points_evenly_spaced(subjects, name):
+    strands = subjects[name].strands
+    low, median, high = np.percentile(strands.lengths(), [2, 50, 98])
+    assert low > 0.06
+    assert 0.11 < median < 0.20
+    assert high < 0.26
+    starts = strands.segment_starts
+    step = np.linalg.norm(strands.points[starts + 1] - strands.points[starts], axis=1)
+    assert np.percentile(step, 99.9) < 0.015
+
+
+def test_styles_differ_in_how_much_they_turn(subjects):
+    """Median turn per centimetre away from the root, degrees."""
+    turn = {}
+    for name in NAMES:
+        strands = subjects[name].strands.resampled(0.005)
+        d = strands.tangents()
+        starts = strands.segment_starts
+        cosine = (d[starts] * d[starts + 1]).sum(axis=1).clip(-1, 1)
+        turn[name] = 2 * np.degrees(np.median(np.arccos(cosine)))
+    assert turn["straight"] < 0.6 * turn["wavy"] < 0.5 * turn["curly"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_full_groom_has_a_head_of_hair(name):
+    subject = make_subject(name, 0)
+    assert 8_000 <= len(subject.strands) <= 12_000
+    assert subject.strands.radius * len(subject.strands) == pytest.approx(100_000 * 40e-6)
+
+
+def test_the_seed_decides_every_byte(subjects):
+    again, other = (make_subject("wavy", seed, strands=1500) for seed in (3, 4))
+    assert again.strands.points.tobytes() == subjects["wavy"].strands.points.tobytes()
+    assert again.digest() == subjects["wavy"].digest() != other.digest()
+    assert not np.isin(other.strands.roots[:, 0], again.strands.roots[:, 0]).any()
+
+
+def test_a_strand_file_is_a_subject_and_a_thinned_one_gets_thicker(tmp_path, subjects):
+    lines = []
+    file = tmp_path / "groom.npz"
+    write_strands(file, Strands(subjects["wavy"].strands.points, subjects["wavy"].strands.offsets))
+    subject = load_subject(str(file), say=lines.append)
+    assert len(subject.strands) == 1500
+    assert subject.strands.radius == 1e-3
+    assert "1500 strands" in lines[0]
+    assert subject.head is None
+    assert subject.hair.sigma_a == (0.10, 0.20, 0.45)
+
+
+def test_sintel_fits_the_demo_rig(shared_data):
+    head = shared_data("sintel/sintel_head.obj")
+    lines = []
+    subject = load_subject(str(shared_data("sintel/sintel.npz")), head, say=lines.append)
+    assert len(subject.strands) == 11_400
+    assert subject.strands.radius == pytest.approx(0.351e-3, abs=1e-6)
+    assert "0.35 mm" in lines[0]
+    check_fits(subject, Rig.load("deploy/rigs/demo.toml"))
+
+
+def test_a_subject_elsewhere_is_an_error_that_says_so(tiny_rig, subjects):
+    subject = subjects["wavy"]
+    check_fits(subject, tiny_rig)
+    moved = subject.strands.transformed(np.eye(3), [0, 0, 1.6])
+    elsewhere = type(subject)("hair", moved, None, subject.hair, subject.skin)
+    with pytest.raises(SubjectError, match=r"cam_a of rig tiny sees only 0%.*convert"):
+        check_fits(elsewhere, tiny_rig)
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "said"),
+    [("afro", None, "wavy, straight, curly"), ("wavy", "x.obj", "own head")],
+)
+def test_unknown_subjects_are_errors(name, head, said):
+    with pytest.raises(SubjectError, match=said):
+        load_subject(name, head)

@@ -1,0 +1,223 @@
+"""The seam that the API calls: one capture at a time, listed, steered, dark at the end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reconstruction.capture.folder import CaptureError
+from reconstruction.capture.verify import verify
+from reconstruction.geometry.rig import RigError
+from stage_service.acquisition.captures import Busy, CaptureManager, UnknownCapture
+from stage_service.acquisition.states import WrongState
+from stage_service.config import RigFile
+from stage_service.plan.capture_plan import CapturePlan, PlanError
+
+SHORT = CapturePlan(lights=("light_003", "light_000"), projectors=())
+LONG = CapturePlan(projectors=())
+
+
+@pytest.fixture
+def completed() -> list[Any]:
+    return []
+
+
+@pytest.fixture
+def manager(rig_file: RigFile, tmp_path: Path, completed: list[Any]) -> Iterator[CaptureManager]:
+    one = CaptureManager(rig_file, tmp_path / "service", completed.append)
+    yield one
+    one.close()
+
+
+def until(manager: CaptureManager, kind: str, **wanted: Any) -> Any:
+    """The first event of this kind with these values."""
+    number = 0
+    for _ in range(1000):
+        events = manager.events.wait(number, 10.0)
+        assert events, f"no {kind} {wanted} within 10 s"
+        for event in events:
+            number = event.number
+            if event.kind == kind and wanted.items() <= event.data.items():
+                return event
+    raise AssertionError(kind)
+
+
+def test_a_capture_from_start_to_follow_up(manager, world, completed):
+    capture_id = manager.start(SHORT, extra={"pipeline": "full"})
+    status = manager.wait(capture_id, 20)
+    assert (status.state, status.outcome, status.error) == ("done", "completed", None)
+    assert (status.step, status.steps) == (6, 6)
+    assert (status.frames_written, status.frames_missing) == (18, 0)
+    assert status.request == {"pipeline": "full"}
+    assert completed == [status]
+    assert manager.list() == [status]
+    assert verify(manager.path(capture_id)) == []
+    states = [e.data["state"] for e in manager.events.since(0) if e.kind == "capture.state"]
+    assert states == ["running", "finishing", "done"]
+
+
+def test_masks_and_plan_are_checked_before_a_folder_exists(manager):
+    with pytest.raises(PlanError):
+        manager.start(CapturePlan(lights=("nobody",)))
+    with pytest.raises(CaptureError, match="mask of cam_0"):
+        manager.start(SHORT, masks={"cam_0": np.zeros((2, 2), bool)})
+    with pytest.raises(CaptureError, match="no camera 'cam_9'"):
+        manager.start(SHORT, masks={"cam_9": np.zeros((6, 8), bool)})
+    assert list(manager.folder.iterdir()) == []
+
+
+def test_one_capture_at_a_time_and_steering(manager, world):
+    first = manager.start(LONG)
+    with pytest.raises(Busy, match=first):
+        manager.start(SHORT)
+    manager.pause(first)
+    until(manager, "capture.state", state="paused")
+    assert not world.lit
+    assert manager.get(first).state == "paused"
+    assert manager.devices()["lights"]["state"] == "ok"
+    manager.resume(first)
+    manager.abort(first)
+    status = manager.wait(first, 20)
+    assert status.outcome == "aborted"
+    assert not world.lit
+    with pytest.raises(WrongState, match="cannot pause a capture that is done"):
+        manager.pause(first)
+    with pytest.raises(UnknownCapture):
+        manager.abort("nobody")
+    second = manager.start(SHORT)
+    assert manager.wait(second, 20).outcome == "completed"
+
+
+def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, world):
+    world.busy = {"cam_1": 10**9, "cam_2": 10**9}
+    capture_id = manager.start(LONG)
+    until(manager, "capture.state", state="running")
+    assert manager.blackout() == {
+        "safe": True,
+        "state": "dark",
+        "detail": "every lamp and projector was read back dark",
+    }
+    assert manager.get(capture_id).outcome == "aborted"
+
+
+def test_blackout_without_a_capture(manager, world):
+    world.lit, world.show = {3, 4}, "ON 65535"
+    assert manager.blackout()["safe"]
+    assert not world.lit
+    assert world.show == "OFF"
+    world.lit, world.stuck_lamps = {7}, True
+    answer = manager.blackout()
+    assert not answer["safe"]
+    assert "unknown, unsafe" in answer["detail"]
+
+
+def test_devices_are_asked_one_by_one(manager, world):
+    world.estop = True
+    world.late = ["ID?"]
+    devices = manager.devices()
+    assert devices["lights"]["estop_pressed"] is True
+    assert devices["lights"]["count"] == 200
+    assert devices["trigger"]["state"] == "unreachable"
+    assert "within 0.3 s" in devices["trigger"]["error"]
+    assert devices["projectors"]["names"] == ["left", "right"]
+    assert devices["cameras"]["cam_2"]["gain"] == 10000.0
+
+
+def test_an_interrupted_capture_is_listed_after_a_restart(manager, rig_file, world):
+    capture_id = manager.start(SHORT)
+    manager.wait(capture_id, 20)
+    (manager.path(capture_id) / "manifest.json").unlink()
+    (manager.folder / "not a capture").mkdir()
+    damaged = manager.folder / "damaged"
+    damaged.mkdir()
+    (damaged / "plan.json").write_text("{")
+    (damaged / "rig.json").write_text("{")
+    manager.close()
+    again = CaptureManager(rig_file, manager.folder.parent)
+    (status,) = again.list()
+    assert (status.state, status.outcome) == ("done", "interrupted")
+    assert status.frames_written == 18
+    again.close()
+
+
+def test_a_follow_up_that_fails_is_told_and_the_capture_stays_completed(rig_file, tmp_path, world):
+    def broken(_status: Any) -> None:
+        raise RuntimeError("no queue")
+
+    manager = CaptureManager(rig_file, tmp_path / "service", broken)
+    status = manager.wait(manager.start(SHORT), 20)
+    assert status.outcome == "completed"
+    event = until(manager, "capture.follow_up_failed")
+    assert event.data["error"] == "RuntimeError: no queue"
+    manager.close()
+
+
+def test_a_closed_manager_starts_nothing(manager):
+    manager.close()
+    with pytest.raises(Busy):
+        manager.start(SHORT)
+
+
+def test_without_devices_nothing_can_be_shot(rig_file, tmp_path):
+    manager = CaptureManager(replace(rig_file, devices=None), tmp_path / "service")
+    with pytest.raises(RigError, match=r"\[devices\] is missing"):
+        manager.start(SHORT)
+    manager.close()
+
+
+PROCESS = """
+import sys, time
+from pathlib import Path
+from stage_service.acquisition.captures import CaptureManager
+from stage_service.config import load_rig_file
+from stage_service.plan.capture_plan import CapturePlan
+manager = CaptureManager(load_rig_file(sys.argv[1]), Path(sys.argv[2]))
+manager.start(CapturePlan(projectors=()))
+while manager.events.last < 12:
+    manager.events.wait(manager.events.last, 1.0)
+print("going", flush=True)
+{ending}
+"""
+# Short sleeps: Python sees a signal that came just before a sleep only after it.
+ASLEEP = "for _ in range(600): time.sleep(0.1)"
+
+
+@pytest.mark.parametrize(
+    ("ending", "send"),
+    [
+        ("", None),
+        (ASLEEP, signal.SIGTERM),
+        (ASLEEP, signal.SIGINT),
+        ("raise ValueError", None),
+    ],
+    ids=["exit", "SIGTERM", "Ctrl-C", "exception"],
+)
+def test_the_process_leaves_darkness_behind(rig_file, world, tmp_path, ending, send):
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROCESS.format(ending=ending), rig_file.path, tmp_path / "service"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])},
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "going\n"
+    if send is not None:
+        process.send_signal(send)
+    process.communicate(timeout=20)
+    assert not world.lit
+    assert world.show == "OFF"
+    manager = CaptureManager(rig_file, tmp_path / "service")
+    (status,) = manager.list()
+    assert status.outcome == "aborted"
+    assert 0 < status.frames_written < status.frames_planned
+    manager.close()

@@ -1,0 +1,137 @@
+"""Leases, the lock of a root folder, the latch and the audit log, each by itself."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stage_service.acquisition.latch import CannotAcknowledge, Latch, Unsafe
+from stage_service.acquisition.safety import Blackout
+from stage_service.records.audit import AuditLog
+from stage_service.records.lease import Leased, Leases, NoLease, RootInUse, RootLock
+
+DARK = Blackout(True, "dark")
+LIT = Blackout(False, "unknown, unsafe: lamps: still lit")
+UNREAD = Blackout(False, "unknown, unsafe: cannot be read back", accepted=True)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_lease_ends_by_itself_and_is_renewed_from_now():
+    clock = Clock()
+    leases = Leases(clock)
+    first = leases.take("Ada", 10)
+    with pytest.raises(Leased, match="Ada steers the stage until"):
+        leases.take("Eve", 10)
+    clock.now = 9.0
+    assert leases.renew(first.token, 10).holder == "Ada"
+    clock.now = 18.0
+    leases.check(first.token)
+    for stranger in (None, "", "é", first.token[:-1]):
+        with pytest.raises(Leased):
+            leases.check(stranger)
+    clock.now = 19.0
+    leases.check(None)
+    assert leases.current is None
+    with pytest.raises(NoLease):
+        leases.renew(first.token, 10)
+    second = leases.take("Eve", 10)
+    assert second.token != first.token
+    with pytest.raises(NoLease):
+        leases.release(first.token)
+    assert leases.holder(second.token) == "Eve"
+    leases.release(second.token)
+    leases.check(None)
+
+
+def test_two_services_never_share_a_root(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from stage_service.records.lease import RootLock;"
+        "lock = RootLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert other.stdin is not None
+    assert other.stdout is not None
+    assert other.stdout.readline() == "held\n"
+    with pytest.raises(RootInUse, match=f"process id {other.pid}: two services must not"):
+        RootLock(tmp_path)
+    other.kill()
+    other.wait()
+    other.stdin.close()
+    other.stdout.close()
+    lock = RootLock(tmp_path)
+    lock.release()
+    RootLock(tmp_path).release()
+
+
+def test_the_latch_holds_until_a_blackout_is_read_back_dark(tmp_path):
+    latch = Latch(tmp_path / "unsafe.json")
+    latch.check()
+    assert latch.learn(DARK, reads_back=True) is None
+    assert latch.learn(LIT, reads_back=True) == "set"
+    assert latch.learn(LIT, reads_back=True) is None
+    again = Latch(tmp_path / "unsafe.json")
+    with pytest.raises(Unsafe, match=r"still lit.*until POST /devices/blackout reads it back dark"):
+        again.check()
+    with pytest.raises(CannotAcknowledge):
+        again.acknowledge()
+    assert again.learn(DARK, reads_back=True) == "cleared"
+    Latch(tmp_path / "unsafe.json").check()
+
+
+def test_where_the_link_cannot_read_back_a_person_clears_the_latch(tmp_path):
+    latch = Latch(tmp_path / "unsafe.json")
+    assert latch.learn(UNREAD, reads_back=False) is None, "accepted: blocks nothing"
+    latch.check()
+    assert latch.learn(LIT, reads_back=False) == "set"
+    assert latch.learn(UNREAD, reads_back=False) is None
+    with pytest.raises(Unsafe, match="until somebody has looked"):
+        latch.check()
+    latch.acknowledge()
+    latch.check()
+    Latch(tmp_path / "unsafe.json").check()
+    with pytest.raises(CannotAcknowledge, match="nothing is latched"):
+        latch.acknowledge()
+
+
+def test_a_damaged_latch_is_a_set_one(tmp_path):
+    (tmp_path / "unsafe.json").write_text("{")
+    with pytest.raises(Unsafe, match="cannot be read"):
+        Latch(tmp_path / "unsafe.json").check()
+
+
+def test_a_torn_line_spoils_no_other(tmp_path):
+    path = tmp_path / "audit.jsonl"
+    log = AuditLog(path)
+    assert log.latest(5) == []
+    log.record("Ada", "blackout", "stage", "dark")
+    with path.open("a") as file:
+        file.write('{"time": "2026')
+    log.record("Ada", "capture.start", "c1")
+    log.record("Eve", "capture.start", "c2", "refused", "why")
+    assert [(a.action, a.subject) for a in log.latest(10)] == [
+        ("blackout", "stage"),
+        ("capture.start", "c1"),
+        ("capture.start", "c2"),
+    ]
+    (last,) = log.latest(1)
+    assert (last.who, last.result, last.detail) == ("Eve", "refused", "why")
+
+
+def test_a_disk_that_is_full_keeps_nobody_from_acting(caplog):
+    log = AuditLog(Path("/dev/full"))
+    log.record("Ada", "blackout", "stage", "dark")
+    assert "not recorded" in caplog.text

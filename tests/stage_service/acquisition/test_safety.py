@@ -1,0 +1,69 @@
+"""Blackout, where a device answers with something that nobody foresaw."""
+
+from types import SimpleNamespace
+
+from stage_service.acquisition.safety import blackout
+from stage_service.devices.errors import DeviceTimeout
+from stage_service.devices.lights.interface import LightCapabilities
+from stage_service.devices.projectors.interface import ProjectorCapabilities
+
+
+class Broken:
+    """A light bank whose driver has a fault of its own."""
+
+    name = "lights"
+    capabilities = LightCapabilities(reads_back=True, dead_man=True, table=0)
+
+    def off(self):
+        raise ZeroDivisionError("a fault of the driver")
+
+
+class Beams:
+    name = "projectors"
+    capabilities = ProjectorCapabilities(reads_back=True, dead_man=False, table=0)
+    lit = True
+
+    def off(self):
+        self.lit = False
+
+    def is_dark(self):
+        return not self.lit
+
+
+class Silent:
+    """A light bank that obeys and cannot say so."""
+
+    name = "lights"
+    capabilities = LightCapabilities(reads_back=False, dead_man=False, table=0)
+    dead = False
+
+    def off(self):
+        if self.dead:
+            raise DeviceTimeout("lights", "off", expected="an answer", received="", todo="")
+
+
+def stage(lights, beams, *, accepts=False):
+    accepted = SimpleNamespace(accept_unverified_blackout=accepts)
+    config = SimpleNamespace(watchdog_s=2.0, lights=accepted)
+    return SimpleNamespace(lights=lights, projectors=beams, config=config)
+
+
+def test_a_fault_of_one_driver_does_not_keep_the_projectors_lit():
+    beams = Beams()
+    result = blackout(stage(Broken(), beams), attempts=1)
+    assert not beams.lit
+    assert not result.safe
+    assert "ZeroDivisionError: a fault of the driver" in result.detail
+    assert "Its watchdog darkens it within 2 s" in result.detail
+    assert result.blocks
+
+
+def test_what_cannot_be_read_back_is_unknown_and_blocks_unless_that_is_accepted():
+    unread = blackout(stage(Silent(), Beams()), attempts=1)
+    assert (unread.state, unread.blocks) == ("unknown, unsafe", True)
+    accepted = blackout(stage(Silent(), Beams(), accepts=True), attempts=1)
+    assert (accepted.state, accepted.blocks) == ("unknown, unsafe", False)
+    assert accepted.detail.endswith("off was sent, but cannot be read back.")
+    broken = Silent()
+    broken.dead = True
+    assert blackout(stage(broken, None, accepts=True), attempts=1).blocks

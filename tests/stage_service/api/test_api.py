@@ -1,0 +1,340 @@
+"""The HTTP API over real sockets: captures, frames, jobs, events, and errors as problems."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+
+from reconstruction.files.exr import read_exr
+from stage_service.api.app import LOOPBACK, create_app
+from stage_service.api.problems import KINDS, Problem, errors_page
+from stage_service.config import RigFile
+from stage_service.jobs.records import Job, JobOptions
+from stage_service.service import CaptureRequest, CaptureView, JobRequest, Stage
+
+SHORT = {
+    "lights": ["light_003", "light_000"],
+    "projectors": [],
+    "exposure": {"olat": 0.01},  # the peers answer lamp number + 1 counts at this exposure
+}
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+
+
+class Server:
+    """The application on a free port, in a thread."""
+
+    def __init__(self, rig_file: RigFile, root: Path) -> None:
+        self.stage = Stage(rig_file, root)
+        config = uvicorn.Config(
+            create_app(self.stage), host=LOOPBACK, port=0, log_level="error", ws="none"
+        )
+        self.server = uvicorn.Server(config)
+        self.thread = threading.Thread(target=self.server.run)
+        self.thread.start()
+        until(lambda: self.server.started)
+        port = self.server.servers[0].sockets[0].getsockname()[1]
+        self.http = httpx.Client(base_url=f"http://{LOOPBACK}:{port}", timeout=20, trust_env=False)
+
+    def stop(self) -> None:
+        self.http.close()
+        self.server.should_exit = True
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+
+
+def until(what: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def server(rig_file: RigFile, tmp_path: Path) -> Iterator[Server]:
+    server = Server(rig_file, tmp_path / "root")
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def http(server: Server) -> httpx.Client:
+    return server.http
+
+
+@pytest.fixture
+def head(tmp_path: Path) -> str:
+    path = tmp_path / "head.obj"
+    path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\ng scalp\nf 1 2 3\n")
+    return str(path)
+
+
+def capture_done(http: httpx.Client, body: dict[str, Any]) -> dict[str, Any]:
+    begun = http.post("/captures", json=body)
+    assert begun.status_code == 202, begun.text
+    where = begun.headers["location"]
+    until(lambda: http.get(where).json()["state"] == "done")
+    done: dict[str, Any] = http.get(where).json()
+    return done
+
+
+def problem(response: httpx.Response, slug: str) -> dict[str, Any]:
+    """Check that the response is a problem document of this kind, and return it."""
+    assert response.headers["content-type"] == "application/problem+json", response.text
+    data: dict[str, Any] = response.json()
+    assert data["type"] == f"/docs/errors.md#{slug}"
+    assert data["status"] == response.status_code
+    assert data["title"] == KINDS[slug].title
+    assert data["detail"]
+    return data
+
+
+def test_a_plan_is_costed_without_touching_the_stage(http, world):
+    cost = http.post("/plans:validate", json=SHORT).json()
+    assert (cost["steps"], cost["frames"]) == (6, 18)
+    assert cost["bytes"] > 18 * 8 * 6 * 12
+    assert cost["seconds"] > 0
+    assert world.pulses == 0
+    refused = http.post("/plans:validate", json={"lights": ["light_999"]})
+    assert "light_999" in problem(refused, "invalid-plan")["problems"][0]
+    refused = http.post("/plans:validate", json={"exposures": {}})
+    errors = problem(refused, "invalid-request")["errors"]
+    assert errors == [{"field": "body.exposures", "message": "Extra inputs are not permitted"}]
+
+
+def test_a_capture_its_frames_and_its_job(http, server, head):
+    pipeline = {"name": "light_planes", "options": {"seed": 3}}
+    done = capture_done(http, {"plan": SHORT, "pipeline": pipeline, "head": head})
+    assert (done["outcome"], done["frames_written"], done["frames_missing"]) == ("completed", 18, 0)
+    assert [c["id"] for c in http.get("/captures").json()] == [done["id"]]
+
+    frames = f"/captures/{done['id']}/frames"
+    exr = server.stage.root / "frame.exr"
+    exr.write_bytes(http.get(f"{frames}/2/cam_0.exr").content)
+    image, attributes = read_exr(exr)
+    assert image.shape == (6, 8, 3)
+    assert image.mean() == pytest.approx(4 * attributes["countScale"], rel=1e-4)
+    png = http.get(f"{frames}/2/cam_0.png")
+    assert png.headers["content-type"] == "image/png"
+    picture = cv2.imdecode(np.frombuffer(png.content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (6, 8, 3)
+    assert (picture == 255).all()  # an even picture is exposed to white
+    assert "cam_2" in problem(http.get(f"{frames}/2/cam_9.exr"), "unknown-frame")["detail"]
+    problem(http.get(f"{frames}/99/cam_0.png"), "unknown-frame")
+    problem(http.get("/captures/nope/frames/0/cam_0.exr"), "unknown-capture")
+
+    job = http.get(f"/jobs/{done['job']}").json()
+    assert (job["state"], job["pipeline"], job["capture"]) == (
+        "queued",
+        "light_planes",
+        done["path"],
+    )
+    assert job["options"]["seed"] == 3
+    assert [j["id"] for j in http.get("/jobs").json()] == [job["id"]]
+    cancelled = http.delete(f"/jobs/{job['id']}").json()
+    assert (cancelled["state"], cancelled["outcome"]) == ("done", "cancelled")
+
+    asked = http.post("/jobs", json={"capture": done["id"], "pipeline": {"name": "reconstruct"}})
+    assert asked.status_code == 202
+    assert http.get(asked.headers["location"]).json()["capture"] == done["path"]
+    refused = {"name": "fit", "options": {"held_out_cameras": ["cam_7"]}}
+    refused = http.post("/jobs", json={"capture": done["id"], "pipeline": refused})
+    assert "cam_7" in problem(refused, "bad-input")["detail"]
+
+
+def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, tmp_path, head):
+    server = Server(rig_file, tmp_path)
+    server.stage.captures._on_complete = None  # as if killed right after the manifest
+    body = {"plan": SHORT, "pipeline": {"name": "reconstruct"}, "head": head}
+    begun = server.http.post("/captures", json=body).json()
+    until(lambda: server.stage.captures.get(begun["id"]).state == "done")
+    assert server.http.get("/jobs").json() == []
+    server.stop()
+    server = Server(rig_file, tmp_path)
+    try:
+        assert [j["pipeline"] for j in server.http.get("/jobs").json()] == ["reconstruct"]
+        assert server.http.get(f"/captures/{begun['id']}").json()["job"] is not None
+    finally:
+        server.stop()
+
+
+def test_steering_a_capture(http, world):
+    capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+    paused = http.post(f"/captures/{capture}/pause")
+    assert paused.status_code == 200
+    until(lambda: http.get(f"/captures/{capture}").json()["state"] == "paused")
+    assert not world.lit
+    busy = problem(http.post("/captures", json={"plan": SHORT}), "busy")
+    assert busy["running"] == capture
+    assert http.get("/health").json()["capture"] == capture
+    http.post(f"/captures/{capture}/resume")
+    until(lambda: http.get(f"/captures/{capture}").json()["state"] == "running")
+    assert http.post(f"/captures/{capture}/abort").status_code == 200
+    until(lambda: http.get(f"/captures/{capture}").json()["state"] == "done")
+    assert http.get(f"/captures/{capture}").json()["outcome"] == "aborted"
+    assert not world.lit
+    assert problem(http.post(f"/captures/{capture}/pause"), "wrong-state")["state"] == "done"
+    submit = http.post("/jobs", json={"capture": "nope", "pipeline": {"name": "fit"}})
+    problem(submit, "unknown-capture")
+
+
+def test_devices_and_blackout(http, world):
+    devices = http.get("/devices").json()
+    assert devices["lights"]["state"] == "ok"
+    world.lit = {5}
+    assert http.post("/devices/blackout").json()["safe"] is True
+    assert not world.lit
+
+
+def test_artifacts_stay_inside_the_model_folder(http, server, tmp_path):
+    model = server.stage.root / "models" / "m"
+    (model / "masks").mkdir(parents=True)
+    (model / "report.json").write_text('{"stages": []}')
+    (model / "masks" / "cam_0.png").write_bytes(b"png")
+    (tmp_path / "secret").write_text("secret")
+    (model / "way_out").symlink_to(tmp_path / "secret")
+    queue = server.stage.queue
+    queue.submit("fit", tmp_path, model, JobOptions(), job="job-1")
+    listed = {a["path"]: a["bytes"] for a in http.get("/jobs/job-1/artifacts").json()}
+    assert listed == {"masks/cam_0.png": 3, "report.json": 14}
+    assert http.get("/jobs/job-1/artifacts/masks/cam_0.png").content == b"png"
+    assert http.get("/jobs/job-1/report").json() == {"stages": []}
+    for path in ("nope", "masks", "..%2f..%2f..%2fsecret", "way_out", "%2e%2e/%2e%2e/jobs.sqlite"):
+        problem(http.get(f"/jobs/job-1/artifacts/{path}"), "unknown-artifact")
+    problem(http.get("/jobs/job-2/report"), "unknown-job")
+
+
+def read_events(http: httpx.Client, count: int, headers: dict[str, str]) -> list[dict[str, Any]]:
+    """The first `count` events of the stream, each checked against its frame."""
+    events: list[dict[str, Any]] = []
+    frame: dict[str, str] = {}
+    with http.stream("GET", "/events", headers=headers) as response:
+        assert response.headers["content-type"].startswith("text/event-stream")
+        for line in response.iter_lines():
+            key, _, value = line.partition(": ")
+            if key in ("id", "event", "data"):
+                frame[key] = value
+            elif not line and frame:
+                event = json.loads(frame["data"])
+                assert (str(event["number"]), event["kind"]) == (frame["id"], frame["event"])
+                events.append(event)
+                frame = {}
+                if len(events) == count:
+                    break
+    return events
+
+
+def test_events_are_numbered_and_replay_from_the_last_seen(http, server):
+    done = capture_done(http, {"plan": SHORT})
+    newest = server.stage.events.last
+    first = read_events(http, newest, {"Last-Event-ID": "0"})
+    assert [e["number"] for e in first] == list(range(1, newest + 1))
+    states = [e["data"]["state"] for e in first if e["kind"] == "capture.state"]
+    assert (states[0], states[-1]) == ("running", "done")
+    assert all(e["data"]["id"] == done["id"] for e in first)
+    assert read_events(http, 2, {"Last-Event-ID": "3"}) == first[3:5]
+    # A number from before a restart is not waited for: everything is replayed.
+    assert read_events(http, 1, {"Last-Event-ID": "100000"}) == first[:1]
+    problem(http.get("/events", headers={"Last-Event-ID": "-1"}), "invalid-request")
+
+
+def test_job_events_follow_the_queue(http, server, tmp_path):
+    before = server.stage.events.last
+    server.stage.queue.submit("fit", tmp_path, tmp_path / "m", JobOptions(), job="job-7")
+    (event,) = read_events(http, 1, {"Last-Event-ID": str(before)})
+    assert (event["kind"], event["data"]["state"]) == ("job.state", "queued")
+
+
+def test_a_stranger_host_name_is_refused(http):
+    refused = http.get("/health", headers={"Host": "rebound.example"})
+    assert refused.status_code == 421
+    assert "rebound.example" in problem(refused, "http")["detail"]
+    assert http.get("/health", headers={"Host": "localhost:8331"}).json()["status"] == "ok"
+
+
+def test_files_of_a_request_are_checked_before_anything_is_lit(http, world, tmp_path):
+    (tmp_path / "head.obj").write_text("v 0 0 0\n")
+    for body, named in (
+        ({"head": str(tmp_path / "none.obj")}, "none.obj"),
+        ({"head": str(tmp_path / "head.obj")}, "no faces"),
+        ({"masks": str(tmp_path)}, "cam"),
+    ):
+        refused = http.post("/captures", json={"plan": SHORT, **body})
+        assert named in problem(refused, "bad-input")["detail"]
+    cv2.imwrite(str(tmp_path / "cam_0.png"), np.zeros((4, 4), np.uint8))
+    refused = http.post("/captures", json={"plan": SHORT, "masks": str(tmp_path)})
+    assert "expected 8x6, got 4x4" in problem(refused, "bad-input")["detail"]
+    assert http.get("/captures").json() == []
+    assert world.pulses == 0
+
+
+def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, head):
+    for pipeline, given, why in (
+        ("light_planes", {}, "give the head"),
+        ("fit", {"head": head}, "strands that are there already"),
+    ):
+        refused = http.post("/captures", json={"pipeline": {"name": pipeline}, **given})
+        assert why in problem(refused, "bad-input")["detail"]
+    done = capture_done(http, {"plan": SHORT})
+    refused = http.post("/jobs", json={"capture": done["id"], "pipeline": {"name": "fit"}})
+    assert "a model with strands" in problem(refused, "bad-input")["detail"]
+
+
+def test_every_route_of_the_api_is_there_and_documented(http):
+    document = http.get("/openapi.json").json()
+    routes = {
+        f"{method.upper()} {path}" for path, item in document["paths"].items() for method in item
+    }
+    assert routes == {
+        "POST /plans:validate",
+        "POST /captures",
+        "GET /captures",
+        "GET /captures/{capture}",
+        "POST /captures/{capture}/pause",
+        "POST /captures/{capture}/resume",
+        "POST /captures/{capture}/abort",
+        "GET /captures/{capture}/frames/{step}/{camera}.exr",
+        "GET /captures/{capture}/frames/{step}/{camera}.png",
+        "POST /jobs",
+        "GET /jobs",
+        "GET /jobs/{job}",
+        "DELETE /jobs/{job}",
+        "GET /jobs/{job}/report",
+        "GET /jobs/{job}/artifacts",
+        "GET /jobs/{job}/artifacts/{path}",
+        "GET /devices",
+        "POST /devices/blackout",
+        "POST /devices/acknowledge",
+        "POST /lease",
+        "GET /lease",
+        "PATCH /lease",
+        "DELETE /lease",
+        "GET /audit",
+        "GET /health",
+        "GET /events",
+    }
+    for item in document["paths"].values():
+        for operation in item.values():
+            assert operation["summary"]
+            assert operation["description"]
+            assert "application/problem+json" in operation["responses"]["default"]["content"]
+    schemas = document["components"]["schemas"]
+    for model in (CaptureRequest, CaptureView, JobRequest, Job, Problem):
+        for example in model.model_json_schema()["examples"]:
+            model.model_validate(example)
+        assert model is Problem or schemas[model.__name__]["examples"]
+    problem(http.get("/nowhere"), "http")
+    problem(http.put("/jobs"), "http")
+
+
+def test_the_page_of_errors_is_the_table():
+    assert (DOCS / "errors.md").read_text() == errors_page()

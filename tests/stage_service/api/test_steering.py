@@ -1,0 +1,312 @@
+"""Who may steer, what is refused while nobody knows what is lit, and the record of it all."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+
+from reconstruction.capture.verify import verify
+from stage_service.api.app import create_app
+from stage_service.cli import main
+from stage_service.config import RigFile, SafetyLimits
+from stage_service.devices.device_set import Stage as Devices
+from stage_service.service import Stage
+
+SHORT = {"lights": ["light_003", "light_000"], "projectors": []}
+IN_BAND = {**SHORT, "lights": "all", "exposure": {"olat": 0.05}}
+CONSENT = "N. N., 3 May 2026, flashes of 14 Hz for ten seconds"
+
+
+class Client(httpx.Client):
+    """Asks the application, which runs on a socket of its own; `stage` is behind it."""
+
+    stage: Stage
+
+
+@contextmanager
+def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
+    """The application, started and closed as the server does."""
+    stage = Stage(rig_file, root)
+    config = uvicorn.Config(create_app(stage), log_level="error", ws="none")
+    server = uvicorn.Server(config)
+    listener = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    try:
+        # The socket takes connections before the server does: the first answer comes when it is up.
+        with Client(base_url=url, timeout=30, trust_env=False) as client:
+            client.stage = stage
+            client.get("/health")
+            yield client
+    finally:
+        server.should_exit = True
+        thread.join(30)
+        listener.close()
+
+
+@pytest.fixture
+def http(rig_file: RigFile, tmp_path: Path) -> Iterator[Client]:
+    with serving(rig_file, tmp_path / "root") as client:
+        yield client
+
+
+def refused(response: httpx.Response, slug: str) -> dict[str, Any]:
+    data: dict[str, Any] = response.json()
+    assert data["type"] == f"/docs/errors.md#{slug}", data
+    assert data["status"] == response.status_code
+    return data
+
+
+def done(http: Client, capture: str) -> dict[str, Any]:
+    http.stage.captures.wait(capture, 20)
+    status: dict[str, Any] = http.get(f"/captures/{capture}").json()
+    assert status["state"] == "done"
+    return status
+
+
+def audit(http: Client) -> list[tuple[str, str, str]]:
+    """(who, action, result) of each, the caller's port left out."""
+    entries = http.get("/audit").json()
+    return [(re.sub(r":\d+", "", a["who"]), a["action"], a["result"]) for a in entries]
+
+
+def test_without_a_lease_anybody_steers_and_with_one_its_holder(http):
+    assert http.get("/lease").json() == {"holder": None, "expires": None}
+    capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+    granted = http.post("/lease", json={"holder": "Ada", "seconds": 60}).json()
+    mine = {"Hairstage-Lease": granted["token"]}
+    assert http.get("/lease").json() == {"holder": "Ada", "expires": granted["expires"]}
+    for other in ({}, {"Hairstage-Lease": "guessed"}):
+        for path in ("/captures", f"/captures/{capture}/pause", f"/captures/{capture}/resume"):
+            problem = refused(http.post(path, headers=other, json={}), "leased")
+            assert (problem["holder"], problem["expires"]) == ("Ada", granted["expires"])
+    refused(http.post("/lease", json={"holder": "Eve"}), "leased")
+    assert http.post(f"/captures/{capture}/pause", headers=mine).is_success
+    assert http.post(f"/captures/{capture}/abort").is_success, "anybody may abort"
+    assert done(http, capture)["outcome"] == "aborted"
+    assert http.post("/devices/blackout").json()["state"] == "dark"
+
+    later = http.patch("/lease", headers=mine, json={"seconds": 600}).json()
+    assert later["expires"] > granted["expires"]
+    refused(http.patch("/lease", json={}), "no-lease")
+    refused(http.delete("/lease"), "no-lease")
+    assert http.delete("/lease", headers=mine).json()["holder"] is None
+    assert ("Ada (127.0.0.1)", "capture.pause", "ok") in audit(http)
+    assert ("127.0.0.1", "capture.pause", "refused") in audit(http)
+
+
+def test_the_command_line_steers_under_a_lease(http, tmp_path, capsys):
+    def run(*words: str) -> tuple[int, dict[str, Any]]:
+        code = main([*words, "--url", str(http.base_url), "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(SHORT))
+    start = ("capture", "start", "--plan", str(plan), "--wait")
+    code, told = run(*start)
+    assert (code, told["capture"]["outcome"]) == (0, "completed")
+    assert run("lease", "show")[1]["holder"] is None, "released at the end"
+    assert audit(http)[0][1] == "lease.take"
+    assert audit(http)[-1][1:] == ("lease.release", "ok")
+
+    token = run("lease", "take", "--holder", "Ada")[1]["token"]
+    code, told = run(*start)
+    assert (code, told["error"]["problem"]["holder"]) == (1, "Ada")
+    assert run(*start, "--lease", token)[0] == 0
+    assert run("lease", "renew", "--lease", token)[1]["holder"] == "Ada"
+    assert run("lease", "release", "--lease", token)[1]["holder"] is None
+    code, told = run("capture", "resume", told_id(http), "--armed-by", "Ada")
+    assert (code, told["error"]["problem"]["type"]) == (1, "/docs/errors.md#wrong-state")
+
+
+def told_id(http: Client) -> str:
+    capture: str = http.get("/captures").json()[0]["id"]
+    return capture
+
+
+def test_the_audit_log_has_every_action_in_order_and_survives(http, rig_file, tmp_path):
+    capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
+    done(http, capture)
+    http.post("/captures", json={"plan": {"lights": ["nobody"]}})
+    http.post("/devices/blackout")
+    me = "127.0.0.1"
+    entries = audit(http)
+    # A short capture may end before its start is written down.
+    assert sorted(entries[:2]) == [
+        (me, "capture.start", "ok"),
+        ("service", "capture.end", "completed"),
+    ]
+    assert entries[2:] == [(me, "capture.start", "refused"), (me, "blackout", "dark")]
+    entry = http.get("/audit", params={"limit": 2}).json()[0]
+    assert "nobody" in entry["detail"]
+    assert entry["time"].endswith("+00:00")
+    lines = (tmp_path / "root" / "audit.jsonl").read_text().splitlines()
+    assert len(lines) == 4
+
+
+def test_a_stage_that_is_not_dark_is_latched_and_stays_so_over_a_restart(rig_file, world, tmp_path):
+    root = tmp_path / "root"
+    with serving(rig_file, root) as http:
+        assert http.get("/devices").json()["safety"]["state"] == "dark"
+        world.lit, world.stuck_lamps = {7}, True
+        assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
+        problem = refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+        assert "putting all lamps off" in problem["detail"]
+        safety = http.get("/devices").json()["safety"]
+        assert safety["latched"] is not None
+    with serving(rig_file, root) as http:
+        assert http.get("/devices").json()["safety"]["latched"] == safety["latched"]
+        refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+        word = {"name": "Ada", "note": "all dark, I looked"}
+        problem = refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
+        assert "ask for a blackout" in problem["detail"]
+        world.stuck_lamps = False
+        assert http.post("/devices/blackout").json()["safe"]
+        refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
+        capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
+        assert done(http, capture)["outcome"] == "completed"
+        latch = [a for _, a, _ in audit(http) if a.startswith("latch")]
+        assert latch == ["latch.set", "latch.cleared"]
+
+
+def test_a_capture_that_cannot_end_dark_latches(http, world):
+    world.stuck_lamps = True
+    capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
+    assert done(http, capture)["outcome"] == "failed"
+    refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+    refused(http.post(f"/captures/{capture}/resume"), "unsafe")
+
+
+def test_the_service_starts_dark_and_starts_without_its_devices(rig_file, world, tmp_path):
+    world.lit, world.show = {1, 2}, "ON 65535"
+    with serving(rig_file, tmp_path / "a"):
+        assert (world.lit, world.show) == (set(), "OFF")
+    assert rig_file.devices is not None
+    nowhere = rig_file.devices.lights.model_copy(update={"port": 1})
+    away = replace(rig_file, devices=rig_file.devices.model_copy(update={"lights": nowhere}))
+    with serving(away, tmp_path / "b") as http:
+        assert http.get("/health").json()["status"] == "ok"
+        refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+    with serving(rig_file, tmp_path / "b") as http:  # they are there again: dark at the start
+        assert http.get("/devices").json()["safety"] == {
+            "state": "dark",
+            "detail": "every lamp and projector was read back dark",
+            "latched": None,
+        }
+
+
+def with_subject(rig_file: RigFile, **cameras: Any) -> RigFile:
+    """The rig before a living subject."""
+    assert rig_file.devices is not None
+    of = rig_file.devices.cameras.model_copy(update=cameras)
+    devices = rig_file.devices.model_copy(update={"cameras": of})
+    return replace(rig_file, safety=SafetyLimits(), devices=devices)
+
+
+def test_flashes_in_the_band_need_consent_and_somebody_who_arms_them(rig_file, world, tmp_path):
+    with serving(with_subject(rig_file), tmp_path / "root") as http:
+        flash = http.post("/plans:validate", json=IN_BAND).json()["flash"]
+        assert (flash["band"], flash["needs_consent"]) == ("3 to 30 Hz", True)
+        assert flash["hz"] == pytest.approx(1 / 0.072, rel=0.01)
+        problem = refused(http.post("/captures", json={"plan": IN_BAND}), "flash-rate")
+        assert "13.9 Hz" in problem["problems"][0]
+        assert "no consent is recorded" in problem["problems"][0]
+        assert "rate_hz to 2.5" in problem["problems"][1]
+        assert "82 s instead of 14 s" in problem["problems"][1]
+        agreed = {**IN_BAND, "consent": CONSENT}
+        problem = refused(http.post("/captures", json={"plan": agreed}), "flash-rate")
+        assert "the operator has not armed it" in problem["problems"][0]
+        refused(http.post("/captures", json={"plan": IN_BAND, "armed_by": "Ada"}), "flash-rate")
+        assert world.pulses == 0
+        begun = http.post("/captures", json={"plan": agreed, "armed_by": "Ada"})
+        assert begun.status_code == 202
+        http.post(f"/captures/{begun.json()['id']}/abort")
+        refused(http.post("/captures", json={"plan": agreed, "armed_by": ""}), "invalid-request")
+        armed = [a for a in http.get("/audit").json() if a["action"] == "flash.armed"]
+        assert [a["detail"] for a in armed] == [f"armed by Ada; consent: {CONSENT}"]
+
+
+def test_a_plan_that_flashes_otherwise_than_predicted_is_stopped(rig_file, world, tmp_path):
+    slow = with_subject(rig_file, readout_s=0.5)  # predicted: less than two steps a second
+    with serving(slow, tmp_path / "root") as http:
+        capture = http.post("/captures", json={"plan": IN_BAND}).json()["id"]
+        status = done(http, capture)
+        assert status["outcome"] == "failed"
+        assert "no consent is armed" in status["error"]
+        assert world.pulses < 8
+        assert not world.lit
+
+
+def interrupted(http: Client) -> str:
+    """A capture that was aborted after some frames."""
+    capture: str = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+    events = http.stage.events
+    while not any(e.kind == "capture.step" for e in events.since(0)):
+        assert events.wait(events.last, 10.0)
+    http.post(f"/captures/{capture}/abort")
+    return capture
+
+
+def test_a_capture_that_was_aborted_is_continued_where_it_stopped(http, world):
+    capture = interrupted(http)
+    stopped = done(http, capture)
+    assert 0 < stopped["frames_written"] < stopped["frames_planned"]
+    pulses = world.pulses
+    begun = http.post(f"/captures/{capture}/resume")
+    assert begun.status_code == 200, begun.text
+    assert [c["id"] for c in http.get("/captures").json()] == [capture]
+    status = done(http, capture)
+    assert (status["outcome"], status["error"]) == ("completed", None)
+    assert status["frames_written"] == status["frames_planned"]
+    assert world.pulses == status["steps"] - pulses, "only what was missing was shot"
+    assert verify(Path(status["path"])) == []
+    problem = refused(http.post(f"/captures/{capture}/resume"), "wrong-state")
+    assert "possible now: nothing" in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda r: {"rig": replace(r.rig, lights=r.rig.lights[::-1])}, "the rig has changed"),
+        (
+            lambda r: {"capture": r.capture.model_copy(update={"tracking_every": 3})},
+            "the plan's steps",
+        ),
+        (lambda r: {"safety": SafetyLimits(max_lamps=3)}, "max_lamps allows 3"),
+    ],
+    ids=["rig", "defaults", "limits"],
+)
+def test_a_capture_is_not_continued_on_another_stage(
+    rig_file: RigFile,
+    tmp_path: Path,
+    change: Callable[[RigFile], dict[str, Any]],
+    why: str,
+) -> None:
+    with serving(rig_file, tmp_path / "root") as http:
+        plan = {"lights": [f"light_{i:03}" for i in range(40)], "rows": {"last": 5}}
+        capture = http.post("/captures", json={"plan": plan}).json()["id"]
+        http.post("/devices/blackout")
+        assert done(http, capture)["outcome"] == "aborted"
+    with serving(replace(rig_file, **change(rig_file)), tmp_path / "root") as http:
+        problem = refused(http.post(f"/captures/{capture}/resume"), "invalid-plan")
+        assert why in problem["detail"]
+        assert http.get(f"/captures/{capture}").json()["outcome"] == "aborted"
+
+
+def test_the_stage_keeps_the_limits_of_the_rig_file(rig_file):
+    lights = Devices.of(replace(rig_file, safety=SafetyLimits(max_lamps=5))).lights
+    with pytest.raises(RuntimeError, match="max_lamps"):
+        lights.all_on()
+    lights.close()

@@ -1,0 +1,309 @@
+"""The command line: help, JSON, exit codes, and what it leaves running (nothing)."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.capture.folder import Step
+from reconstruction.capture.writer import CaptureWriter
+from reconstruction.files.exr import write_exr
+from reconstruction.files.strands import write_strands
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from stage_service.cli import build_parser, main
+from stage_service.cli.children import Children
+from stage_service.cli.output import CommandError
+
+RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, dict[str, Any]]:
+    """Run a command with --json: its exit code and the one object on stdout."""
+    code = main([*map(str, words), "--json"])
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1, out
+    return code, json.loads(out)
+
+
+def leaves(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    if not groups:
+        yield parser.prog, parser
+    for group in groups:
+        for child in group.choices.values():
+            yield from leaves(child)
+
+
+def test_every_command_says_what_it_does_and_speaks_json():
+    commands = dict(leaves(build_parser()))
+    names = {" ".join(name.split()[1:]) for name in commands}
+    assert {"demo", "serve", "worker", "simulate", "verify", "import"} <= names
+    assert {"reconstruct", "fit", "render", "bench"} <= names
+    assert {"evaluate geometry", "evaluate images", "rig check"} <= names
+    assert {"capture start", "capture abort", "jobs submit", "jobs cancel"} <= names
+    for name, parser in commands.items():
+        assert parser.get_default("json") is False, name
+        assert callable(parser.get_default("run")), name
+        assert len(parser.description or "") > 12, name
+        assert len(parser.format_help().splitlines()) > 5, name
+
+
+def test_help_is_fast_because_nothing_heavy_is_imported():
+    code = (
+        "import sys; from stage_service.cli import build_parser; build_parser().format_help();"
+        "print([m for m in ('numpy', 'cv2', 'mitsuba', 'dbos', 'fastapi') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_wrong_usage_is_exit_code_2(capsys):
+    with pytest.raises(SystemExit) as error:
+        main(["reconstruct"])
+    assert error.value.code == 2
+    with pytest.raises(SystemExit) as error:
+        main(["--help"])
+    assert error.value.code == 0
+    assert "exit codes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["demo.toml", "stage331.toml"])
+def test_rig_check_counts_and_conditions(capsys, name):
+    code, data = run(capsys, "rig", "check", RIGS / name)
+    assert code == 0
+    assert (data["lights"], data["projectors"]) == (331, 3)
+    assert data["cameras"] == {"demo.toml": 8, "stage331.toml": 50}[name]
+    assert data["cost"]["frames"] == data["cost"]["steps"] * data["cameras"]
+    pairs = data["triangulation"]["pairs"]
+    assert len(pairs) == 3 * data["cameras"]
+    assert 0.5 < data["triangulation"]["triangulated"] <= 1.0
+    assert data["warnings"] == [] or name == "stage331.toml"
+
+
+def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
+    code, data = run(capsys, "rig", "check", tmp_path / "none.toml")
+    assert code == 3
+    assert "none.toml" in data["error"]["detail"]
+    code, data = run(capsys, "reconstruct", tmp_path, "--out", tmp_path / "model")
+    assert code == 3
+    assert "is not a capture" in data["error"]["detail"]
+    (tmp_path / "mine.txt").write_text("precious")
+    code, data = run(capsys, "demo", "--out", tmp_path, "--rig", RIGS / "demo.toml")
+    assert code == 3
+    assert "no demo wrote" in data["error"]["detail"]
+    assert (tmp_path / "mine.txt").read_text() == "precious"
+
+
+def test_an_unreachable_service_is_exit_code_4(capsys):
+    code, data = run(capsys, "capture", "list", "--url", "http://127.0.0.1:9")
+    assert code == 4
+    assert "hairstage serve" in data["error"]["detail"]
+
+
+def test_verify_tells_sound_from_damaged(capsys, tmp_path):
+    rig = Rig.from_dict(
+        {
+            "cameras": [
+                {
+                    "name": "cam",
+                    "width": 4,
+                    "height": 3,
+                    "position": [0, -1, 0],
+                    "target": [0, 0, 0],
+                    "fov_deg": 20,
+                }
+            ],
+            "lights": [{"name": "a", "position": [0, -1, 1], "intensity": [1, 1, 1]}],
+        }
+    )
+    steps = [Step(0, "dark", 0.01, 0.0), Step(1, "olat", 0.01, light="a")]
+    writer = CaptureWriter.create(tmp_path / "capture", rig, {"steps": steps})
+    for step in steps:
+        writer.write_frame(step, "cam", np.zeros((3, 4, 3), np.float32))
+    writer.finish("completed")
+    assert run(capsys, "verify", tmp_path / "capture")[0] == 0
+    frame = tmp_path / "capture" / "frames" / "00001" / "cam.exr"
+    frame.write_bytes(frame.read_bytes()[:-1] + b"x")
+    code, data = run(capsys, "verify", tmp_path / "capture")
+    assert code == 1
+    assert len(data["problems"]) == 1
+    assert "00001/cam.exr" in data["problems"][0]
+
+
+def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
+    z = np.linspace(0, 0.1, 50)
+    strands = [np.stack([np.full(50, x), np.zeros(50), z], axis=1) for x in (0.0, 0.02)]
+    write_strands(tmp_path / "true.npz", Strands.from_list(strands))
+    write_strands(tmp_path / "half.npz", Strands.from_list(strands[:1]))
+    code, data = run(capsys, "evaluate", "geometry", tmp_path / "half.npz", tmp_path / "true.npz")
+    assert code == 0
+    assert "visible" not in data
+    assert set(data["all"]) == {"1mm_10deg", "2mm_20deg", "3mm_30deg"}
+    figures = data["all"]["1mm_10deg"]
+    assert figures["precision"] == 1.0
+    assert figures["recall"] == pytest.approx(0.5, abs=0.02)
+    assert main(["evaluate", "geometry", *[str(tmp_path / "true.npz")] * 2]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("100.0 / 100.0 / 100.0") >= 6
+    assert "root to tip" in printed
+
+
+def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(200, 3))
+    roots *= 0.09 / np.linalg.norm(roots, axis=1, keepdims=True)
+    hair = Strands.from_list([np.stack([r, 1.4 * r]) for r in roots])
+    write_strands(tmp_path / "true.npz", hair)
+    metres = hair.subset(np.arange(20))
+    write_strands(tmp_path / "mm.npz", Strands(1e3 * metres.points, metres.offsets))
+    write_strands(tmp_path / "none.npz", Strands.from_list([]))
+    np.savez(tmp_path / "nan.npz", points=hair.points * np.nan, offsets=hair.offsets)
+    (tmp_path / "empty.hair").touch()
+
+    command = "evaluate", "geometry"
+    true, out = tmp_path / "true.npz", tmp_path / "out"
+    code, data = run(capsys, *command, true, true, "--out", out)
+    assert (code, data["warnings"]) == (0, [])
+    assert json.loads((out / "report.json").read_text()) == data
+    assert {p.name for p in out.glob("*.png")} == {Path(p).name for p in data["pictures"]}
+    assert len(data["pictures"]) == 4
+    assert set(data["regions"]["scalp"]) == {"front", "top", "sides", "back", "nape"}
+
+    code, data = run(capsys, *command, tmp_path / "mm.npz", true)
+    assert code == 0
+    assert "both in metres?" in data["warnings"][0]
+    code, data = run(capsys, *command, tmp_path / "none.npz", true)
+    assert code == 0
+    assert data["warnings"] == ["there are no predicted strands: precision is given as 0"]
+    assert data["all"]["3mm_30deg"]["f"] == 0
+    for pred, other, said in [
+        (true, tmp_path / "none.npz", "none.npz: no strands"),
+        (tmp_path / "nan.npz", true, "nan.npz: points must be finite"),
+        (tmp_path / "empty.hair", true, "empty.hair: 0 bytes"),
+        (tmp_path / "absent.npz", true, "absent.npz: no such file"),
+        (tmp_path / "hair.obj", true, "unknown strand format '.obj'"),
+    ]:
+        code, data = run(capsys, *command, pred, other)
+        assert code == 3
+        assert said in data["error"]["detail"]
+        assert "\n" not in data["error"]["detail"]
+
+
+def test_evaluate_images_compares_files_and_folders(capsys, tmp_path):
+    image = np.random.default_rng(0).uniform(0, 200, (16, 16, 3))
+    for folder, offset in (("pred", 10.0), ("true", 0.0)):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "a.png"), (image + offset).astype(np.uint8))
+        write_exr(tmp_path / folder / "b.exr", image.astype(np.float32))
+    code, data = run(capsys, "evaluate", "images", tmp_path / "pred", tmp_path / "true")
+    assert code == 0
+    assert data["images"]["a.png"]["psnr"] == pytest.approx(20 * np.log10(25.5), abs=0.01)
+    assert data["images"]["b.exr"] == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
+    code, data = run(
+        capsys, "evaluate", "images", tmp_path / "pred" / "a.png", tmp_path / "true" / "b.exr"
+    )
+    assert code == 3
+    assert "two EXR files" in data["error"]["detail"]
+
+
+def test_a_service_from_the_command_line(capsys, rig_file, world, tmp_path):
+    command = [sys.executable, "-m", "stage_service.cli", "serve", "--json", "--port", "0"]
+    command += ["--rig", str(rig_file.path), "--root", str(tmp_path / "root")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
+        try:
+            assert service.stdout is not None
+            url = json.loads(service.stdout.readline())["url"]
+            assert url.startswith("http://127.0.0.1:")
+            plan = tmp_path / "plan.json"
+            plan.write_text('{"lights": ["light_003"], "projectors": []}')
+            code, cost = run(capsys, "capture", "check", "--plan", plan, "--url", url)
+            assert (code, cost["steps"]) == (0, 5)
+            code, data = run(capsys, "capture", "start", "--plan", plan, "--wait", "--url", url)
+            assert (code, data["capture"]["outcome"]) == (0, "completed")
+            capture = data["capture"]["id"]
+            assert run(capsys, "verify", data["capture"]["path"])[0] == 0
+            code, data = run(capsys, "capture", "list", "--url", url)
+            assert [c["id"] for c in data["captures"]] == [capture]
+            code, data = run(capsys, "capture", "resume", capture, "--url", url)
+            assert (code, data["error"]["problem"]["status"]) == (1, 409)
+            code, job = run(
+                capsys, "jobs", "submit", capture, "--options", '{"seed": 4}', "--url", url
+            )
+            assert (code, job["state"], job["options"]["seed"]) == (0, "queued", 4)
+            code, job = run(capsys, "jobs", "cancel", job["id"], "--url", url)
+            assert (code, job["outcome"]) == (0, "cancelled")
+            code, data = run(capsys, "jobs", "wait", job["id"], "--url", url)
+            assert (code, data["job"]["outcome"]) == (1, "cancelled")
+            plan.write_text('{"lights": ["lamp"]}')
+            code, data = run(capsys, "capture", "start", "--plan", plan, "--url", url)
+            assert (code, data["error"]["problem"]["type"]) == (3, "/docs/errors.md#invalid-plan")
+            # SIGTERM in mid-capture: dark, a manifest that says so, exit code 0.
+            world.busy["cam_0"] = 10**9
+            code, data = run(capsys, "capture", "start", "--url", url)
+            assert code == 0
+            service.send_signal(signal.SIGTERM)
+            assert service.wait(20) == 0
+            assert not world.lit
+            manifest = json.loads((Path(data["path"]) / "manifest.json").read_text())
+            assert manifest["outcome"] == "aborted"
+        finally:
+            service.kill()
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path):
+    sleeper = [sys.executable, "-c", "import time; print('{}', flush=True); time.sleep(60)"]
+    failing = [sys.executable, "-c", "raise SystemExit('no such camera')"]
+    pids = []
+
+    def command() -> None:
+        with Children(tmp_path) as children:
+            child = children.start("good", sleeper, answers=True)
+            pids.append(child.pid)
+            assert children.first_line("good", child, 10) == {}
+            assert children.peak_memory_gb()["good"] > 0.001
+            children.first_line("bad", children.start("bad", failing, answers=True), 10)
+
+    with pytest.raises(CommandError, match=r"bad: ended with exit code 1; .*no such camera"):
+        command()
+    assert not alive(pids[0])
+
+
+def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
+    words = ("capture", "check", "--rig", RIGS / "stage331.toml")
+    code, cost = run(capsys, *words)
+    assert (code, cost["frames"]) == (0, 50 * (331 + 3 * (768 + 76) + 4))
+    assert main([*map(str, words)]) == 0
+    told = capsys.readouterr().out
+    assert "limited by link" in told
+    assert "the trigger box clocks 2867 of 2867 steps" in told
+    assert "needs consent, or rate_hz" in told
+    plan = tmp_path / "plan.json"
+    plan.write_text('{"lights": ["lamp"]}')
+    code, data = run(capsys, *words, "--plan", plan)
+    assert (code, "'lamp'" in data["error"]["detail"]) == (3, True)
+    plan.write_text('{"speed": 1}')
+    code, data = run(capsys, *words, "--plan", plan)
+    assert (code, data["error"]["detail"]) == (
+        3,
+        f"{plan}: speed: Extra inputs are not permitted, got 1",
+    )

@@ -1,0 +1,236 @@
+"""Drivers against peers on real wires: what they ask, and how they tell trouble."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from stage_service.config import RigFile, SerialConfig
+from stage_service.devices.cameras.fan_out import FanOut
+from stage_service.devices.cameras.link import LinkCamera
+from stage_service.devices.device_set import Stage
+from stage_service.devices.errors import (
+    Cancelled,
+    DeviceError,
+    DeviceTimeout,
+    DeviceUnreachable,
+    SafetyRefusal,
+)
+from stage_service.devices.heartbeat import Heartbeat
+from stage_service.devices.lights.modbus import ModbusLightBank
+from stage_service.devices.projectors.serial_controller import SerialProjectorController
+from stage_service.devices.trigger.serial_box import SerialTriggerBox
+
+NEVER = threading.Event()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Poll for what another thread brings about."""
+    deadline = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen within 5 s"
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def stage(rig_file: RigFile) -> Iterator[Stage]:
+    one = Stage.of(rig_file)
+    one.connect()
+    yield one
+    one.close()
+
+
+def test_light_bank_lights_exactly_what_it_is_told(stage, world):
+    stage.lights.select(3)
+    assert world.lit == {3}
+    stage.lights.all_on()
+    assert len(world.lit) == 200
+    stage.lights.off()
+    assert world.lit == set()
+    stage.lights.set_level(0.5)
+    assert world.levels == [32768] * 200
+    stage.lights.set_watchdog(1.25)
+    assert world.watchdog_ms == 1250
+    with pytest.raises(ValueError, match="lamps are 0 to 199, got 200"):
+        stage.lights.select(200)
+
+
+def test_light_bank_status(stage, world):
+    world.lit, world.estop = {1, 2}, True
+    status = stage.lights.status()
+    assert (status.lit, status.estop_pressed, status.interlock_open) == (2, True, False)
+
+
+def test_light_bank_exception_replies_are_errors(stage):
+    with pytest.raises(DeviceError, match=r"watchdog to 0.05 s: .* Modbus exception 3"):
+        stage.lights.set_watchdog(0.05)
+
+
+def test_light_bank_of_another_size_is_refused(rig_file):
+    assert rig_file.devices is not None
+    bank = ModbusLightBank(rig_file.devices.lights, 331)
+    with pytest.raises(DeviceError, match="expected 331 lamps as in the rig file, received 200"):
+        bank.connect()
+    bank.close()
+
+
+def test_a_mute_light_bank_misses_its_deadline_and_comes_back(stage, world):
+    with world.lock:  # the peer cannot answer meanwhile
+        start = time.monotonic()
+        with pytest.raises(DeviceTimeout) as error:
+            stage.lights.select(3)
+        assert time.monotonic() - start < 1.0
+    assert error.value.deadline_s == 0.3
+    assert "putting lamp 3 on" in str(error.value)
+    until(lambda: world.lit == {3})  # the peer executes the command late, and answers nobody
+    stage.lights.select(4)
+    assert world.lit == {4}
+
+
+def test_heartbeats_come_while_it_runs_and_trouble_is_kept(stage, world, monkeypatch):
+    with Heartbeat(stage.lights, 0.01) as heartbeat:
+        until(lambda: world.heartbeats >= 5)
+        heartbeat.check()
+
+        def unreachable() -> None:
+            raise DeviceUnreachable("bank", "beating", expected="a", received="b", todo="c")
+
+        monkeypatch.setattr(stage.lights, "heartbeat", unreachable)
+        until(lambda: heartbeat._error is not None)
+        with pytest.raises(DeviceUnreachable, match="beating"):
+            heartbeat.check()
+        monkeypatch.undo()
+        until(lambda: heartbeat._error is None)
+    seen = world.heartbeats
+    assert threading.Event().wait(0.05) is False
+    assert world.heartbeats == seen
+
+
+def test_trigger_box(stage, world):
+    assert [stage.trigger.pulse(0.001), stage.trigger.pulse(0.02)] == [1, 2]
+    assert world.requests[-2:] == ["PULSE 1000", "PULSE 20000"]
+    assert stage.trigger.count() == 2
+    stage.trigger.reset()
+    assert stage.trigger.count() == 0
+    world.interlock = True
+    assert stage.trigger.status().interlock_open
+    with pytest.raises(SafetyRefusal, match="refusal: interlock or emergency stop"):
+        stage.trigger.pulse(0.001)
+    with pytest.raises(ValueError, match="exposure must be"):
+        stage.trigger.pulse(11.0)
+
+
+def test_a_late_serial_reply_never_answers_the_next_request(stage, world):
+    stage.trigger.pulse(0.001)
+    world.late = ["COUNT?"]
+    with pytest.raises(DeviceTimeout, match=r"reading the pulse count: .*within 0.3 s"):
+        stage.trigger.count()
+    status = stage.trigger.status()
+    assert not status.estop_pressed
+    assert world.requests[-4:] == ["COUNT?", "?", "ID?", "STATUS?"]
+
+
+@pytest.mark.parametrize("garbage", [b"\xff\x00", b"noise\n"])
+def test_garbage_on_the_serial_line_is_shown(stage, world, garbage):
+    world.garbage = garbage
+    with pytest.raises(DeviceError, match="reading the pulse count") as error:
+        stage.trigger.count()
+    assert repr(garbage.decode("ascii", "backslashreplace").strip())[1:-1] in str(error.value)
+    assert not stage.trigger.status().estop_pressed  # the count came after it, and is not taken
+
+
+def test_serial_ports_that_are_not_there_or_another_device(rig_file, world):
+    assert rig_file.devices is not None
+    config = SerialConfig(port="/dev/hairstage-nowhere", timeout_s=0.2)
+    with pytest.raises(DeviceUnreachable, match="opening the serial port"):
+        SerialTriggerBox(config).connect()
+    assert rig_file.devices.projectors is not None
+    box = SerialTriggerBox(rig_file.devices.projectors)
+    with pytest.raises(DeviceError, match=r"'HAIRSTAGE-PROJECTORS left,right'.*check the ports"):
+        box.connect()
+    box.close()
+    controller = SerialProjectorController(rig_file.devices.projectors, ("left", "middle"))
+    with pytest.raises(DeviceError, match="expected the projectors left, middle"):
+        controller.connect()
+    controller.close()
+
+
+def test_projectors(stage, world):
+    assert stage.projectors is not None
+    stage.projectors.line("right", 7, 0.5)
+    assert world.show == "LINE right 7 32768"
+    assert not stage.projectors.is_dark()
+    stage.projectors.all_on(1.0)
+    assert world.show == "ON 65535"
+    stage.projectors.off()
+    assert stage.projectors.is_dark()
+    with pytest.raises(DeviceError, match="ERR 2 unknown projector"):
+        stage.projectors.line("middle", 7, 0.5)
+
+
+def test_a_camera_gives_radiance(stage, world):
+    camera = stage.cameras[0]
+    assert camera.read(NEVER) is None
+    camera.arm(0.005)
+    stage.lights.select(99)
+    stage.trigger.pulse(0.005)
+    frame = camera.read(NEVER)
+    assert frame is not None
+    assert (frame.block_id, frame.exposure) == (1, 0.005)
+    # 100 counts per 10 ms at 10,000 counts per (W/(sr m²) · s).
+    np.testing.assert_allclose(frame.radiance(camera.info), 1.0, rtol=1e-6)
+    assert frame.full_scale(camera.info) == pytest.approx((4095 - 64) / 50.0)
+    camera.disarm()
+    stage.trigger.pulse(0.005)
+    assert camera.read(NEVER) is None
+
+
+def test_a_saturated_count_is_at_full_scale_exactly(stage, world):
+    camera = stage.cameras[0]
+    for exposure in (0.0003, 0.007, 0.1, 1.7):
+        camera.arm(exposure)
+        world.cameras[camera.name]["queue"].append((1, 4095))
+        frame = camera.read(NEVER)
+        assert frame is not None
+        assert (frame.radiance(camera.info) == np.float32(frame.full_scale(camera.info))).all()
+
+
+def test_cameras_of_another_rig_are_refused(rig_file, stage):
+    assert rig_file.devices is not None
+    geometry = rig_file.rig.cameras[0]
+    other = type(geometry).look_at("cam_0", 80, 60, [0, -1, 0], [0, 0, 0], 20)
+    camera = LinkCamera(rig_file.devices.cameras, other)
+    with pytest.raises(DeviceError, match="expected 80x60 pixels as in the rig file, received 8x6"):
+        camera.connect()
+    camera.close()
+    stranger = type(geometry).look_at("cam_9", 8, 6, [0, -1, 0], [0, 0, 0], 20)
+    camera = LinkCamera(rig_file.devices.cameras, stranger)
+    with pytest.raises(DeviceError, match="received no camera cam_9"):
+        camera.connect()
+    camera.close()
+
+
+def test_mute_and_busy_cameras(stage, world):
+    world.mute = {"cam_0"}
+    with pytest.raises(DeviceTimeout, match=r"cam_0.*within 0.3 s"):
+        stage.cameras[0].read(NEVER)
+    world.busy = {"cam_1": 10**9}
+    cancel = threading.Event()
+    threading.Timer(0.05, cancel.set).start()
+    with pytest.raises(Cancelled):
+        stage.cameras[1].read(cancel)
+
+
+def test_all_cameras_at_once_and_every_failure_is_named(stage, world):
+    cameras = FanOut(stage.cameras)
+    assert cameras(lambda c: c.name) == {n: n for n in ("cam_0", "cam_1", "cam_2")}
+    world.mute = {"cam_0", "cam_2"}
+    start = time.monotonic()
+    with pytest.raises(ExceptionGroup, match=r"cam_0.*cam_2|cam_2.*cam_0"):
+        cameras(lambda c: c.read(NEVER))
+    assert time.monotonic() - start < 0.55  # side by side: one deadline, not two
+    cameras.close()
