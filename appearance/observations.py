@@ -8,13 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -56,11 +54,11 @@ class Observed:
 
     camera: Camera
     lights: tuple[Light, ...]
-    pixels: NDArray[np.int64]
-    radiance: NDArray[np.float32]
-    valid: Mask
+    pixels: Ints
+    radiance: Floats
+    valid: Bools
 
-    def where(self, pixels: Mask) -> Observed:
+    def where(self, pixels: Bools) -> Observed:
         """The same lights at some of the pixels, marked by `pixels (P,)`."""
         return Observed(
             self.camera,
@@ -71,9 +69,7 @@ class Observed:
         )
 
 
-def observe(
-    capture: Capture, camera: str, lights: Sequence[str], pixels: NDArray[np.int64]
-) -> Observed:
+def observe(capture: Capture, camera: str, lights: Sequence[str], pixels: Ints) -> Observed:
     """Read the frames of `camera` under each of `lights` and keep `pixels (P,)` of them."""
     radiance = np.zeros((len(lights), len(pixels), 3), np.float32)
     valid = np.zeros((len(lights), len(pixels)), bool)
@@ -92,7 +88,7 @@ def observe(
     )
 
 
-def model_mask(model: Path, camera: str, kind: str, capture: Capture) -> Mask:
+def model_mask(model: Path, camera: str, kind: str, capture: Capture) -> Bools:
     """The mask `(H, W)` of `kind` "hair" or "skin" that reconstruction left in the model folder.
 
     A hair mask that is absent falls back to the user's in the capture, an absent skin mask to an
@@ -115,7 +111,7 @@ def model_mask(model: Path, camera: str, kind: str, capture: Capture) -> Mask:
     return user
 
 
-def chosen(mask: Mask, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def chosen(mask: Bools, most: int, rng: np.random.Generator) -> Ints:
     """Flat indices of `most` pixels of `mask` at random, or of all where there are fewer."""
     index = np.flatnonzero(mask)
     return index if len(index) <= most else np.sort(rng.choice(index, most, replace=False))

@@ -14,10 +14,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
@@ -33,7 +33,6 @@ from reconstruction.images.silhouettes import NoSilhouette, lit_image, lit_rgb, 
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Stage
 
-Mask = NDArray[np.bool_]
 Source = Literal["user", "network", "geometry", "light and lines", "lines", "silhouette"]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
@@ -47,9 +46,9 @@ class HairMask:
     the rest follows its neighbours.
     """
 
-    subject: Mask
-    hair: Mask
-    skin: Mask
+    subject: Bools
+    hair: Bools
+    skin: Bools
     source: Source
     decided: float
 
@@ -115,7 +114,7 @@ def usable_masks(
     return out
 
 
-def _by_looks(capture: Capture, subjects: dict[str, Mask]) -> dict[str, HairMask]:
+def _by_looks(capture: Capture, subjects: dict[str, Bools]) -> dict[str, HairMask]:
     """Masks from light and lines alone; where these show one class, all of it may be hair."""
     features = {}
     for name, subject in subjects.items():
@@ -146,10 +145,10 @@ def _by_looks(capture: Capture, subjects: dict[str, Mask]) -> dict[str, HairMask
 def _decide(
     capture: Capture,
     camera: Camera,
-    subject: Mask,
+    subject: Bools,
     points: PointCloud | None,
     head: Mesh,
-    off: NDArray[np.float64] | None,
+    off: Array | None,
     stands_off: float,
 ) -> HairMask:
     """A mask from where points lie on the head, and from the light where they lie on it."""
@@ -176,8 +175,8 @@ def _decide(
 
 
 def _votes(
-    points: PointCloud, camera: Camera, off: NDArray[np.float64], stands_off: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    points: PointCloud, camera: Camera, off: Array, stands_off: float
+) -> tuple[Array, Array]:
     """Weights of the points that stand off the head and that lie on it, per pixel `(H, W)`.
 
     The camera's own points, none where it took no part in the triangulation.
@@ -197,7 +196,7 @@ def _votes(
     return votes[0].reshape(shape), votes[1].reshape(shape)
 
 
-def distance_to(head: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_to(head: Mesh, points: Array) -> Array:
     """Distances `(N,)` of `points (N, 3)` in front of the surface of `head`, metres.
 
     To the nearest of samples 2 mm apart, along their normal where the point is closer than 1 cm:
@@ -209,7 +208,7 @@ def distance_to(head: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(distance < 0.01, height, distance)
 
 
-def _samples(head: Mesh, step: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _samples(head: Mesh, step: float) -> tuple[Array, Array]:
     """Points `(N, 3)` about `step` apart on every face of `head`, and their normals `(N, 3)`."""
     corners = head.vertices[head.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -226,7 +225,7 @@ def _samples(head: Mesh, step: float) -> tuple[NDArray[np.float64], NDArray[np.f
     return np.concatenate(points), normals[np.concatenate(faces)]
 
 
-def head_coverage(head: Mesh, camera: Camera) -> Mask:
+def head_coverage(head: Mesh, camera: Camera) -> Bools:
     """Pixels `(H, W)` whose ray meets `head`."""
     shift = 4  # OpenCV's fixed-point bits below the pixel
     image = np.zeros((camera.height, camera.width), np.uint8)
@@ -240,7 +239,7 @@ def head_coverage(head: Mesh, camera: Camera) -> Mask:
     return np.asarray(image > 0)
 
 
-def _threshold(contrast: NDArray[np.float64], subject: Mask, hair: Mask, skin: Mask) -> float:
+def _threshold(contrast: Array, subject: Bools, hair: Bools, skin: Bools) -> float:
     """The contrast above which a pixel is hair: between what sure hair and likely skin have.
 
     The split of the whole subject where one of them is missing. Where the two do not differ by a
@@ -256,7 +255,7 @@ def _threshold(contrast: NDArray[np.float64], subject: Mask, hair: Mask, skin: M
     return sure - third if sure > 2 * third else np.inf
 
 
-def _fill(subject: Mask, hair: Mask, skin: Mask) -> Mask:
+def _fill(subject: Bools, hair: Bools, skin: Bools) -> Bools:
     """Hair over all of the subject: undecided pixels follow decided ones, specks are voted out."""
     known = (hair | skin).astype(np.float64)
     score = np.zeros(subject.shape)

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.undistorted import as_shot, straightened
 from reconstruction.files.strands import write_strands
@@ -42,9 +42,6 @@ from reconstruction.masks import HairMask, hair_masks, usable_masks
 from reconstruction.methods import METHODS, Method
 from reconstruction.report.report import Progress, Report, Stage, silent
 from reconstruction.tangents.estimate import Measured, MeasureOptions, measure_tangents
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
@@ -274,7 +271,7 @@ def _surface(
     options: ReconstructOptions,
     report: Report,
     progress: Progress,
-) -> list[NDArray[np.floating]]:
+) -> list[AnyFloats]:
     """Polylines through the measured lines; none of them rooted."""
     if options.surface is None:
         return []
@@ -340,7 +337,7 @@ def grow(
     options: ReconstructOptions,
     stage: Stage,
     progress: Progress = silent,
-    seen: Sequence[NDArray[np.floating]] = (),
+    seen: Sequence[AnyFloats] = (),
 ) -> Strands:
     """Strands from the scalp, then through the gaps that those leave, all of them rooted.
 

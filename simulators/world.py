@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.rig import Rig
 from simulators.frames.frames import Snapshot
 from simulators.peers.faults import Fault, Faults
@@ -196,7 +197,7 @@ class World:
             else:
                 self._queue(camera, camera.exposure, counts)
 
-    def _move_subject(self, power: NDArray[np.float64], show: Show) -> None:
+    def _move_subject(self, power: Array, show: Show) -> None:
         lit = int(np.count_nonzero(power))
         anew = lit == 1 or (self._pulses == 1 and lit == 0 and show.level == 0)
         if anew:

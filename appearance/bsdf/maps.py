@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.render.paths import opaque
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.head.scalp_map import ScalpMap, sphere_center
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

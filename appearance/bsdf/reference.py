@@ -12,12 +12,12 @@ towards -x. The lobes p are R, TT, TRT and the residual: everything that leaves 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from appearance.sun_fit.longitudinal import longitudinal, variance_of_roughness
+from reconstruction.arrays import Array
 
-Array = NDArray[np.float64]
 LOBES = 4
 
 

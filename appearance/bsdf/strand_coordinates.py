@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array, Ints
 
 NAMES = (
     "control_points",
@@ -74,11 +75,11 @@ def strand_parameters(
 
 
 def transported_normals(
-    points: NDArray[np.float64],
-    segments: NDArray[np.int64],
-    segments_of_strand: NDArray[np.int64],
+    points: Array,
+    segments: Ints,
+    segments_of_strand: Ints,
     root_normals: ArrayLike | None = None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Unit normals `(K, 3)` at the middles of the segments, transported along each strand.
 
     Parallel transport: from one segment to the next, the least rotation that takes one tangent to
@@ -100,9 +101,7 @@ def transported_normals(
     return transported(tangents, segments_of_strand, root)
 
 
-def transported(
-    tangents: NDArray[np.float64], counts: NDArray[np.int64], root: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def transported(tangents: Array, counts: Ints, root: Array) -> Array:
     """Unit normals `(K, 3)` of unit `tangents (K, 3)`, `counts (S,)` of them to a strand.
 
     Each strand begins with the part of its `root (S, 3)` across the first tangent.
@@ -117,16 +116,14 @@ def transported(
     return normals
 
 
-def _turned(
-    v: NDArray[np.float64], before: NDArray[np.float64], after: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _turned(v: Array, before: Array, after: Array) -> Array:
     """`v`, perpendicular to `before`, turned by the least rotation from `before` to `after`."""
     cosine = (before * after).sum(-1, keepdims=True)
     along = (v * after).sum(-1, keepdims=True)
     return np.asarray(v - along / np.maximum(1 + cosine, 1e-9) * (before + after))
 
 
-def _upright(v: NDArray[np.float64], tangents: NDArray[np.float64]) -> NDArray[np.float64]:
+def _upright(v: Array, tangents: Array) -> Array:
     """`v` without its part along `tangents`, of unit length; any normal where none is left."""
     left = v - (v * tangents).sum(-1, keepdims=True) * tangents
     least = np.eye(3)[np.abs(tangents).argmin(-1)]
@@ -134,7 +131,7 @@ def _upright(v: NDArray[np.float64], tangents: NDArray[np.float64]) -> NDArray[n
     return _unit(np.where(np.linalg.norm(left, axis=-1, keepdims=True) > 1e-6, left, other))
 
 
-def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(v: Array) -> Array:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
 
 

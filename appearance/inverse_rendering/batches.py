@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.inverse_rendering.losses import weights
 from appearance.observations import Observed
+from reconstruction.arrays import Array, Bools, Ints
 
-Array = NDArray[np.float64]
 _UNIFORM = 0.5
 _FORGET = 0.3
 
@@ -24,7 +23,7 @@ class Batch:
     """
 
     view: int
-    lights: NDArray[np.int64]
+    lights: Ints
     share: Array
 
 
@@ -35,7 +34,7 @@ class Seen:
     rendered: Array
     captured: Array
     level: Array
-    valid: NDArray[np.bool_]
+    valid: Bools
 
 
 class Pairs:

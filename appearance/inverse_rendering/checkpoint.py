@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.inverse_rendering.descent import Adam, Convergence
 from appearance.inverse_rendering.unknowns import Raw
+from reconstruction.arrays import Array
 
 
 @dataclass
@@ -32,7 +32,7 @@ class State:
     tables: Raw = field(default_factory=dict)
 
     @property
-    def gain(self) -> NDArray[np.float64]:
+    def gain(self) -> Array:
         """The factors on the lamps' intensities."""
         return self.tables["gain"]
 

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.inverse_rendering.unknowns import Raw
-
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 STEP = {
     "sigma_a": 0.06,

@@ -16,15 +16,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.inverse_rendering import losses
 from appearance.inverse_rendering.batches import Batch, Seen
 from appearance.inverse_rendering.problem import Effort, Problem
 from appearance.inverse_rendering.unknowns import Raw
+from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, silent
 
-Array = NDArray[np.float64]
 Number = tuple[str, int]
 """A name in `Raw` and the index of a channel there; of "gain", that of a lamp."""
 

@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import Exposure, mean_scores, relative_error, scores
 from appearance.observations import HeldOut, Observed, model_mask, observe
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.capture.folder import Capture
 
-Array = NDArray[np.float64]
 MAGNIFIED = 4.0
 """Factor on the differences of displayed values in error maps."""
 
@@ -90,7 +89,7 @@ def judge(
     return {name: mean_scores(images) for name, images in found.items()}
 
 
-def _image(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> Array:
+def _image(values: Floats, mask: Bools) -> Array:
     out = np.zeros((*mask.shape, 3))
     out[mask] = values
     return out

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from appearance.bsdf.maps import HairMaps
@@ -20,8 +19,8 @@ from appearance.inverse_rendering.unknowns import BRACKET, Lamps, Raw, maps_of
 from appearance.observations import Observed
 from appearance.render.paths import Surface, jittered, stream
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array, Ints
 
-Array = NDArray[np.float64]
 Shape = tuple[int, int, int]
 _RAYS = 8
 _WIDE = 0.02
@@ -57,7 +56,7 @@ def cell_colours(
     return replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
 
 
-def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> NDArray[np.int64]:
+def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> Ints:
     """Cells that rays through the pixels meet first `(P, 8)`, as flat indices; -1 where none."""
     import drjit as dr
     import mitsuba as mi
@@ -90,7 +89,7 @@ def _mean(o: Observed, values: Array) -> Array:
     return np.asarray(np.where(o.valid[..., None], values, 0).sum(axis=0) / count[:, None])
 
 
-def _add(total: Array, cells: NDArray[np.int64], values: Array) -> None:
+def _add(total: Array, cells: Ints, values: Array) -> None:
     hit = cells >= 0
     np.add.at(
         total.reshape(-1, 3), cells[hit], np.repeat(values[:, None], _RAYS, axis=1)[hit] / _RAYS

@@ -20,9 +20,9 @@ from appearance.inverse_rendering.global_parameters import WIDE, solved
 from appearance.inverse_rendering.initial_absorption import cell_colours
 from appearance.inverse_rendering.problem import Effort, Problem, Watched
 from appearance.inverse_rendering.unknowns import Lamps, Raw, maps_of
+from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, silent
 
-Array = NDArray[np.float64]
 Shape = tuple[int, int, int]
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")

@@ -16,10 +16,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array, Bools
+
 FLOOR = 0.03
 LEAST_NOISE = 0.1
 """Of the median pixel's: what a pixel's noise is held to be at least, known from few paths."""
@@ -63,9 +63,7 @@ def quieted(weight: Array, squares: Array) -> Array:
     return np.asarray(out * (weight.sum() / out.sum()))
 
 
-def slope(
-    difference: Array, level: Array, valid: NDArray[np.bool_], kind: str, error: float
-) -> Array:
+def slope(difference: Array, level: Array, valid: Bools, kind: str, error: float) -> Array:
     """Derivative of the image loss by the rendered values `(L, P, 3)`, in exposure units.
 
     `difference` is rendered less captured; `valid (L, P)`; `kind` "squares" or "l1"; `error` an
@@ -77,7 +75,7 @@ def slope(
     return np.where(valid[..., None], out, 0.0) / used
 
 
-def squares(one: Array, other: Array, weight: Array, valid: NDArray[np.bool_]) -> float:
+def squares(one: Array, other: Array, weight: Array, valid: Bools) -> float:
     """Weighted mean square of the differences `one` and `other`, of two independent renderings.
 
     Without their noise: may be slightly negative where the renderings agree with the captured.

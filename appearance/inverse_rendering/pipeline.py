@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.held_out import held_out_frames, judge
@@ -20,12 +19,12 @@ from appearance.model.fitted_appearance import FittedAppearance
 from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
 from appearance.render.bounces import bounce_limit
 from appearance.scene.hair_scene import build_scene
+from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, Report, Series, Stage, silent
 
-Array = NDArray[np.float64]
 MAPS, LAMPS, PICTURE = "hair_maps.npz", "lamps.json", "stage1.png"
 
 

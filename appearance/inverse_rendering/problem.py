@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering import losses
@@ -19,10 +18,10 @@ from appearance.render.differentiable import DifferentiableOlat
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.lights import Light
 
-Array = NDArray[np.float64]
-Watched = Sequence[tuple[Batch, NDArray[np.int64], Array]]
+Watched = Sequence[tuple[Batch, Ints, Array]]
 """Pairs, the numbers of some of their pixels, and the share of its weight that each keeps."""
 
 
@@ -153,7 +152,7 @@ class Problem:
         raw: Raw,
         gain: Array,
         batch: Batch,
-        few: NDArray[np.int64],
+        few: Ints,
         effort: Effort,
         seed: int,
     ) -> tuple[Seen, Seen]:
@@ -161,7 +160,7 @@ class Problem:
         one, other = (self.render(raw, gain, batch, few, effort, seed + k) for k in (0, 1 << 20))
         return self.seen(batch, few, one), self.seen(batch, few, other)
 
-    def seen(self, batch: Batch, few: NDArray[np.int64], rendered: Array) -> Seen:
+    def seen(self, batch: Batch, few: Ints, rendered: Array) -> Seen:
         """`rendered (k, P, 3)` beside what was captured of a view's pixels number `few`."""
         o = self.views[batch.view]
         captured = o.radiance[batch.lights][:, few].astype(float) * self.scale
@@ -175,7 +174,7 @@ class Problem:
         raw: Raw,
         gain: Array,
         batch: Batch,
-        few: NDArray[np.int64],
+        few: Ints,
         effort: Effort,
         seed: int,
     ) -> Array:
@@ -218,7 +217,7 @@ class Problem:
         return self._painted
 
     def _op(
-        self, raw: Raw, gain: Array, batch: Batch, few: NDArray[np.int64], effort: Effort
+        self, raw: Raw, gain: Array, batch: Batch, few: Ints, effort: Effort
     ) -> DifferentiableOlat:
         scene = self._scene(raw)
         moved = self.lamps_at(raw, gain)
@@ -238,7 +237,7 @@ class Problem:
         op: DifferentiableOlat,
         leaves: dict[str, Any],
         free: Sequence[str],
-        lights: NDArray[np.int64],
+        lights: Ints,
     ) -> dict[str, Any]:
         """The lamps of a batch as functions of the leaves; the op's lamps are already moved."""
         import drjit as dr

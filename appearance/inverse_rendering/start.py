@@ -8,15 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.fit import BETA_N, FitOptions, SunFit
+from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, Stage, silent
 
-Array = NDArray[np.float64]
 GUESS = 0.3
 """Longitudinal roughness where the pictures show no highlight to read it from."""
 

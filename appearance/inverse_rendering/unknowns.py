@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.lights import Light
 
-Array = NDArray[np.float64]
 Raw = dict[str, Array]
 
 BRACKET = 6.0
@@ -72,7 +71,7 @@ class Lamps:
         return out
 
 
-def raw_of(maps: HairMaps, lamps: Lamps, profile_of: NDArray[np.int64]) -> Raw:
+def raw_of(maps: HairMaps, lamps: Lamps, profile_of: Ints) -> Raw:
     """The unconstrained numbers of `maps` and `lamps`; `profile_of (L,)` numbers the profiles."""
     raw = {
         "sigma_a": _logit_of_colour(-BRACKET * np.sqrt(np.maximum(maps.sigma_a, 1e-12))),

@@ -18,7 +18,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from reconstruction.arrays import AnyFloats, Bools, Floats
 
 VARIABLE = "HAIRSTAGE_LPIPS"
 UNAVAILABLE = f"LPIPS needs network weights: {VARIABLE} names no ONNX file"
@@ -26,9 +27,7 @@ _LEAST = 64
 """Pixels on a side: smaller pictures are enlarged, as AlexNet would have nothing left of them."""
 
 
-def lpips(
-    image: NDArray[np.floating], truth: NDArray[np.floating], mask: NDArray[np.bool_]
-) -> float | None:
+def lpips(image: AnyFloats, truth: AnyFloats, mask: Bools) -> float | None:
     """Distance of two pictures `(H, W, 3)` with values in [0, 1], both black outside `mask (H, W)`.
 
     None where no weights are given; `ValueError` where the file is not such a network.
@@ -52,7 +51,7 @@ def _network(file: str) -> Any:
     return cv2.dnn.readNetFromONNX(file)
 
 
-def _blob(picture: NDArray[np.floating]) -> NDArray[np.float32]:
+def _blob(picture: AnyFloats) -> Floats:
     least = min(picture.shape[:2])
     if least < _LEAST:
         size = [-(-n * _LEAST // least) for n in picture.shape[1::-1]]

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Row = tuple[str, Mapping[str, NDArray[np.floating]], Mapping[str, str]]
+from reconstruction.arrays import AnyFloats
+
+Row = tuple[str, Mapping[str, AnyFloats], Mapping[str, str]]
 
 
 def comparison_picture(
@@ -46,7 +47,7 @@ def comparison_picture(
     figure.savefig(path, dpi=110)
 
 
-def write_png(path: Path, picture: NDArray[np.floating]) -> None:
+def write_png(path: Path, picture: AnyFloats) -> None:
     """Write picture values `(H, W, 3)` in [0, 1] as an 8-bit PNG."""
     values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
     if not cv2.imwrite(str(path), values[..., ::-1]):

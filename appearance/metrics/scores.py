@@ -12,19 +12,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 
 from appearance.metrics import lpips
-
-Image = NDArray[np.floating]
-Mask = NDArray[np.bool_]
+from reconstruction.arrays import AnyFloats, Array, Bools
 
 _WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 _WINDOW /= _WINDOW.sum()
 
 
-def srgb(linear: ArrayLike) -> NDArray[np.float64]:
+def srgb(linear: ArrayLike) -> Array:
     """The sRGB curve (IEC 61966-2-1) on values clipped to [0, 1]."""
     x = np.clip(np.asarray(linear, float), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
@@ -48,12 +46,12 @@ class Exposure:
             raise ValueError("no training hair pixel is lit: the exposure cannot be set")
         return cls(1.0 / float(np.percentile(values, 99)))
 
-    def __call__(self, radiance: ArrayLike) -> NDArray[np.float64]:
+    def __call__(self, radiance: ArrayLike) -> Array:
         """Picture values in [0, 1] of `radiance`, any shape."""
         return srgb(np.asarray(radiance, float) * self.scale)
 
 
-def scores(image: Image, truth: Image, mask: Mask | None = None) -> dict[str, float]:
+def scores(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> dict[str, float]:
     """ "psnr" and "ssim" of pictures `(H, W, 3)`, and "lpips" where its weights are given."""
     image, truth, mask = _checked(image, truth, mask)
     out = {"psnr": psnr(image, truth, mask), "ssim": ssim(image, truth, mask)}
@@ -71,7 +69,7 @@ def scores_unavailable() -> dict[str, str]:
     return {} if os.environ.get(lpips.VARIABLE) else {"lpips": lpips.UNAVAILABLE}
 
 
-def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
+def psnr(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> float:
     """Peak signal-to-noise ratio in dB for range 1, over the pixels of `mask (H, W)`.
 
     Both images are `(H, W, 3)` picture values. Equal images give 100 dB, a number JSON can hold.
@@ -81,13 +79,13 @@ def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
     return float(-10.0 * np.log10(max(error, 1e-10)))
 
 
-def ssim(image: Image, truth: Image, mask: Mask | None = None) -> float:
+def ssim(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> float:
     """Structural similarity: the mean of `ssim_map` over the pixels of `mask (H, W)`."""
     image, truth, mask = _checked(image, truth, mask)
     return float(ssim_map(image, truth, mask)[mask].mean())
 
 
-def ssim_map(image: Image, truth: Image, mask: Mask | None = None) -> NDArray[np.float64]:
+def ssim_map(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> Array:
     """Structural similarity `(H, W, C)` (Wang 2004): 11×11 Gaussian of σ 1.5, range 1.
 
     A window's statistics are taken over its pixels in the mask, with the weights rescaled to sum
@@ -108,7 +106,7 @@ def ssim_map(image: Image, truth: Image, mask: Mask | None = None) -> NDArray[np
     return out
 
 
-def relative_error(radiance: Image, truth: Image, mask: Mask | None = None) -> float:
+def relative_error(radiance: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> float:
     """Root of the summed squared radiance error over the summed squared truth, on `mask`."""
     radiance, truth, mask = _checked(radiance, truth, mask)
     scale = float(np.sum(truth[mask] ** 2))
@@ -117,14 +115,14 @@ def relative_error(radiance: Image, truth: Image, mask: Mask | None = None) -> f
     return float(np.sqrt(np.sum((radiance[mask] - truth[mask]) ** 2) / scale))
 
 
-def _blur(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _blur(x: Array) -> Array:
     rows = correlate1d(x, _WINDOW, axis=0, mode="constant")
     return np.asarray(correlate1d(rows, _WINDOW, axis=1, mode="constant"))
 
 
 def _checked(
-    rendered: Image, captured: Image, mask: Mask | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], Mask]:
+    rendered: AnyFloats, captured: AnyFloats, mask: Bools | None
+) -> tuple[Array, Array, Bools]:
     image, truth = np.asarray(rendered, np.float64), np.asarray(captured, np.float64)
     if image.shape != truth.shape or image.ndim != 3:
         raise ValueError(f"images must be alike (H, W, C), got {image.shape} and {truth.shape}")

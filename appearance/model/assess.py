@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.metrics.pictures import comparison_picture
 from appearance.metrics.scores import (
@@ -26,13 +25,13 @@ from appearance.render.smoothed import olat_smoothed
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
+from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.lights import Light
 from reconstruction.head.fitted import model_head
 from reconstruction.report.report import Progress, Report, Stage, silent
 
-Array = NDArray[np.floating]
 METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
 COLUMNS = ("captured", "ours", "diffuse", "three_nearest")
 
@@ -57,8 +56,8 @@ class _Compared:
 
     camera: str
     light: str
-    frames: dict[str, Array]
-    mask: NDArray[np.bool_]
+    frames: dict[str, AnyFloats]
+    mask: Bools
 
 
 def assess(
@@ -170,8 +169,8 @@ def _compared(
     names: Sequence[str],
     held_out: HeldOut,
     scenes: tuple[HairScene, HairScene],
-    colour: Array,
-    mask: NDArray[np.bool_],
+    colour: AnyFloats,
+    mask: Bools,
     options: AssessOptions,
     seed: int,
 ) -> list[_Compared]:
@@ -200,7 +199,7 @@ def _compared(
     return out
 
 
-def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut) -> Array:
+def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut) -> AnyFloats:
     """`camera`'s captured frames under the three training lights nearest to `light`, mixed.
 
     Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
@@ -250,16 +249,16 @@ def judge(result: dict[str, Any], stage: Stage) -> None:
 
 def _rows(
     groups: dict[str, list[_Compared]], fitted: FittedAppearance
-) -> list[tuple[str, dict[str, Array], dict[str, str]]]:
+) -> list[tuple[str, dict[str, AnyFloats], dict[str, str]]]:
     """Two rows a group for the picture: a label, pictures by column, and their scores."""
-    rows: list[tuple[str, dict[str, Array], dict[str, str]]] = []
+    rows: list[tuple[str, dict[str, AnyFloats], dict[str, str]]] = []
     for group, images in groups.items():
         # the frames that show most: brightly lit hair, and from different cameras where there are
         ranked = sorted(images, key=lambda c: -float(c.frames["captured"][c.mask].mean()))
         picked = ranked[:1]
         picked += [c for c in ranked if c.camera != picked[0].camera][:1] or ranked[1:2]
         for c in picked:
-            shown: dict[str, Array] = {k: fitted.exposure(v) for k, v in c.frames.items()}
+            shown: dict[str, AnyFloats] = {k: fitted.exposure(v) for k, v in c.frames.items()}
             captions = {
                 k: f"{psnr(v, shown['captured'], c.mask):.1f} dB  "
                 f"{ssim(v, shown['captured'], c.mask):.2f}"

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from appearance.bsdf.maps import HairMaps
-
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 
 def wisp_of(strands: ArrayLike, root_uv: Array, cells: tuple[int, int], soft: float = 0.0) -> Array:

@@ -12,20 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from appearance.bsdf.maps import HairMaps
 from appearance.model.fitted_model import FittedModel
 from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_scene import SCALE
+from reconstruction.arrays import Array, Floats
 from reconstruction.files.exr import write_exr
 from reconstruction.files.strands.usd import open_curves, write_usd
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh, write_obj
 from reconstruction.geometry.strands import Strands
-
-Array = NDArray[np.float64]
 
 
 def export_maps(maps: HairMaps, folder: Path) -> list[Path]:
@@ -143,7 +141,7 @@ def export_mitsuba(
     return path
 
 
-def _floats(values: Array) -> NDArray[np.float32]:
+def _floats(values: Array) -> Floats:
     return np.ascontiguousarray(values, np.float32)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.metrics.pictures import write_png
 from appearance.metrics.scores import Exposure
@@ -14,6 +13,7 @@ from appearance.render.coverage import coverage
 from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.smoothed import environment_smoothed
 from appearance.scene.hair_scene import build_scene
+from reconstruction.arrays import Floats
 from reconstruction.files.exr import write_exr
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.cameras import Camera
@@ -31,7 +31,7 @@ def relight_model(
     size: int = 320,
     spp: int = 36,
     seed: int = 0,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Render a model in three-quarter view under `environment`: radiance `(size, size, 3)`.
 
     `environment` is "studio" (the default), "sky" or the path of an `.hdr` or `.exr` map. Writes

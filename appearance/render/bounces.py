@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import Surface, opaque_index
 from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene.hair_scene import HairScene
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.cameras import Camera
 
 _LONGEST = 256
@@ -37,7 +37,7 @@ def bounce_limit(
     camera: Camera,
     share: float = 2e-3,
     *,
-    pixels: NDArray[np.int64] | None = None,
+    pixels: Ints | None = None,
     paths: int = 4096,
     seed: int = 0,
 ) -> BounceLimit:
@@ -70,9 +70,7 @@ def bounce_limit(
     return BounceLimit(depth + 1, float(left_out[depth].max()), float(bound[depth]))
 
 
-def _by_depth(
-    scene: HairScene, camera: Camera, index: NDArray[np.int64], spp: int, seed: int
-) -> NDArray[np.float64]:
+def _by_depth(scene: HairScene, camera: Camera, index: Ints, spp: int, seed: int) -> Array:
     """Light of a white sky by the number of the path's vertices from 1, `(256 + 1, P, 3)`."""
     import drjit as dr
     import mitsuba as mi

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.paths import Surface, wave
 from appearance.scene.hair_scene import HairScene
+from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 
 
-def coverage(
-    scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0
-) -> dict[str, NDArray[np.float32]]:
+def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, Floats]:
     """Share of each pixel that shows `"hair"` and `"head"`: two images `(H, W)` in [0, 1]."""
     import drjit as dr
     import mitsuba as mi
@@ -34,7 +32,7 @@ def coverage(
     return out
 
 
-def covered_pixels(scene: HairScene, camera: Camera, spp: int = 9) -> NDArray[np.int64]:
+def covered_pixels(scene: HairScene, camera: Camera, spp: int = 9) -> Ints:
     """Flat indices `(P,)` of the pixels that see the subject in at least one of `spp` samples.
 
     A pixel that the subject covers by less than 1/`spp` may be left out, and reads as background.

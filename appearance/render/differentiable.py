@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.render.lamps import LampBank
 from appearance.render.paths import (
@@ -34,6 +34,7 @@ from appearance.render.paths import (
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
@@ -199,7 +200,7 @@ class DifferentiableOlat:
         each_sample(self.camera, _array(self.index), len(self.index), self.spp, (seed,), trace)
 
 
-def _array(index: NDArray[np.int64]) -> Any:
+def _array(index: Ints) -> Any:
     import mitsuba as mi
 
     return mi.UInt32(for_kernels(index, np.uint32))

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.paths import opaque, opaque_index
 from appearance.render.tracing import Paths
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array, Floats
 from reconstruction.geometry.lights import Light
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class Splat:
                     self.film, weight[channel] * y, put, active, mode=dr.ReduceMode.NoConflicts
                 )
 
-    def light(self, spp: int) -> NDArray[np.float32]:
+    def light(self, spp: int) -> Floats:
         """Multiply scattered radiance `(L, P, 3)` of each light, from `spp` >= 2 samples."""
         dome = self.dome
         even, odd = (spp + 1) // 2, spp // 2

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
@@ -19,20 +18,21 @@ from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
 from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.geometry.cameras import Camera
 
 
 def render_environment(
     scene: HairScene,
     camera: Camera,
-    envmap: NDArray[np.floating],
+    envmap: AnyFloats,
     *,
     spp: int = 64,
     max_depth: int = 24,
     seed: int = 0,
     rotation_deg: float = 0.0,
     background: bool = False,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Radiance `(H, W, 3)`, W/(sr m²), of the subject lit by `envmap (h, w, 3)` alone.
 
     `rotation_deg` turns the map counter-clockwise seen from above. Pixels off the subject are 0,
@@ -84,7 +84,7 @@ class Sky:
     turn: Any
 
     @classmethod
-    def of(cls, envmap: NDArray[np.float32], rotation_deg: float) -> Sky:
+    def of(cls, envmap: Floats, rotation_deg: float) -> Sky:
         import mitsuba as mi
 
         height, width = envmap.shape[:2]

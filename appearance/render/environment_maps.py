@@ -6,14 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.files.exr import read_exr
 
-Image = NDArray[np.float32]
 
-
-def load_environment(path: str | Path) -> Image:
+def load_environment(path: str | Path) -> Floats:
     """Read a lat-long map `(h, w, 3)`, scene-linear RGB, from Radiance `.hdr` or OpenEXR `.exr`.
 
     Raises `ValueError` that names the file when it is absent, of another kind, negative or not
@@ -32,7 +30,7 @@ def load_environment(path: str | Path) -> Image:
     return check_environment(np.ascontiguousarray(image[:, :, 2::-1]), str(path))
 
 
-def check_environment(envmap: NDArray[np.floating], name: str) -> Image:
+def check_environment(envmap: AnyFloats, name: str) -> Floats:
     """`envmap` as float32; `ValueError` unless `(h, w, 3)`, finite and not negative."""
     image = np.asarray(envmap, np.float32)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
@@ -47,7 +45,7 @@ def check_environment(envmap: NDArray[np.floating], name: str) -> Image:
     return image
 
 
-def studio(height: int = 128) -> Image:
+def studio(height: int = 128) -> Floats:
     """A dim grey room with three soft boxes `(height, 2 height, 3)`: key, cool fill, warm rim.
 
     The key is in front of a subject that faces −y, high on its right; mean radiance about 1.
@@ -68,7 +66,7 @@ def studio(height: int = 128) -> Image:
 
 def sky(
     height: int = 128, sun_azimuth_deg: float = -120.0, sun_elevation_deg: float = 40.0
-) -> Image:
+) -> Floats:
     """A clear sky with a sun 4° wide over grey ground `(height, 2 height, 3)`.
 
     A gradient from a pale horizon to a blue zenith with a glow about the sun; not a physical sky
@@ -87,7 +85,7 @@ def sky(
     return image.astype(np.float32)
 
 
-def _directions(height: int) -> NDArray[np.float64]:
+def _directions(height: int) -> Array:
     """Unit directions `(height, 2 height, 3)` of the texels' centres; see `render.environment`."""
     if height < 2:
         raise ValueError(f"an environment map needs at least 2 rows, got {height}")
@@ -97,18 +95,18 @@ def _directions(height: int) -> NDArray[np.float64]:
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), z], axis=-1)
 
 
-def _unit(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+def _unit(azimuth_deg: float, elevation_deg: float) -> Array:
     a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 def _soft_box(
-    direction: NDArray[np.float64],
+    direction: Array,
     azimuth_deg: float,
     elevation_deg: float,
     half_width_deg: float,
     half_height_deg: float,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Share `(h, w)` of a rectangle on the sphere, its edge soft over 2°."""
     elevation = np.degrees(np.arcsin(np.clip(direction[..., 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(direction[..., 1], direction[..., 0]))

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.bsdf.corrective import rodrigues
 from appearance.render.paths import opaque, opaque_index, opaque_matrix
 from appearance.scene.hair_scene import SCALE, light_arrays
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import POLAR_FRAMES, LampProfile
 from reconstruction.geometry.lights import Light
 
@@ -145,7 +146,7 @@ class ProfileTable:
     longitudes: Any
     colatitudes: Any
     values: Any
-    frame: NDArray[np.float64]
+    frame: Array
     shape: tuple[int, int]
     start: Any
     spare: Any

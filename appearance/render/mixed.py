@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment import Sky
@@ -18,6 +18,7 @@ from appearance.render.paths import Surface, opaque, pixel_indices
 from appearance.render.tracing import Paths, Reach, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
@@ -30,7 +31,7 @@ _PILOT_STREAM = 1 << 30
 class Environment:
     """A lat-long map `(h, w, 3)` as in `render_environment`, times `weight` (one or 3 numbers)."""
 
-    envmap: NDArray[np.floating]
+    envmap: AnyFloats
     rotation_deg: float = 0.0
     weight: ArrayLike = 1.0
 
@@ -46,7 +47,7 @@ def render_mixed(
     max_depth: int = 24,
     seed: int = 0,
     pixels: ArrayLike | None = None,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Radiance, W/(sr m²), of the subject under everything at once: `(H, W, 3)`, or `(P, 3)`.
 
     `weights` broadcasts to `(L, 3)`: a factor for each light and channel, of any sign (a light may
@@ -87,11 +88,11 @@ def _choice(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
-    weight: NDArray[np.float64],
-    index: NDArray[np.int64],
+    weight: Array,
+    index: Ints,
     max_depth: int,
     seed: int,
-) -> NDArray[np.float64]:
+) -> Array:
     """Probabilities `(L,)` of asking each lamp; none is 0, so nothing is left out for good."""
     if len(lights) < 2:
         return np.ones(len(lights))
@@ -116,11 +117,11 @@ def _render(
     scene: HairScene,
     camera: Camera,
     bank: LampBank | None,
-    choice: NDArray[np.float64],
-    skies: Sequence[tuple[Sky, NDArray[np.float64]]],
-    index: NDArray[np.int64],
+    choice: Array,
+    skies: Sequence[tuple[Sky, Array]],
+    index: Ints,
     how: tuple[int, int, int],
-) -> NDArray[np.float32]:
+) -> Floats:
     import drjit as dr
     import mitsuba as mi
 
@@ -143,7 +144,7 @@ class _Gather:
     film: Any
     bank: LampBank | None
     choice: Any
-    skies: Sequence[tuple[Sky, NDArray[np.float64]]]
+    skies: Sequence[tuple[Sky, Array]]
 
     def __call__(self, si: Any, paths: Paths) -> None:
         import drjit as dr

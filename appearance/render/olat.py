@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
@@ -16,6 +16,7 @@ from appearance.render.lamps import LampBank
 from appearance.render.paths import Surface, light_from, opaque_index, pixel_indices
 from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
 from appearance.scene.hair_scene import HairScene
+from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
@@ -82,7 +83,7 @@ def render_olat(
     seed: int = 0,
     pixels: ArrayLike | None = None,
     **options: Any,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Radiance under each of `lights` alone, W/(sr m²) at full level.
 
     Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`: then
@@ -105,7 +106,7 @@ def render_olat(
 
 def olat_tiles(
     scene: HairScene, camera: Camera, lights: Sequence[Light], *, seed: int = 0, **options: Any
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+) -> Iterator[tuple[Ints, Floats]]:
     """`render_olat` of the pixels that see the subject, a tile at a time.
 
     Yields flat pixel indices `(P,)` and their radiance `(L, P, 3)`. A tile is spread over the
@@ -122,10 +123,10 @@ def _tiles(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
-    index: NDArray[np.int64],
+    index: Ints,
     options: OlatOptions,
     seed: int,
-) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+) -> Iterator[tuple[slice, Floats]]:
     """Slices of `index` and the radiance `(L, P, 3)` of their pixels."""
     if not len(lights) or not len(index):
         return
@@ -149,7 +150,7 @@ class _Plan:
     lights: Sequence[Light]
     counts: tuple[int, int]
     reach: Reach
-    dim: NDArray[np.float32]
+    dim: Floats
     dome: Dome | None
 
 
@@ -157,7 +158,7 @@ def _plan(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
-    index: NDArray[np.int64],
+    index: Ints,
     options: OlatOptions,
     seed: int,
 ) -> _Plan:
@@ -179,11 +180,11 @@ def _plan(
 def _spread(
     scene: HairScene,
     camera: Camera,
-    index: NDArray[np.int64],
+    index: Ints,
     spp: int,
     plan: _Plan,
     seed: int,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Standard deviation `(L,)` of what a path through a pixel brings from each light.
 
     From a few paths, and without the brightest of them: a rare bright path, a hundred times what
@@ -192,7 +193,7 @@ def _spread(
     wanted = int(np.clip(len(index) * spp // _PILOT_SHARE, 64, _PILOT))
     few = index[:: -(-len(index) // wanted)]
 
-    def pilot(pixels: NDArray[np.int64], plan: _Plan, number: int) -> NDArray[np.float32]:
+    def pilot(pixels: Ints, plan: _Plan, number: int) -> Floats:
         radiance = _render_tile(scene, camera, pixels, 1, plan, (seed, _PILOT_STREAM + number))
         brightest = radiance.max(-1)
         return np.minimum(brightest, np.quantile(brightest, _USUAL, axis=1, keepdims=True))
@@ -206,11 +207,11 @@ def _spread(
 def _render_tile(
     scene: HairScene,
     camera: Camera,
-    index: NDArray[np.int64],
+    index: Ints,
     spp: int,
     plan: _Plan,
     seed: tuple[int, int],
-) -> NDArray[np.float32]:
+) -> Floats:
     """Mean over `spp` paths a pixel: `(L, P, 3)`."""
     import drjit as dr
     import mitsuba as mi
@@ -240,7 +241,7 @@ class _Bank:
     dim: Any
 
     @classmethod
-    def of(cls, lights: Sequence[Light], dim: NDArray[np.float32]) -> _Bank:
+    def of(cls, lights: Sequence[Light], dim: Floats) -> _Bank:
         import mitsuba as mi
 
         return cls(LampBank.of(lights), mi.Float(dim))

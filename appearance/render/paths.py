@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.cameras import Camera, undistorted
 
 
@@ -52,7 +53,7 @@ def opaque_index(value: int) -> Any:
     return dr.opaque(mi.UInt32, value)
 
 
-def opaque_matrix(matrix: NDArray[np.float64]) -> Any:
+def opaque_matrix(matrix: Array) -> Any:
     """`matrix (3, 3)` that kernels read from memory."""
     import mitsuba as mi
 
@@ -175,7 +176,7 @@ def continue_path(
     return si.spawn_ray(si.to_world(wo)), throughput, alive
 
 
-def pixel_indices(camera: Camera, pixels: ArrayLike) -> NDArray[np.int64]:
+def pixel_indices(camera: Camera, pixels: ArrayLike) -> Ints:
     """`pixels (P,)` as flat indices, row after row; raises `ValueError` outside the image."""
     index = np.asarray(pixels, np.int64)
     if index.ndim != 1 or (len(index) and (index.min() < 0 or index.max() >= _size(camera))):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
@@ -21,10 +21,9 @@ from appearance.render.paths import (
 )
 from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
 from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.projectors import Projector
-
-Image = NDArray[np.float32]
 
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31
@@ -63,7 +62,7 @@ def render_scanlines(
     pixels: ArrayLike | None = None,
     rows: Mapping[str, range] | None = None,
     **options: Any,
-) -> dict[str, Image]:
+) -> dict[str, Floats]:
     """Radiance of each row of each projector at full level, W/(sr m²).
 
     Returns by projector name `(rows, H, W, 3)`, or `(rows, P, 3)` for `pixels (P,)` (flat
@@ -95,7 +94,7 @@ def scanline_tiles(
     seed: int = 0,
     rows: Mapping[str, range] | None = None,
     **options: Any,
-) -> Iterator[tuple[NDArray[np.int64], dict[str, Image]]]:
+) -> Iterator[tuple[Ints, dict[str, Floats]]]:
     """`render_scanlines` of the pixels that see the subject, a tile at a time, as `olat_tiles`."""
     ranges, chosen = _ranges(projectors, rows), ScanlineOptions(**options)
     index = covered_pixels(scene, camera)
@@ -135,10 +134,10 @@ def _tiles(
     camera: Camera,
     projectors: Sequence[Projector],
     rows: dict[str, range],
-    index: NDArray[np.int64],
+    index: Ints,
     options: ScanlineOptions,
     seed: int,
-) -> Iterator[tuple[slice, dict[str, Image]]]:
+) -> Iterator[tuple[slice, dict[str, Floats]]]:
     """Slices of `index` and the rows' radiance `(rows, P, 3)` at their pixels."""
     if not len(index):
         return
@@ -162,11 +161,11 @@ def _tiles(
 def _render(
     scene: HairScene,
     camera: Camera,
-    index: NDArray[np.int64],
+    index: Ints,
     plan: _Plan,
     spp: int,
     seed: tuple[int, int],
-) -> dict[str, Image]:
+) -> dict[str, Floats]:
     """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
     import drjit as dr
     import mitsuba as mi

@@ -12,18 +12,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from appearance.render.coverage import coverage
 from appearance.render.environment import render_environment
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
+from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
-
-Image = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 
 def olat_smoothed(
@@ -35,7 +32,7 @@ def olat_smoothed(
     max_depth: int = 16,
     sigma: float = 1.5,
     seed: int = 0,
-) -> Image:
+) -> Floats:
     """`render_olat` with its indirect light smoothed over `sigma` pixels: `(L, H, W, 3)`."""
     share = coverage(scene, camera, max(spp, 16), seed)
     # the first hits and their light are the same in both: they draw the same random numbers first
@@ -49,13 +46,13 @@ def olat_smoothed(
 def environment_smoothed(
     scene: HairScene,
     camera: Camera,
-    envmap: NDArray[np.floating],
+    envmap: AnyFloats,
     *,
     spp: int = 36,
     max_depth: int = 16,
     sigma: float = 1.5,
     seed: int = 0,
-) -> Image:
+) -> Floats:
     """`render_environment` with its indirect light smoothed over `sigma` pixels: `(H, W, 3)`.
 
     Direct light takes 8 `spp` paths a pixel: they are short, and the strands show in it.
@@ -69,7 +66,7 @@ def environment_smoothed(
     return direct + smoothed((whole - first)[None], share, sigma)[0]
 
 
-def smoothed(images: Image, share: dict[str, NDArray[np.float32]], sigma: float) -> Image:
+def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
     """`images (L, H, W, 3)` averaged over `sigma` pixels, hair and head apart.
 
     `share` is what `coverage` returns. A pixel belongs to what covers more of it, and gets the

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.paths import Surface, jittered, opaque, opaque_index
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import Camera
 
 LANE_BYTES = 512
@@ -58,7 +58,7 @@ class Paths:
 def follow(
     surface: Surface,
     camera: Camera,
-    pixels: NDArray[np.int64],
+    pixels: Ints,
     spp: int,
     seeds: tuple[int, ...],
     reach: Reach,

@@ -8,8 +8,8 @@ the tangent, and a polyline's tangent jumps; the cost is about a quarter more ti
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.strands import Strands
 
 MOST_UNEVEN = 2.0
@@ -18,7 +18,7 @@ MOST_UNEVEN = 2.0
 
 def spline_control_points(
     strands: Strands,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Array, Ints]:
     """Control points `(N + 2 S, 4)` (x, y, z, radius) and first control points of the segments.
 
     Points are interpolated with natural ends (no curvature at root and tip), for all strands of one
@@ -41,7 +41,7 @@ def spline_control_points(
     return out, segments
 
 
-def _interpolating(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolating(points: Array) -> Array:
     """Control points `(S, n + 2, 3)` of the natural splines through `points (S, n, 3)`.
 
     (c[i-1] + 4 c[i] + c[i+1]) / 6 = p[i] with c[0] = p[0], c[n-1] = p[n-1]; the phantom ends
@@ -100,7 +100,7 @@ def _evened(strands: Strands) -> Strands:
     )
 
 
-def _ranges(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _ranges(counts: Ints) -> Ints:
     """0 … counts[0]-1, 0 … counts[1]-1, … in one array."""
     ends = np.cumsum(counts)
     return np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.scene.backend import ensure_backend
 from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 
@@ -163,9 +164,7 @@ def _curves(strands: Strands) -> Any:
     return shape
 
 
-def _guarded(
-    points: NDArray[np.float64], segments: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _guarded(points: Array, segments: Ints) -> tuple[Array, Ints]:
     """The curves and copies of their last segment, thin inside it, where no ray meets them.
 
     Mitsuba finds a hit's segment back from one float32 coordinate over all segments. Rounding
@@ -191,7 +190,7 @@ def _mesh(head: Mesh) -> Any:
     return mesh
 
 
-def light_arrays(lights: Sequence[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def light_arrays(lights: Sequence[Any]) -> tuple[Floats, Floats]:
     """Positions and intensities `(L, 3)` of `lights` in the scene's units."""
     position = np.array([light.position for light in lights], float).reshape(-1, 3) * SCALE
     intensity = np.array([light.intensity for light in lights], float).reshape(-1, 3) * SCALE**2

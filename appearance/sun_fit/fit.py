@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.metrics.scores import Exposure
 from appearance.model.fitted_appearance import FittedAppearance
@@ -31,6 +30,7 @@ from appearance.sun_fit.roughness_and_colour import (
     match_roughness,
 )
 from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
+from reconstruction.arrays import Array, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.files.strands import read_strands
 from reconstruction.head.fitted import model_head
@@ -178,7 +178,7 @@ def _reached(
     return [_under(o, lit) for o in hair], [_under(o, lit) for o in skin]
 
 
-def _under(o: Observed, lights: NDArray[np.int64]) -> Observed:
+def _under(o: Observed, lights: Ints) -> Observed:
     names = tuple(o.lights[i] for i in lights)
     return replace(o, lights=names, radiance=o.radiance[lights], valid=o.valid[lights])
 
@@ -249,8 +249,8 @@ class SunFit:
     def colour(
         self,
         beta_m: float,
-        start: NDArray[np.float64] | None,
-        skin: NDArray[np.float64],
+        start: Array | None,
+        skin: Array,
         stage: Stage,
         iterations: int | None = None,
     ) -> Colours:

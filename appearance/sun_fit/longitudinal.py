@@ -9,10 +9,10 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import i0e
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 LEAST_VARIANCE = 1e-7
 """Smallest longitudinal variance; a lobe of 0.02 degrees."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.observations import Observed
 from appearance.sun_fit.longitudinal import longitudinal
 from appearance.sun_fit.visible_fibres import VisibleFibres
-
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array, Bools, Ints
 
 WINDOW = np.pi / 6
 """Sun Eq. 9: how far from the mirror direction samples are taken, both ways."""
@@ -35,7 +33,7 @@ class MirrorSamples:
     value: Array
     theta_i: Array
     theta_o: Array
-    hair: NDArray[np.bool_]
+    hair: Bools
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -55,7 +53,7 @@ class LobeBins:
     deviation: Array
     value: Array
     error: Array
-    count: NDArray[np.int64]
+    count: Ints
     theta_i: Array
     theta_o: Array
     weight: Array
@@ -102,7 +100,7 @@ def mirror_samples(
 
 def mirror_lights(
     observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, least: float = 0.03
-) -> NDArray[np.int64]:
+) -> Ints:
     """Indices of the lights that are near the mirror direction of a share `least` of the pixels."""
     near = _near_mirror(observed, fibres, tilt_deg, 0.9, 0.06)[0]
     return np.flatnonzero(near.sum(axis=1) > least * near.shape[1])
@@ -145,7 +143,7 @@ def _near_mirror(
     tilt_deg: float,
     least_share: float,
     most_spread: float,
-) -> tuple[NDArray[np.bool_], Array, Array, Array]:
+) -> tuple[Bools, Array, Array, Array]:
     """Which samples to take `(L, P)`, their deviations, and the way to the light and its square."""
     middle = _middle(fibres)
     mean = _unit(fibres.tangent.sum(axis=1, dtype=float))

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar, nnls
 from scipy.stats import theilslopes
 
@@ -27,8 +26,7 @@ from appearance.sun_fit.longitudinal import (
     variance_of_roughness,
 )
 from appearance.sun_fit.mirror_samples import LobeBins
-
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
 

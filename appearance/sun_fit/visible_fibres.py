@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.cameras import Camera
 
 
@@ -21,16 +22,16 @@ class VisibleFibres:
     rays that meet a fibre: where it is false, the other two are 0.
     """
 
-    point: NDArray[np.float32]
-    tangent: NDArray[np.float32]
-    hair: NDArray[np.bool_]
+    point: Floats
+    tangent: Floats
+    hair: Bools
 
     @property
-    def share(self) -> NDArray[np.float64]:
+    def share(self) -> Array:
         """Share of each pixel that shows hair `(P,)`."""
         return np.asarray(self.hair.mean(axis=1))
 
-    def spread(self) -> NDArray[np.float64]:
+    def spread(self) -> Array:
         """Variance `(P,)`, rad², of the tangents' angle to their undirected mean in a pixel."""
         t = self.tangent.astype(float)
         count = np.maximum(self.hair.sum(axis=1), 1)

@@ -10,16 +10,15 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.errors import CalibrationError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """Corners that a picture shows: their numbers `ids (N,)` and `pixels (N, 2)`."""
 
-    ids: NDArray[np.int64]
+    ids: Ints
     pixels: Array
 
     def __len__(self) -> int:
@@ -73,7 +72,7 @@ class Board:
         size = (self.columns * per_square, self.rows * per_square)
         return np.asarray(self._opencv.generateImage(size))
 
-    def ink(self, points: ArrayLike, per_square: int = 64) -> NDArray[np.bool_]:
+    def ink(self, points: ArrayLike, per_square: int = 64) -> Bools:
         """Whether board points `(..., 2)` are inked; beyond the picture they are not."""
         picture = self.picture(per_square)
         at = np.floor(np.asarray(points, float) * (per_square / self.square)).astype(int)
@@ -81,7 +80,7 @@ class Board:
         at = np.where(inside[..., None], at, 0)
         return np.asarray(inside) & (picture[at[..., 1], at[..., 0]] < 128)
 
-    def plain(self, points: ArrayLike, margin: float, per_square: int = 64) -> NDArray[np.bool_]:
+    def plain(self, points: ArrayLike, margin: float, per_square: int = 64) -> Bools:
         """Whether board points `(..., 2)` are `margin` metres or more inside one colour."""
         ink = (self.picture(per_square) < 128).astype(np.uint8)
         reach = int(np.ceil(margin * per_square / self.square))

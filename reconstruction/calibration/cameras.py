@@ -13,15 +13,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.least_squares import Solution, minimise
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rigid_motion import Rigid, align_devices
 
-Array = NDArray[np.float64]
 Sightings = Mapping[str, Mapping[str, Sighting]]
 
 LEAST = 8  # corners in a sighting
@@ -93,7 +92,7 @@ class _Lens:
     """fx, fy, cx, cy, k1, k2, p1, p2, k3 `(9,)`, and which of them are estimated."""
 
     values: Array
-    free: NDArray[np.int64]
+    free: Ints
 
     @classmethod
     def kept(cls, camera: Camera) -> _Lens:
@@ -226,11 +225,11 @@ class _Bundle:
             x[self.board_at(k)] = boards[pose].vector()
         return x
 
-    def camera_at(self, k: int) -> NDArray[np.int64]:
+    def camera_at(self, k: int) -> Ints:
         """Where camera number `k` > 0 has its pose."""
         return np.arange(6) + self.cameras_from + 6 * k
 
-    def board_at(self, k: int) -> NDArray[np.int64]:
+    def board_at(self, k: int) -> Ints:
         """Where board number `k` has its pose."""
         return np.arange(6) + self.boards_from + 6 * k
 
@@ -312,7 +311,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
     )
 
 
-def _position_deviation(solution: Solution, at: NDArray[np.int64]) -> float:
+def _position_deviation(solution: Solution, at: Ints) -> float:
     """Metres, from the covariance of rotation vector and translation."""
     x, C = solution.x[at], solution.covariance[np.ix_(at, at)]
     step = 1e-6 * np.eye(6)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array
 from reconstruction.calibration.least_squares import minimise, numeric
 from reconstruction.geometry.cameras import Pinhole
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.rigid_motion import Rigid, align_devices
-
-Array = NDArray[np.float64]
 
 
 def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:

@@ -11,16 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from reconstruction.arrays import Array
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.least_squares import Solution, minimise
 from reconstruction.calibration.spheres import Highlight, crossing, mirrored
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
-
-Array = NDArray[np.float64]
 
 LOOSE = 0.05  # of the distance: a larger deviation is no position
 SAME_PLACE = np.radians(0.5)  # between rays that are to cross

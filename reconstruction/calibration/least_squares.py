@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
+
 Linearised = Callable[[Array], tuple[Array, Any]]
 """Residuals `(m,)` and their derivatives `(m, n)`, dense or sparse."""
 

@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.boards import Board
 from reconstruction.calibration.cameras import CameraSolution
 from reconstruction.calibration.errors import CalibrationError
@@ -26,8 +26,6 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rigid_motion import Rigid
 from reconstruction.light_planes.peaks import find_peaks
-
-Array = NDArray[np.float64]
 
 MOST = 20_000  # points: more do not make it better
 HEAD = 0.1  # metres about the points' middle where planes of light are to be right
@@ -191,9 +189,7 @@ def projector_intensities(
     return {p.name: channels[k] for k, p in enumerate(projectors) if lit[k] >= 50}
 
 
-def _printed(
-    camera: Camera, board: Board, to_world: Rigid
-) -> tuple[NDArray[np.int64], Array, Array]:
+def _printed(camera: Camera, board: Board, to_world: Rigid) -> tuple[Ints, Array, Array]:
     """Pixels `(N, 2)` that see the print, points `(N, 3)` there, and each one's share of paper."""
     to_board = to_world.inverse()
     origin = to_board(camera.center)
@@ -212,7 +208,7 @@ def _printed(
     return pixels[inside], to_world(at[inside].mean(axis=1)), paper
 
 
-def _sure(projectors: Sequence[Projector], points: Array) -> NDArray[np.bool_]:
+def _sure(projectors: Sequence[Projector], points: Array) -> Bools:
     """Points well inside of each beam or well outside: rows do not say where its sides are."""
     sure = np.ones(len(points), bool)
     for p in projectors:

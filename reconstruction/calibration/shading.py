@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.lamps import LOOSE, Lamp
 from reconstruction.calibration.least_squares import minimise
 from reconstruction.geometry.lights import Light
-
-Array = NDArray[np.float64]
 
 MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better
 STEEPEST = 0.15  # cosine of incidence: flatter light shows the sphere's grain
@@ -34,7 +32,7 @@ class Shading:
 
     eyes: Array
     rays: Array
-    sphere: NDArray[np.int64]
+    sphere: Ints
     radiance: Array
     deviation: Array
     centres: Array
@@ -77,7 +75,7 @@ class Shading:
         falling = (normals * v).sum(axis=1) / (v * v).sum(axis=1) ** 1.5
         return np.asarray(self.albedo / np.pi * strength * falling)
 
-    def used(self, light: Light) -> NDArray[np.bool_]:
+    def used(self, light: Light) -> Bools:
         """Pixels `(N,)` that `light` reaches well."""
         points, normals = self.surface
         v = light.position - points
@@ -201,7 +199,7 @@ def _derivatives(shading: Shading, light: Light) -> tuple[Array, Array]:
     return now - grey / error, np.stack(columns, axis=1)
 
 
-def _direction(shading: Shading, lit: NDArray[np.bool_]) -> Array:
+def _direction(shading: Shading, lit: Bools) -> Array:
     """The way `(3,)` to a far light: radiance = max(n·g, 0)."""
     normals, use, g = shading.surface[1], lit, np.asarray((0.0, 0.0, 1.0))
     for _ in range(4):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.frames import lamp_response
 from reconstruction.calibration.lamps import Glint
@@ -17,8 +17,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import NoSilhouette, background_noise, lit_image
 
-Array = NDArray[np.float64]
-Samples = tuple[Array, Array, NDArray[np.int64], Array, Array]
+Samples = tuple[Array, Array, Ints, Array, Array]
 
 MOST = 4000  # pixels of a camera
 RIM = 0.35  # cosine to the viewer below which a pixel's mean is not its middle
@@ -94,7 +93,7 @@ def glints_of(
     return out
 
 
-def _disc(camera: Camera, centre: Array, radius: float) -> tuple[NDArray[np.int64], Array]:
+def _disc(camera: Camera, centre: Array, radius: float) -> tuple[Ints, Array]:
     """Pixels `(N, 2)` well inside the sphere's picture, and their rays `(N, 3)`."""
     box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     at, depth = camera.project(centre + radius * box)

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.calibration.errors import CalibrationError
 from reconstruction.calibration.least_squares import minimise, numeric
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import background_noise
-
-Array = NDArray[np.float64]
 
 RIM = 0.2  # pixels: what a point of the outline is off by
 SPOT = 0.3  # pixels: a highlight within one pixel, anywhere in it
@@ -29,7 +27,7 @@ class Highlight:
     saturated: bool
 
 
-def find_outline(image: NDArray[np.floating], directions: int = 120) -> Array:
+def find_outline(image: AnyFloats, directions: int = 120) -> Array:
     """Sub-pixel points `(N, 2)` of the rim of the one lit blob in a dark-subtracted grey `image`.
 
     Along rays from its centroid, where the light falls to half of what it is two pixels inside.
@@ -104,7 +102,7 @@ def sphere_centre(
     return solution.x[:3], solution.covariance[:3, :3]
 
 
-def find_highlight(image: NDArray[np.floating], saturated: NDArray[np.bool_]) -> Highlight | None:
+def find_highlight(image: AnyFloats, saturated: Bools) -> Highlight | None:
     """The brightest spot of a dark-subtracted grey `image`, None where all is noise.
 
     Its centre is the mean of its pixels by brightness. A saturated spot's deviation grows with it.

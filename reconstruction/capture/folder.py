@@ -23,8 +23,8 @@ from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Bools, Floats
 from reconstruction.files.exr import read_exr
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig
@@ -132,25 +132,23 @@ class Capture:
         record = self.records.get((step.index, camera))
         return record is not None and record.file is not None
 
-    def frame(self, step: Step, camera: str) -> NDArray[np.float32]:
+    def frame(self, step: Step, camera: str) -> Floats:
         """Scene-linear radiance `(H, W, 3)`, W/(sr m²), as exposed: at the step's lamp level.
 
         Noise may push dark pixels below zero. Raises `MissingFrame`.
         """
         return self._read(step, camera)[0]
 
-    def response(self, step: Step, camera: str) -> NDArray[np.float32]:
+    def response(self, step: Step, camera: str) -> Floats:
         """`frame` divided by the step's level: the answer to the lamp at full intensity."""
         image = self.frame(step, camera)
         return image if step.level in (0, 1) else image / np.float32(step.level)
 
-    def saturated(self, step: Step, camera: str) -> NDArray[np.bool_]:
+    def saturated(self, step: Step, camera: str) -> Bools:
         """Pixels `(H, W)` with a channel at the sensor's full scale."""
         return self.response_and_saturated(step, camera)[1]
 
-    def response_and_saturated(
-        self, step: Step, camera: str
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def response_and_saturated(self, step: Step, camera: str) -> tuple[Floats, Bools]:
         """`response` and `saturated` of one frame for the price of reading it once."""
         image, attributes = self._read(step, camera)
         full_scale = float(attributes.get("fullScale", np.inf))
@@ -165,7 +163,7 @@ class Capture:
         """Whether a frame of this light alone was written, at any exposure."""
         return any(self.has(s, camera) for s in self._of_light.get(light, ()))
 
-    def light(self, light: str, camera: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def light(self, light: str, camera: str) -> tuple[Floats, Bools]:
         """Response `(H, W, 3)` to one light alone, and where `(H, W)` it is saturated.
 
         Where the light was shot with several exposures, their mean with the weight of exposure
@@ -223,14 +221,14 @@ class Capture:
             raise MissingFrame(f"{self.path}: step {step.index} ({step.kind}), {camera}: {why}")
         return self.path / record.file
 
-    def _read(self, step: Step, camera: str) -> tuple[NDArray[np.float32], dict[str, float | str]]:
+    def _read(self, step: Step, camera: str) -> tuple[Floats, dict[str, float | str]]:
         return self.read_file(step, camera, read_exr)
 
     def of_kind(self, kind: StepKind) -> tuple[Step, ...]:
         """Steps of one kind in the order they were shot."""
         return tuple(s for s in self.steps if s.kind == kind)
 
-    def olat(self, camera: str, lights: list[str] | None = None) -> NDArray[np.float32]:
+    def olat(self, camera: str, lights: list[str] | None = None) -> Floats:
         """Responses `(L, H, W, 3)` to single lights, in the order of `lights` (default: rig order).
 
         Raises `MissingFrame` when one of them was not shot.
@@ -248,7 +246,7 @@ class Capture:
         """Names of the lights that were shot one at a time, in rig order."""
         return [light.name for light in self.rig.lights if light.name in self._of_light]
 
-    def mask(self, camera: str) -> NDArray[np.bool_] | None:
+    def mask(self, camera: str) -> Bools | None:
         """The user's hair mask `(H, W)` (half grey and above), or None when there is none."""
         path = self.path / "masks" / f"{camera}.png"
         if not path.is_file():

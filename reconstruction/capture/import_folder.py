@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture, CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.exr import read_exr
@@ -208,7 +209,7 @@ def _head(path: Path) -> Mesh | None:
         raise ImportProblem(str(error)) from error
 
 
-def _picture(path: Path, camera: Camera) -> NDArray[np.float32]:
+def _picture(path: Path, camera: Camera) -> Floats:
     try:
         image, _ = read_exr(path)
     except ValueError as error:

@@ -6,16 +6,15 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Report
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+Maps = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class _Lens:
         straight = replace(pinhole, K=K, width=x1 - x0 + 1, height=y1 - y0 + 1)
         return cls(bent, straight, _grid(straight, bent), _grid(bent, straight))
 
-    def straighten(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def straighten(self, image: Floats) -> Floats:
         """A bent picture `(H, W, C)`, straight, by cubic interpolation.
 
         Beside the last of the light a cubic swings below zero, which would pass for noise: what is
@@ -86,12 +85,12 @@ class StraightenedCapture(Capture):
         cameras = tuple(self._lenses[c.name].straight if c.distorted else c for c in rig.cameras)
         self.rig = Rig(rig.name, cameras, rig.lights, rig.projectors)
 
-    def frame(self, step: Step, camera: str) -> NDArray[np.float32]:
+    def frame(self, step: Step, camera: str) -> Floats:
         image = self.source.frame(step, camera)
         lens = self._lenses.get(camera)
         return image if lens is None else lens.straighten(image)
 
-    def response_and_saturated(self, step: Step, camera: str) -> tuple[NDArray[np.float32], Bools]:
+    def response_and_saturated(self, step: Step, camera: str) -> tuple[Floats, Bools]:
         image, saturated = self.source.response_and_saturated(step, camera)
         lens = self._lenses.get(camera)
         if lens is None:

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError, FrameRecord, Step
 from reconstruction.files.durable import (
     RESERVE,
@@ -133,7 +134,7 @@ class CaptureWriter:
         self,
         step: Step,
         camera: str,
-        radiance: NDArray[np.floating],
+        radiance: AnyFloats,
         *,
         full_scale: float = math.inf,
         count_scale: float = 0.0,
@@ -162,7 +163,7 @@ class CaptureWriter:
         self,
         step: Step,
         camera: str,
-        radiance: NDArray[np.floating],
+        radiance: AnyFloats,
         *,
         full_scale: float = math.inf,
         count_scale: float = 0.0,

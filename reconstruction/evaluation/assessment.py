@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.evaluation.connectivity import (
     Followed,
     connectivity_figures,
@@ -25,9 +25,6 @@ from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, silent
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ROOTED = 5e-3
 """Metres: a strand that ends this near the scalp reaches it."""
@@ -189,7 +186,7 @@ def _region_figures(
 ) -> dict[str, Any]:
     precision, recall = comparison.all
     depth = HairDepth(truth, head if head is not None else sphere)
-    kinds: dict[str, tuple[Sequence[str], Int, Int]] = {}
+    kinds: dict[str, tuple[Sequence[str], Ints, Ints]] = {}
     if sphere is not None:
         grows = sphere.scalp_regions(true.roots)
         kinds["scalp"] = SCALP, grows[of_pred.strand], grows[recall.drawn.strand]

@@ -11,17 +11,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.visual_hull import VoxelGrid, mesh_silhouette, trim_edges, visual_hull
 from reconstruction.growth.envelope import carve, inside_mesh, mesh_depth
 from reconstruction.growth.field import solve_field
-
-Bool = NDArray[np.bool_]
 
 SPACING = np.sqrt(2) * 1e-3
 """Metres between neighbouring lines: no point between them is over 1 mm from the nearest."""
@@ -33,7 +31,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 def control_hull(
     cameras: Sequence[Camera],
-    masks: Mapping[str, Bool],
+    masks: Mapping[str, Bools],
     head: Mesh | None = None,
     *,
     spacing: float = 2e-3,
@@ -94,7 +92,7 @@ def hull_smooth_field(
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
 
 
-def _descent(hull: VoxelGrid, head: Bool | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _descent(hull: VoxelGrid, head: Bools | None) -> tuple[Array, Array]:
     """Centres `(N, 3)` of the outer surface's voxels and unit directions `(N, 3)` of descent."""
     solid = np.pad(hull.inside if head is None else hull.inside | head, 4)
     surface = solid & ~ndimage.binary_erosion(solid)

@@ -6,14 +6,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.evaluation.matching import THRESHOLDS
 from reconstruction.evaluation.oriented_points import Block, OrientedPoints, near_pairs
 from reconstruction.geometry.strands import Strands
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 LIES_ON = THRESHOLDS[1]
 """A point lies on a strand that has a point within this distance and (undirected) angle of it."""
@@ -66,8 +63,8 @@ class Followed:
         self.complete = len(self.strands) == len(points.offsets) - 1
         self._block = points.of_strands(self.strands)
         self._counts = np.diff(points.offsets)[self.strands]
-        self._point: list[Int] = []
-        self._other: list[Int] = []
+        self._point: list[Ints] = []
+        self._other: list[Ints] = []
 
     def look(self, block: Block) -> None:
         """Take a block of the other set into account; each of its strands is in one block only."""
@@ -118,13 +115,13 @@ class Followed:
                 out[k] += 1
         return out
 
-    def _incidences(self) -> tuple[Int, Int]:
+    def _incidences(self) -> tuple[Ints, Ints]:
         """Points of the followed strands and strands that they lie on, by point."""
         point = np.concatenate([*self._point, np.zeros(0, np.int64)])
         order = np.argsort(point, kind="stable")
         return point[order], np.concatenate([*self._other, np.zeros(0, np.int64)])[order]
 
-    def _pairs(self) -> tuple[Int, Int, Int]:
+    def _pairs(self) -> tuple[Ints, Ints, Ints]:
         """Followed strand (its place), other strand, and how many points of the first lie on it."""
         point, other = self._incidences()
         owner = np.repeat(np.arange(len(self.strands)), self._counts)[point]

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats
 from reconstruction.evaluation.assessment import Assessment, Nearest
 from reconstruction.evaluation.matching import THRESHOLDS
 from reconstruction.report.plots import COLOURS, INK, QUIET, TITLE, WIDTH, clean_axes, save_figure
-
-Array = NDArray[np.floating]
 
 VIEWS = {
     "front": ((1, 0, 0), (0, 0, 1)),
@@ -60,7 +58,9 @@ def draw_errors(assessment: Assessment, folder: str | Path) -> list[Path]:
     return [save_figure(figure, folder / f"{name}.png") for name, figure in pictures.items()]
 
 
-def _views(sets: Mapping[str, tuple[Nearest, Array]], steps: Sequence[float], label: str) -> Figure:
+def _views(
+    sets: Mapping[str, tuple[Nearest, AnyFloats]], steps: Sequence[float], label: str
+) -> Figure:
     figure = Figure(figsize=(1.5 * WIDTH, 0.58 * WIDTH), layout="constrained")
     grid = figure.subplots(len(sets), len(VIEWS), squeeze=False)
     colours = ListedColormap(list(GOOD_TO_BAD[:-1])).with_extremes(over=GOOD_TO_BAD[-1])

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Bools
 from reconstruction.evaluation.oriented_points import Block, Drawn, OrientedPoints, near_pairs
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
-
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -64,8 +62,8 @@ def scores(
     recall: Matches,
     *,
     directed: bool = False,
-    predicted: Bool | None = None,
-    true: Bool | None = None,
+    predicted: Bools | None = None,
+    true: Bools | None = None,
 ) -> dict[str, dict[str, float]]:
     """Precision, recall and F at each threshold, as `compare_strands` returns them.
 
@@ -85,7 +83,7 @@ def scores(
     return out
 
 
-def _share(matches: Matches, k: int, directed: bool, among: Bool | None) -> tuple[float, float]:
+def _share(matches: Matches, k: int, directed: bool, among: Bools | None) -> tuple[float, float]:
     """The share of points that match, and its standard error by sampling: 0 if all are scored."""
     found = (matches.directed if directed else matches.found)[k]
     found = found if among is None else found[among]

@@ -13,14 +13,11 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Floats, Ints
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.strands import Resampling, Strands
-
-Single = NDArray[np.float32]
-Int = NDArray[np.int64]
 
 STEP = 1e-3
 """Metres between the points."""
@@ -48,9 +45,9 @@ class Block:
     Where a strand has no length, the tangent is 0.
     """
 
-    points: Single
-    tangents: Single
-    strand: Int
+    points: Floats
+    tangents: Floats
+    strand: Ints
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -140,32 +137,32 @@ class OrientedPoints:
         block = self._make(chosen, np.searchsorted(self.offsets, chosen, side="right") - 1)
         return Drawn(block.points, block.tangents, block.strand, complete)
 
-    def of_strands(self, which: Int) -> Block:
+    def of_strands(self, which: Ints) -> Block:
         """All points of the strands `which`, in that order."""
         counts = np.diff(self.offsets)[which]
         strand = np.repeat(which, counts)
         place = np.arange(len(strand)) - np.repeat(np.cumsum(counts) - counts, counts)
         return self._make(self.offsets[strand] + place, strand)
 
-    def _make(self, index: Int, strand: Int) -> Block:
+    def _make(self, index: Ints, strand: Ints) -> Block:
         before, after = self._beside(index, strand)
         tangents = _directions(self._at(before)[0], self._at(after)[0])
         return Block(self._at(index)[0], tangents, strand)
 
-    def _beside(self, index: Int, strand: Int) -> tuple[Int, Int]:
+    def _beside(self, index: Ints, strand: Ints) -> tuple[Ints, Ints]:
         """The points before and after each on its strand; an end stands in for what is not."""
         first, last = self.offsets[strand], self.offsets[strand + 1] - 1
         return np.maximum(index - 1, first), np.minimum(index + 1, last)
 
 
-def _directions(before: Single, after: Single) -> Single:
+def _directions(before: Floats, after: Floats) -> Floats:
     """Unit vectors `(n, 3)`; 0 where both points coincide."""
     d = after.astype(float) - before
     norm = np.linalg.norm(d, axis=1, keepdims=True)
     return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
 
 
-def near_pairs(points: Single, other: Block, reach: float) -> Iterator[tuple[Int, Int]]:
+def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Ints, Ints]]:
     """Indices `(n,)`, `(n,)` of points and points of `other` at most `reach` metres apart.
 
     They come in parts of about `MOST_PAIRS`, those of one point together.

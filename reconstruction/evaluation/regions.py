@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import AnyFloats, Array, Ints
 from reconstruction.evaluation.oriented_points import OrientedPoints
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.growth.envelope import inside_mesh
 from reconstruction.head.scalp_map import sphere_center
-
-Array = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 SCALP = ("front", "top", "sides", "back", "nape")
 DEPTHS = ("outer", "inner")
@@ -55,7 +52,7 @@ class HeadSphere:
             return None
         return cls(center, radius)
 
-    def scalp_regions(self, roots: NDArray[np.floating]) -> NDArray[np.int64]:
+    def scalp_regions(self, roots: AnyFloats) -> Ints:
         """Indices into `SCALP (n,)` of `roots (n, 3)`: z is up and the face looks towards -y.
 
         Seen from the centre: what rises over 50° is top, the rest in quarters of 90° to the front,
@@ -103,7 +100,7 @@ class HairDepth:
         self._depth = (self.spacing * np.maximum(depth, 0)).astype(np.float32)
         self._grid = grid
 
-    def regions(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+    def regions(self, points: AnyFloats) -> Ints:
         """Indices into `DEPTHS (n,)` of `points (n, 3)`; outside the hair is outer."""
         ijk = self._grid.index(points)
         on = ((ijk >= 0) & (ijk < self._depth.shape)).all(axis=1)

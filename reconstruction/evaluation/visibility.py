@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Bools, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Resampling, Strands
 from reconstruction.growth.envelope import surface_samples
-
-Single = NDArray[np.float32]
-Points = NDArray[np.floating]
-Bool = NDArray[np.bool_]
 
 NARROWEST, WIDEST = 5e-4, 1e-3
 """Limits, in metres, of the width that a strand hides with."""
@@ -53,7 +49,7 @@ class Visibility:
             for buffer in self._buffers:
                 buffer.splat(samples)
 
-    def __call__(self, points: Points, tolerance: float = 1e-3) -> Bool:
+    def __call__(self, points: AnyFloats, tolerance: float = 1e-3) -> Bools:
         """Whether at least one camera sees each of `points (N, 3)`; returns `(N,)`."""
         out = np.zeros(len(points), bool)
         for buffer in self._buffers:
@@ -65,7 +61,7 @@ class Visibility:
 class _DepthBuffer:
     """The nearest depth behind every pixel of a finer image of the part that shows the strands."""
 
-    def __init__(self, camera: Camera, strands: Points, pixel: float) -> None:
+    def __init__(self, camera: Camera, strands: AnyFloats, pixel: float) -> None:
         self.camera = camera
         pixels, depth = camera.project(strands)
         front = depth > 1e-6
@@ -96,7 +92,7 @@ class _DepthBuffer:
         corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
         self.image = (corners - self.low) * self.scale
 
-    def _project(self, points: Points) -> Iterator[tuple[slice, Single, Single, Single]]:
+    def _project(self, points: AnyFloats) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
         """Chunk by chunk: which points, column, row and depth; behind the camera column is -inf."""
         for first in range(0, len(points), CHUNK):
             part = slice(first, first + CHUNK)
@@ -106,14 +102,14 @@ class _DepthBuffer:
             y = np.divide(y, z, out=y, where=front)
             yield part, x, y, z
 
-    def splat(self, points: Points) -> None:
+    def splat(self, points: AnyFloats) -> None:
         height, width = self.shape
         for _, x, y, z in self._project(points):
             on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
             flat = y[on].astype(np.int64) * width + x[on].astype(np.int64)
             np.minimum.at(self.depth, flat, z[on])
 
-    def sees(self, points: Points, tolerance: float) -> Bool:
+    def sees(self, points: AnyFloats, tolerance: float) -> Bools:
         out = np.zeros(len(points), bool)
         height, width = self.shape
         (left, top), (right, bottom) = self.image
@@ -125,7 +121,7 @@ class _DepthBuffer:
             out[part] = seen
         return out
 
-    def over(self, mesh: Mesh) -> Bool:
+    def over(self, mesh: Mesh) -> Bools:
         """Which faces `(F,)` may cover the buffer: before the camera and over its rectangle."""
         pixels, depth = self.camera.project(mesh.vertices)
         front = (depth[mesh.faces] > 1e-6).all(axis=1)

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.files.durable import PAGE, part, replace_durably
 
 Attributes = Mapping[str, float | str]
 
 
-def read_exr(path: str | Path) -> tuple[NDArray[np.float32], dict[str, float | str]]:
+def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
     """Read an RGB image `(H, W, 3)` and the header attributes that `write_exr` was given.
 
     Raises `ValueError` that names the file when it is missing, broken or not RGB.
@@ -34,7 +34,7 @@ def read_exr(path: str | Path) -> tuple[NDArray[np.float32], dict[str, float | s
 
 def write_exr(
     path: str | Path,
-    image: NDArray[np.floating],
+    image: AnyFloats,
     attributes: Attributes | None = None,
     *,
     compress: bool = True,
@@ -83,7 +83,7 @@ class UncompressedExr:
         self._pixels = lines["bgr"]
         self._offsets = self._header_room + line.itemsize * np.arange(height, dtype="<u8")
 
-    def fill(self, image: NDArray[np.floating], attributes: Attributes) -> memoryview:
+    def fill(self, image: AnyFloats, attributes: Attributes) -> memoryview:
         """The whole file with `image (H, W, 3)`; valid until the next call.
 
         Raises `ValueError` for attributes that do not fit the header.

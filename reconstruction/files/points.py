@@ -6,9 +6,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 SUFFIXES = (".obj", ".ply", ".csv", ".npy")
 _KINDS = {

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array, Bools
 
 
 def facing(forward: ArrayLike, roll_deg: float = 0.0) -> Array:
@@ -124,7 +124,7 @@ class Pinhole:
         """The inverse of `_through_lens`."""
         return x, y
 
-    def inside(self, pixels: ArrayLike) -> NDArray[np.bool_]:
+    def inside(self, pixels: ArrayLike) -> Bools:
         """Whether `pixels (..., 2)` fall on the image, edge pixels' outer halves included."""
         p = np.asarray(pixels, float)
         return np.asarray(

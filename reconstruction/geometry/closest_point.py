@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.growth.envelope import surface_samples
 
-Array = NDArray[np.float64]
 _CANDIDATES = 6
 
 
@@ -20,7 +19,7 @@ class ClosestPoint:
     too large, far less where faces are small beside it. `faces (F,) bool` restricts the search.
     """
 
-    def __init__(self, mesh: Mesh, spacing: float, faces: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, mesh: Mesh, spacing: float, faces: Bools | None = None) -> None:
         samples, _, face = surface_samples(mesh, spacing)
         if faces is not None:
             samples, face = samples[faces[face]], face[faces[face]]
@@ -30,7 +29,7 @@ class ClosestPoint:
         self._face = face
         self._tree = cKDTree(samples)
 
-    def __call__(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], Array, Array]:
+    def __call__(self, points: AnyFloats) -> tuple[Ints, Array, Array]:
         """Faces `(N,)`, barycentric coordinates `(N, 3)`, distances `(N,)` of `points (N, 3)`."""
         at: Array = np.asarray(points, np.float64)
         k = min(_CANDIDATES, len(self._face))

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import LampProfile, Photometry, Unit
-
-Array = NDArray[np.float64]
 
 VERSIONS = {
     "IESNA91": 1991,

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array, Bools, Ints
+
 Photometry = Literal["A", "B", "C"]
 Unit = Literal["cd", "W/sr", "relative"]
 
@@ -132,7 +133,7 @@ class LampProfile:
 _SLACK_DEG = 1e-9  # a direction on a table's last node is in it, however it was rounded
 
 
-def _interval(nodes: Array, x: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+def _interval(nodes: Array, x: Array) -> tuple[Ints, Array, Bools]:
     """Left node of the interval that holds `x`, the share of the way through it, and if it does."""
     i = np.clip(np.searchsorted(nodes, x, side="right") - 1, 0, len(nodes) - 2)
     share = (x - nodes[i]) / (nodes[i + 1] - nodes[i])

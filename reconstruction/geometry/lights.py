@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import LampProfile
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from reconstruction.arrays import Array, Bools, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,9 +18,9 @@ class Mesh:
     `scalp (F,) bool` marks the faces that hair grows from, or is None where nobody said.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    scalp: NDArray[np.bool_] | None = None
+    vertices: Array
+    faces: Ints
+    scalp: Bools | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64).reshape(-1, 3)
@@ -32,17 +34,17 @@ class Mesh:
         if self.scalp is not None and np.shape(self.scalp) != (len(faces),):
             raise ValueError(f"scalp must mark the {len(faces)} faces, got {np.shape(self.scalp)}")
 
-    def face_normals(self) -> NDArray[np.float64]:
+    def face_normals(self) -> Array:
         """Unit normals `(F, 3)` by the right-hand rule; 0 for faces without area."""
         n = self._cross()
         length = np.linalg.norm(n, axis=1, keepdims=True)
         return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
 
-    def face_areas(self) -> NDArray[np.float64]:
+    def face_areas(self) -> Array:
         """Areas `(F,)` in square metres."""
         return 0.5 * np.linalg.norm(self._cross(), axis=1)
 
-    def vertex_normals(self) -> NDArray[np.float64]:
+    def vertex_normals(self) -> Array:
         """Area-weighted unit normals `(V, 3)`; 0 for vertices of no face."""
         n = np.zeros_like(self.vertices)
         np.add.at(n, self.faces.ravel(), np.repeat(self._cross(), 3, axis=0))
@@ -54,7 +56,7 @@ class Mesh:
         moved = self.vertices @ np.asarray(rotation, float).T + np.asarray(translation, float)
         return Mesh(moved, self.faces, self.scalp)
 
-    def _cross(self) -> NDArray[np.float64]:
+    def _cross(self) -> Array:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return np.cross(b - a, c - a)
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Pinhole
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Pinhole
 
-Array = NDArray[np.float64]
 P = TypeVar("P", bound=Pinhole)
 
 

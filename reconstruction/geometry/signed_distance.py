@@ -6,9 +6,9 @@ Distances are in metres, negative inside; points are `(..., 3)`, results `(...)`
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 
 def ellipsoid(p: Array, center: ArrayLike, radii: ArrayLike, tilt_deg: float = 0.0) -> Array:

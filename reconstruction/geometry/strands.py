@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
+
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +22,9 @@ class Strands:
     or a coordinate is not finite.
     """
 
-    points: NDArray[np.float32]
-    offsets: NDArray[np.int64]
-    radius: float | NDArray[np.float32] = 4e-5
+    points: Floats
+    offsets: Ints
+    radius: float | Floats = 4e-5
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points, dtype=np.float32).reshape(-1, 3)
@@ -45,7 +47,7 @@ class Strands:
             raise ValueError("radius must be positive and finite")
 
     @classmethod
-    def from_list(cls, strands: list[NDArray[np.floating]], radius: float = 4e-5) -> Strands:
+    def from_list(cls, strands: list[AnyFloats], radius: float = 4e-5) -> Strands:
         """Strands from a list of `(n_i, 3)` arrays; an empty list gives a head without hair."""
         counts = [len(s) for s in strands]
         points = np.concatenate(strands) if strands else np.zeros((0, 3))
@@ -58,30 +60,30 @@ class Strands:
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
-    def __getitem__(self, i: int) -> NDArray[np.float32]:
+    def __getitem__(self, i: int) -> Floats:
         """Points `(n, 3)` of strand `i`."""
         if not 0 <= i < len(self):
             raise IndexError(f"strand {i} of {len(self)}")
         return self.points[self.offsets[i] : self.offsets[i + 1]]
 
     @property
-    def strand_of_point(self) -> NDArray[np.int64]:
+    def strand_of_point(self) -> Ints:
         """Index of the strand of each point `(N,)`."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
     @property
-    def segment_starts(self) -> NDArray[np.int64]:
+    def segment_starts(self) -> Ints:
         """Index of the first point of each segment `(N - S,)`; its second is one further."""
         keep = np.ones(len(self.points), bool)
         keep[self.offsets[1:] - 1] = False
         return np.flatnonzero(keep)
 
     @property
-    def roots(self) -> NDArray[np.float32]:
+    def roots(self) -> Floats:
         """First points `(S, 3)`."""
         return self.points[self.offsets[:-1]]
 
-    def lengths(self) -> NDArray[np.float64]:
+    def lengths(self) -> Array:
         """Arc length of each strand `(S,)`, metres."""
         starts = self.segment_starts
         step = np.linalg.norm(
@@ -89,7 +91,7 @@ class Strands:
         )
         return np.bincount(self.strand_of_point[starts], step, len(self)).astype(np.float64)
 
-    def tangents(self) -> NDArray[np.float32]:
+    def tangents(self) -> Floats:
         """Unit tangents `(N, 3)` by central differences, root to tip; 0 where points coincide."""
         p = self.points.astype(float)
         last = np.zeros(len(p), bool)
@@ -144,9 +146,7 @@ class Resampling:
         counts = np.maximum(np.ceil(self._lengths / step).astype(np.int64), 1) + 1
         self.offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
-    def __call__(
-        self, index: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], float | NDArray[np.float32]]:
+    def __call__(self, index: Ints) -> tuple[Floats, float | Floats]:
         """Points `(n, 3)` at `index (n,)` among all the resampled ones, and their radius."""
         p, offsets, arc = self.strands.points, self.strands.offsets, self._arc
         strand = np.searchsorted(self.offsets, index, side="right") - 1
@@ -165,7 +165,7 @@ class Resampling:
         return points, radius
 
 
-def smoothed(line: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+def smoothed(line: Array, sigma: float) -> Array:
     """The polyline `(n, 3)` under a Gaussian of `sigma` metres along it, its ends where they were.
 
     Points a third of a millimetre apart and a tenth aside turn by more than ten degrees from one

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-
-Array = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 BLOCK = 8
 """Voxels along the edge of the blocks that are carved as a whole before single voxels are."""
@@ -31,7 +29,7 @@ class VoxelGrid:
 
     origin: Array
     spacing: float
-    inside: Bool
+    inside: Bools
 
     def __post_init__(self) -> None:
         origin = np.array(self.origin, dtype=np.float64)
@@ -50,17 +48,17 @@ class VoxelGrid:
         ijk = np.argwhere(self.inside) if index is None else np.asarray(index)
         return np.asarray(self.origin + self.spacing * ijk)
 
-    def index(self, points: ArrayLike) -> NDArray[np.int64]:
+    def index(self, points: ArrayLike) -> Ints:
         """Indices `(..., 3)` of the voxels around `points (..., 3)`; they may lie off the grid."""
         q = (np.asarray(points, float) - self.origin) / self.spacing
         return np.floor(q + 0.5).astype(np.int64)
 
-    def contains(self, points: ArrayLike) -> Bool:
+    def contains(self, points: ArrayLike) -> Bools:
         """Whether `points (..., 3)` lie in an inside voxel; off the grid counts as outside."""
         ijk = self.index(points)
-        on: Bool = np.asarray(((ijk >= 0) & (ijk < self.inside.shape)).all(axis=-1))
+        on: Bools = np.asarray(((ijk >= 0) & (ijk < self.inside.shape)).all(axis=-1))
         i, j, k = np.moveaxis(np.where(on[..., None], ijk, 0), -1, 0)
-        found: Bool = self.inside[i, j, k] if self.inside.size else np.zeros(on.shape, bool)
+        found: Bools = self.inside[i, j, k] if self.inside.size else np.zeros(on.shape, bool)
         return np.asarray(on & found)
 
     @property
@@ -71,7 +69,7 @@ class VoxelGrid:
 
 def visual_hull(
     cameras: Sequence[Camera],
-    masks: Mapping[str, Bool],
+    masks: Mapping[str, Bools],
     *,
     spacing: float,
     bounds: ArrayLike | None = None,
@@ -113,7 +111,7 @@ def visual_hull(
 class _View:
     """A camera, its mask, and for every pixel the distance (pixels) to the mask or to its edge."""
 
-    def __init__(self, camera: Camera, mask: Bool) -> None:
+    def __init__(self, camera: Camera, mask: Bools) -> None:
         mask = np.asarray(mask, bool)
         if mask.shape != (camera.height, camera.width):
             raise ValueError(
@@ -134,7 +132,7 @@ class _View:
         else:
             self.outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
 
-    def cut_off(self, points: Array, radius: float = 0.0) -> Bool:
+    def cut_off(self, points: Array, radius: float = 0.0) -> Bools:
         """Whether balls about `points (M, 3)` reach past an edge where the subject may go on."""
         pixels, depth = self.camera.project(points)
         front = depth > 1e-6
@@ -147,7 +145,7 @@ class _View:
         off |= (y < -0.5 + reach) | (y >= height - 0.5 - reach)
         return np.asarray(front & allowed & off)
 
-    def on_mask(self, points: Array) -> Bool:
+    def on_mask(self, points: Array) -> Bools:
         """Whether `points (M, 3)` fall on a pixel of the mask. The carve's hot loop."""
         c = self.camera
         x, y, z = (c.K @ c.R) @ points.T + (c.K @ c.t)[:, None]
@@ -158,7 +156,7 @@ class _View:
         on[on] = self.mask.ravel()[flat]
         return on
 
-    def balls(self, points: Array, radius: float) -> tuple[Bool, Bool]:
+    def balls(self, points: Array, radius: float) -> tuple[Bools, Bools]:
         """Whether balls about `points (M, 3)` may touch the mask, and surely lie within it."""
         pixels, depth = self.camera.project(points)
         # a ball's outline grows towards the image's edges; 1.5 covers 48 degrees off the axis
@@ -172,7 +170,7 @@ class _View:
         return touches, within
 
 
-def _balls(views: list[_View], points: Array, radius: float, least: int) -> tuple[Bool, Bool]:
+def _balls(views: list[_View], points: Array, radius: float, least: int) -> tuple[Bools, Bools]:
     """Whether balls about `points (M, 3)` may hold a part of the hull, and are wholly inside it."""
     alive, whole = np.arange(len(points)), np.ones(len(points), bool)
     count = np.zeros(len(points), np.int64)
@@ -188,7 +186,7 @@ def _balls(views: list[_View], points: Array, radius: float, least: int) -> tupl
     return out, out & whole
 
 
-def _points(views: list[_View], points: Array, least: int) -> Bool:
+def _points(views: list[_View], points: Array, least: int) -> Bools:
     """Whether `points (M, 3)` are inside the hull."""
     alive, count = np.arange(len(points)), np.zeros(len(points), np.int64)
     for view in views:
@@ -202,9 +200,7 @@ def _points(views: list[_View], points: Array, least: int) -> Bool:
     return out
 
 
-def _carve(
-    views: list[_View], low: Array, spacing: float, shape: NDArray[np.int64], least: int
-) -> Bool:
+def _carve(views: list[_View], low: Array, spacing: float, shape: Ints, least: int) -> Bools:
     """The inside voxels `shape`: blocks of `BLOCK`³, then the voxels of those that are mixed."""
     blocks = -(-shape // BLOCK)
     out = np.zeros((*blocks, BLOCK, BLOCK, BLOCK), bool)
@@ -223,7 +219,7 @@ def _carve(
     return voxels[: shape[0], : shape[1], : shape[2]]
 
 
-def _indices(shape: NDArray[np.int64]) -> NDArray[np.int64]:
+def _indices(shape: Ints) -> Ints:
     """All voxel indices `(M, 3)` of a grid."""
     return np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
 
@@ -260,7 +256,7 @@ def _common_center(views: list[_View]) -> Array:
     return np.asarray(np.linalg.solve(A, b))
 
 
-def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bool:
+def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bools:
     """The pixels `(H, W)` that a mesh covers or its outline touches, as far as it is in front."""
     pixels, depth = camera.project(mesh.vertices)
     faces = mesh.faces[(depth[mesh.faces] > 1e-6).all(axis=1)]
@@ -272,7 +268,7 @@ def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bool:
     return image.astype(bool)
 
 
-def trim_edges(mask: Bool, hair: Bool) -> Bool:
+def trim_edges(mask: Bools, hair: Bools) -> Bools:
     """`mask (H, W)` without the pixels on the image's edges that `hair (H, W)` does not hold.
 
     A neck runs out of most images where the hair does not. The hull of masks trimmed like this

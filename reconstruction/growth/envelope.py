@@ -9,17 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.visual_hull import VoxelGrid
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
-
-def surface_samples(
-    mesh: Mesh, spacing: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def surface_samples(mesh: Mesh, spacing: float) -> tuple[Array, Array, Ints]:
     """Points `(M, 3)` on the mesh no more than about `spacing` metres apart, evenly laid out.
 
     Also their smooth unit normals `(M, 3)` (the vertices', interpolated) and faces `(M,)`.
@@ -102,7 +98,7 @@ def _crossings(
 def carve(
     hull: VoxelGrid,
     cameras: Sequence[Camera],
-    first_surface: Mapping[str, NDArray[np.floating]],
+    first_surface: Mapping[str, AnyFloats],
     margin: float = 0.0,
 ) -> VoxelGrid:
     """The hull without the voxels that some camera saw through (space carving).
@@ -130,7 +126,7 @@ def carve(
     return replace(hull, inside=inside)
 
 
-def depth_map(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:
+def depth_map(camera: Camera, points: AnyFloats) -> Array:
     """Depth `(H, W)` along z, metres: the median of the points on a pixel, 0 where there are none.
 
     A pixel has a point for each projector that reaches it; the lower median of those outvotes a
@@ -147,7 +143,7 @@ def depth_map(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float6
     return out.reshape(camera.height, camera.width)
 
 
-def mesh_depth(camera: Camera, mesh: Mesh) -> NDArray[np.float64]:
+def mesh_depth(camera: Camera, mesh: Mesh) -> Array:
     """Depth `(H, W)` along z of the mesh's nearest surface, infinite where it is not seen.
 
     Faces are painted from far to near, each pixel takes its face's plane: right where faces are

@@ -10,18 +10,16 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.growth.laplace import conjugate_gradients, explicit_diffusion, grid_laplacian
 from reconstruction.report.report import Series
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _PAD = 2
 _ROWS, _COLUMNS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 
 
-def to_tensors(directions: NDArray[np.floating]) -> Array:
+def to_tensors(directions: AnyFloats) -> Array:
     """Structure tensors `(N, 6)` (xx, yy, zz, xy, xz, yz) of lines along `directions (N, 3)`.
 
     `t tᵀ / |t|²`: the same for t and -t, trace 1.
@@ -46,7 +44,7 @@ def principal(tensors: Array) -> tuple[Array, Array]:
     return vectors[:, :, 2], values[:, ::-1]
 
 
-def _within(index: NDArray[np.int64], shape: tuple[int, ...]) -> Bools:
+def _within(index: Ints, shape: tuple[int, ...]) -> Bools:
     """Which of the voxels `index (N, 3)` lie on a grid of `shape`."""
     return np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))
 
@@ -70,8 +68,8 @@ class OrientationField:
     empty: Bools
     degenerate: Bools
     _padded: NDArray[np.int32] = field(init=False)
-    _table: NDArray[np.float32] = field(init=False)
-    _corners: NDArray[np.int64] = field(init=False)
+    _table: Floats = field(init=False)
+    _corners: Ints = field(init=False)
 
     def __post_init__(self) -> None:
         # Two voxels of nothing on each side, so that eight corners are looked up at once without
@@ -100,12 +98,12 @@ class OrientationField:
         away = ndimage.distance_transform_edt(~measured, sampling=self.grid.spacing)
         return np.asarray(away[self.grid.inside] <= reach)
 
-    def voxel(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+    def voxel(self, points: AnyFloats) -> Ints:
         """The number `(N,)` of the envelope voxel that holds each point, -1 outside."""
         number = self._padded.ravel()[self._flat(self.grid.index(points))]
         return np.where(number == len(self.directions), -1, number).astype(np.int64)
 
-    def sample(self, points: NDArray[np.floating], along: Array) -> tuple[Array, Bools]:
+    def sample(self, points: AnyFloats, along: Array) -> tuple[Array, Bools]:
         """Directions `(N, 3)` at `points (N, 3)`, each signed to turn least from `along (N, 3)`.
 
         The eight voxels around a point are interpolated trilinearly after their signs are made to
@@ -127,14 +125,14 @@ class OrientationField:
         good = norm > 1e-6
         return np.where(good[:, None], total / np.where(good, norm, 1.0)[:, None], 0.0), good
 
-    def _flat(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _flat(self, index: Ints) -> Ints:
         """Places `(N,)` in the padded volume; voxels far off the grid fall on its rim."""
         shape = self._padded.shape
         inside = np.clip(index + _PAD, 0, np.array(shape) - 2)
         return np.asarray(inside @ self._strides(shape))
 
     @staticmethod
-    def _strides(shape: tuple[int, ...]) -> NDArray[np.int64]:
+    def _strides(shape: tuple[int, ...]) -> Ints:
         return np.array([shape[1] * shape[2], shape[2], 1])
 
 
@@ -154,10 +152,10 @@ class FieldOptions:
 
 def gather(
     grid: VoxelGrid,
-    points: NDArray[np.floating],
-    directions: NDArray[np.floating],
-    weights: NDArray[np.floating],
-) -> tuple[NDArray[np.int64], Array, Array]:
+    points: AnyFloats,
+    directions: AnyFloats,
+    weights: AnyFloats,
+) -> tuple[Ints, Array, Array]:
     """Data per voxel: numbers `(D,)` of the voxels hit, mean tensors `(D, 6)`, weights `(D,)`.
 
     Points outside the envelope are given to the nearest of the 26 neighbours that is inside, or
@@ -186,10 +184,10 @@ def gather(
 
 def solve_field(
     grid: VoxelGrid,
-    points: NDArray[np.floating],
-    directions: NDArray[np.floating],
-    weights: NDArray[np.floating] | None = None,
-    boundary: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    points: AnyFloats,
+    directions: AnyFloats,
+    weights: AnyFloats | None = None,
+    boundary: tuple[AnyFloats, AnyFloats] | None = None,
     options: FieldOptions = FieldOptions(),
 ) -> tuple[OrientationField, list[Series]]:
     """Spread measured lines through the envelope: Laplace's equation for each tensor entry.
@@ -237,7 +235,7 @@ class FieldSystem:
     empty: Bools
 
     @property
-    def free(self) -> NDArray[np.int64]:
+    def free(self) -> Ints:
         """Numbers `(F,)` of the voxels to solve for."""
         return np.flatnonzero(~self.fixed & ~self.empty)
 
@@ -251,10 +249,10 @@ class FieldSystem:
 
 def field_system(
     grid: VoxelGrid,
-    points: NDArray[np.floating],
-    directions: NDArray[np.floating],
-    weights: NDArray[np.floating] | None = None,
-    boundary: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    points: AnyFloats,
+    directions: AnyFloats,
+    weights: AnyFloats | None = None,
+    boundary: tuple[AnyFloats, AnyFloats] | None = None,
 ) -> FieldSystem:
     """The linear system of `solve_field`, which says what the arguments are and what it raises."""
     count = int(grid.inside.sum())

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.growth.field import OrientationField
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Method = Literal["euler", "midpoint", "rk4"]
 
 _TOGETHER = 2000
@@ -24,14 +22,14 @@ _TOGETHER = 2000
 class Paths:
     """Traced polylines as columns: `points (T, N, 3) float32`, of which path i has `counts[i]`."""
 
-    points: NDArray[np.float32]
-    counts: NDArray[np.int64]
+    points: Floats
+    counts: Ints
 
 
 def trace(
     field: OrientationField,
-    starts: NDArray[np.floating],
-    along: NDArray[np.floating],
+    starts: AnyFloats,
+    along: AnyFloats,
     *,
     step: float = 5e-4,
     max_length: float = 0.3,
@@ -87,7 +85,7 @@ def _advance(
     return (d + 2 * k2 + 2 * k3 + k4) / 6, np.ones(len(p), bool)
 
 
-def to_polylines(paths: Paths) -> list[NDArray[np.float32]]:
+def to_polylines(paths: Paths) -> list[Floats]:
     """The paths as a list of `(n_i, 3)` arrays."""
     columns = np.ascontiguousarray(paths.points.transpose(1, 0, 2))
     return [columns[i, :n] for i, n in enumerate(paths.counts)]
@@ -95,8 +93,8 @@ def to_polylines(paths: Paths) -> list[NDArray[np.float32]]:
 
 def grow_from_roots(
     field: OrientationField,
-    roots: NDArray[np.floating],
-    normals: NDArray[np.floating],
+    roots: AnyFloats,
+    normals: AnyFloats,
     *,
     step: float = 5e-4,
     max_length: float = 0.3,
@@ -105,7 +103,7 @@ def grow_from_roots(
     to_measured: bool = False,
     method: Method = "midpoint",
     threads: int | None = None,
-) -> list[NDArray[np.float32]]:
+) -> list[Floats]:
     """Strands from `roots (N, 3)`, setting out along the scalp's `normals (N, 3)`.
 
     A root whose envelope stays clear of the skin is led to it along the normal, by at most `lift`
@@ -119,7 +117,7 @@ def grow_from_roots(
     at: Array = np.asarray(roots, np.float64)
     out_of: Array = np.asarray(normals, np.float64)
 
-    def some(first: int) -> list[NDArray[np.float32]]:
+    def some(first: int) -> list[Floats]:
         these = slice(first, first + _TOGETHER)
         p, n = at[these], out_of[these]
         starts, found = p.copy(), np.zeros(len(p), bool)
@@ -147,7 +145,7 @@ def grow_from_roots(
         return [path for part in parts for path in part]
 
 
-def _last_measured(field: OrientationField, path: NDArray[np.float32]) -> int:
+def _last_measured(field: OrientationField, path: Floats) -> int:
     """Index of the path's last point in a measured voxel, 0 where there is none."""
     number = field.voxel(path)
     return int(np.flatnonzero((number >= 0) & field.measured[number]).max(initial=0))
@@ -160,12 +158,12 @@ class Coverage:
         self.field = field
         self.covered = np.zeros(len(field.directions), bool)
 
-    def add(self, points: NDArray[np.floating]) -> None:
+    def add(self, points: AnyFloats) -> None:
         """Mark the voxels that `points (N, 3)` lie in."""
         n = self.field.voxel(points)
         self.covered[n[n >= 0]] = True
 
-    def gaps(self) -> NDArray[np.int64]:
+    def gaps(self) -> Ints:
         """Numbers of the voxels with an orientation and no strand."""
         return np.flatnonzero(self.field.valid & ~self.covered)
 
@@ -181,7 +179,7 @@ def fill_gaps(
     within: float | None = None,
     batch: int = 1500,
     rounds: int = 120,
-) -> list[NDArray[np.float32]]:
+) -> list[Floats]:
     """Strands through the voxels that no strand passes, traced both ways from random ones.
 
     Only voxels within `within` metres of a measured one are set out from: Photobooth §3.4 deletes
@@ -191,7 +189,7 @@ def fill_gaps(
     of the next. Paths shorter than `shortest` metres are not kept.
     """
     rng = np.random.default_rng(seed)
-    out: list[NDArray[np.float32]] = []
+    out: list[Floats] = []
     spent = ~field.near_measured(max(3e-3, 2 * field.grid.spacing) if within is None else within)
     centers = field.grid.centers()
     for _ in range(rounds):

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
@@ -16,9 +16,6 @@ from reconstruction.growth.envelope import carve, depth_map, inside_mesh, mesh_d
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Stage
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _BARE = 2e-3
 """Metres behind the head's surface up to which a pixel of skin rules hair out."""

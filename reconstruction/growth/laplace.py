@@ -7,20 +7,18 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.report.report import Series
-
-Array = NDArray[np.float64]
 
 _COARSEST = 3000
 _OVERCORRECTION = 1.8
 """Constant interpolation over 2x2x2 blocks makes the coarse operator up to twice too stiff."""
 
 
-def grid_laplacian(inside: NDArray[np.bool_]) -> sparse.csr_array:
+def grid_laplacian(inside: Bools) -> sparse.csr_array:
     """The graph Laplacian `(M, M)` of the M marked voxels of `inside`, C order, six neighbours.
 
     Symmetric, rows sum to 0: no flux passes the volume's surface. Its unit is 1 / spacing².

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Floats
 from reconstruction.head.scalp import Scalp
-
-Polyline = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 _STRIDE = 4
 """Every fourth point of a strand stands for it in the search: the growth's step is short."""
@@ -28,15 +25,15 @@ class Rooted:
     `dropped` found neither.
     """
 
-    strands: list[Polyline]
+    strands: list[Floats]
     to_scalp: int
     joined: int
     dropped: int
 
 
 def root_all(
-    rooted: list[Polyline],
-    loose: list[Polyline],
+    rooted: list[Floats],
+    loose: list[Floats],
     scalp: Scalp,
     *,
     near_scalp: float = 8e-3,
@@ -58,7 +55,7 @@ def root_all(
         return Rooted(strands, 0, 0, 0)
     below = _Below(scalp, highest)
     height = below.heights(_ends(loose))
-    waiting: list[Polyline] = []
+    waiting: list[Floats] = []
     for path, h in zip(loose, height, strict=True):
         if h.min() > near_scalp:
             waiting.append(path)
@@ -93,11 +90,11 @@ class _Below:
         """Distance `(...)` of `points (..., 3)` to the scalp, metres."""
         return np.asarray(self._tree.query(points)[0])
 
-    def lead_lower(self, path: Polyline, heights: Array) -> Polyline:
+    def lead_lower(self, path: Floats, heights: Array) -> Floats:
         """`lead` from the lower end; `heights (2,)` are those of both."""
         return self.lead(path if heights[0] <= heights[1] else path[::-1])
 
-    def lead(self, path: Polyline) -> Polyline:
+    def lead(self, path: Floats) -> Floats:
         """The path with a way from the scalp before it: out along its normal, then into the path.
 
         It rises at about 45 degrees, a cubic in Hermite's form.
@@ -118,18 +115,18 @@ class _Below:
         return np.concatenate([way.astype(np.float32), path])
 
 
-def _ends(paths: list[Polyline]) -> Array:
+def _ends(paths: list[Floats]) -> Array:
     """First and last points `(N, 2, 3)`."""
     return np.stack([[p[0] for p in paths], [p[-1] for p in paths]], axis=1).astype(float)
 
 
 def _join_round(
-    strands: list[Polyline],
-    loose: list[Polyline],
+    strands: list[Floats],
+    loose: list[Floats],
     reach: float,
     least_cosine: float,
     below: _Below,
-) -> tuple[list[Polyline], list[Polyline]]:
+) -> tuple[list[Floats], list[Floats]]:
     """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
     points = np.concatenate(strands)
     counts = np.array([len(s) for s in strands])
@@ -170,7 +167,7 @@ def _join_round(
     return attached, left
 
 
-def _beside(guide: Array, path: Polyline) -> Polyline:
+def _beside(guide: Array, path: Floats) -> Floats:
     """The path with a way to the guide's root before it, parallel to the guide where they meet."""
     offset = path[0] - guide[-1]
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1))])

@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.strands import smoothed
 from reconstruction.tangents.estimate import Measured
-
-Array = NDArray[np.float64]
-Polyline = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ class LineCloud:
 
 def surface_strands(
     lines: Measured, options: SurfaceOptions = SurfaceOptions(), *, seed: int = 0, batch: int = 2000
-) -> list[Polyline]:
+) -> list[Floats]:
     """Polylines `(n, 3)` through measured lines, both ways from lines that none passes yet.
 
     Lines are taken `batch` at a time in an order drawn by `seed`.
@@ -123,7 +120,7 @@ def surface_strands(
     cloud = LineCloud(lines, options)
     order = np.random.default_rng(seed).permutation(len(lines.points))
     spent = np.zeros(len(order), bool)
-    out: list[Polyline] = []
+    out: list[Floats] = []
     while len(order := order[~spent[order]]):
         chosen = order[:batch]
         spent[chosen] = True
@@ -145,7 +142,7 @@ def _spend(
     cloud: LineCloud,
     lines: Measured,
     paths: list[Array],
-    spent: NDArray[np.bool_],
+    spent: Bools,
     options: SurfaceOptions,
 ) -> None:
     """Mark the lines that `paths` pass along."""

@@ -6,18 +6,15 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.growth.envelope import surface_samples
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import MOTIONS, Pose, Surface, find_pose, similarity, tukey
 from reconstruction.head.shape import ShapeOptions, bend
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FEWEST = 10
 """Points under which no head is fitted: a pose alone has seven unknowns."""
@@ -82,14 +79,14 @@ class HeadFit:
 
 
 def fit_head(
-    points: NDArray[np.floating],
-    normals: NDArray[np.floating] | None = None,
+    points: AnyFloats,
+    normals: AnyFloats | None = None,
     template: Mesh | None = None,
     *,
     part: Part = "head",
-    landmarks: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    landmarks: tuple[AnyFloats, AnyFloats] | None = None,
     turn: float | None = None,
-    guides: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
+    guides: tuple[AnyFloats, AnyFloats] | None = None,
     any_unit: bool = False,
     shape: ShapeOptions = ShapeOptions(),  # noqa: B008  frozen
     seed: int = 0,
@@ -185,7 +182,7 @@ def _faces(template: Mesh, part: str) -> Bools:
 def _with(
     points: Array,
     normals: Array | None,
-    guides: tuple[NDArray[np.floating], NDArray[np.floating]] | None,
+    guides: tuple[AnyFloats, AnyFloats] | None,
 ) -> tuple[Array, Array | None]:
     if guides is None:
         return points, normals

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.files.points import read_points
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
@@ -21,9 +21,6 @@ from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.masks import HairMask, distance_to
 from reconstruction.report.report import Stage
 from reconstruction.tangents.reflection import surface_normals
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FEWEST_SKIN = 300
 """Cells with a point of skin under which a head is not guessed from them."""
@@ -230,6 +227,6 @@ def _thinned(points: Array, normals: Array | None) -> tuple[Array, Array | None]
     return points[first], None if normals is None else normals[first]
 
 
-def _one_a_cell(points: Array) -> NDArray[np.int64]:
+def _one_a_cell(points: Array) -> Ints:
     cell = np.floor(points / _CELL).astype(np.int64)
     return np.sort(np.unique(cell, axis=0, return_index=True)[1])

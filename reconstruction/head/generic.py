@@ -5,14 +5,13 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from skimage.measure import marching_cubes
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.signed_distance import blend, capsule, carve, ellipsoid
-
-Array = NDArray[np.float64]
 
 HEAD_BOX = np.array([[-0.15, -0.19, -0.20], [0.15, 0.19, 0.19]])
 """Corners `(2, 3)` of a box, metres, that holds the head with room around it."""

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array, Ints
 
 MOTIONS = ("turn x", "turn y", "turn z", "scale", "shift x", "shift y", "shift z")
 """The seven ways in which a similarity can change, in the order of every `(7,)` here."""
@@ -35,7 +34,7 @@ class Surface:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_tree", cKDTree(self.points))
 
-    def nearest(self, points: Array, limit: float) -> tuple[Array, NDArray[np.int64]]:
+    def nearest(self, points: Array, limit: float) -> tuple[Array, Ints]:
         """Distances `(N,)`, never over `limit`, and samples `(N,)`: any beyond that, it is slow."""
         distance, index = self._tree.query(points, distance_upper_bound=limit)
         return np.minimum(distance, limit), np.where(np.isfinite(distance), index, 0)

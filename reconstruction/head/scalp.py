@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.growth.envelope import surface_samples
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _LIFTS = np.arange(1, 7) * 2e-3
 """Metres above the skin at which hair is looked for: the envelope may stay clear of the head."""

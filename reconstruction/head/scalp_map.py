@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
-
-Array = NDArray[np.float64]
 
 _SPACING = 2e-2
 """Of samples for the closest point, as a share of the scalp's extent."""
@@ -75,7 +73,7 @@ class ScalpMap:
             raise ValueError("the other head must have the same faces")
         return ScalpMap(Mesh(head.vertices, head.faces, self.head.scalp), self.uv)
 
-    def __call__(self, points: NDArray[np.floating]) -> tuple[Array, Array]:
+    def __call__(self, points: AnyFloats) -> tuple[Array, Array]:
         """(u, v) `(N, 2)` at the scalp's closest point to `points (N, 3)`, and its distance."""
         face, weights, distance = self._closest(points)
         uv = np.einsum("nc,ncd->nd", weights, self.uv[self.head.faces[face]])
@@ -89,7 +87,7 @@ class ScalpMap:
         return np.asarray(ratio / np.average(ratio, weights=areas))
 
 
-def _scalp(head: Mesh) -> NDArray[np.bool_]:
+def _scalp(head: Mesh) -> Bools:
     if head.scalp is None or not head.scalp.any():
         raise ValueError("the head marks no scalp: mark it in the OBJ, or let mark_scalp do so")
     return head.scalp

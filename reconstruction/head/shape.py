@@ -11,16 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.growth.envelope import surface_samples
 from reconstruction.head.pose import Surface, tukey
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _NEAR = 8
 
@@ -46,7 +43,7 @@ class Handles:
 
     at: Array
     reach: float
-    links: NDArray[np.int64]
+    links: Ints
 
     @classmethod
     def on(cls, points: Array, count: int) -> Handles:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from reconstruction.arrays import Bools
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.head.fit import HeadFit, HeadFitError, mark_scalp
 
@@ -52,7 +52,7 @@ def _largest_piece(mesh: Mesh) -> Mesh:
     return _faces_only(mesh, piece == np.bincount(piece).argmax())
 
 
-def _faces_only(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
+def _faces_only(mesh: Mesh, keep: Bools) -> Mesh:
     """The mesh of some faces, without the vertices that none of them uses."""
     used, faces = np.unique(mesh.faces[keep], return_inverse=True)
     scalp = None if mesh.scalp is None else mesh.scalp[keep]

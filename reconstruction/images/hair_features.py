@@ -9,14 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.images.orientation import LogGaborBank, texture
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MATTE_CONTRAST = 1.29  # sqrt(1/6 - 1/16) / (1/4): cosine over all directions, deviation over mean
 
@@ -28,7 +25,7 @@ _ONE_CLASS = 3.0
 """Deviations between classes' means under which they are one: 2.65 for a Gaussian cut in two."""
 
 
-def light_contrast(capture: Capture, camera: str, subject: Mask, lights: int = 96) -> Array | None:
+def light_contrast(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Array | None:
     """How unlike a matte surface each pixel answers single lamps: log ratio `(H, W)`, 0 for matte.
 
     The deviation over the mean of the answers to a dome of lamps is 1.29 for a matte surface in the
@@ -50,7 +47,7 @@ def light_contrast(capture: Capture, camera: str, subject: Mask, lights: int = 9
     return np.asarray(np.where(subject, smooth, 0.0))
 
 
-def line_strength(lit: NDArray[np.floating], subject: Mask) -> Array:
+def line_strength(lit: AnyFloats, subject: Bools) -> Array:
     """How strongly oriented filters answer the relative detail of a `lit (H, W)` picture: log.
 
     The log-Gabor bank's mean answer at a wavelength of three pixels, averaged in the subject by a
@@ -63,7 +60,7 @@ def line_strength(lit: NDArray[np.floating], subject: Mask) -> Array:
 
 
 def tell_apart(
-    features: Mapping[str, Array], subjects: Mapping[str, Mask]
+    features: Mapping[str, Array], subjects: Mapping[str, Bools]
 ) -> dict[str, Array] | None:
     """Scores `(H, W)` by camera, above 0 for hair, from its `features (F, H, W)`, larger for hair.
 

@@ -8,11 +8,9 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Images = NDArray[np.floating]
-Bools = NDArray[np.bool_]
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 
 _FAINTEST = 1e-5
 """Relative detail that is rounding in single precision and not texture."""
@@ -41,7 +39,7 @@ class LogGaborBank:
                 f"spread > 0, got {self}"
             )
 
-    def filters(self, height: int, width: int) -> Iterator[NDArray[np.float32]]:
+    def filters(self, height: int, width: int) -> Iterator[Floats]:
         """The `count` transfer functions `(height, width)`, in the layout of `fft2`.
 
         Filter k answers to lines at k · 180°/count from +x towards +y: its own frequencies are
@@ -60,7 +58,7 @@ class LogGaborBank:
             delta = (angle - own + np.pi) % (2 * np.pi) - np.pi
             yield np.asarray(radial * np.exp(-(delta**2) / (2 * sigma**2)), np.float32)
 
-    def responses(self, images: Images) -> NDArray[np.float32]:
+    def responses(self, images: AnyFloats) -> Floats:
         """Magnitudes `(count, H, W)` of the answers to an image `(H, W)`, mirrored at its edges.
 
         Of a stack `(N, H, W)`, the sum of the magnitudes.
@@ -74,7 +72,7 @@ class LogGaborBank:
             out += one
         return out
 
-    def answer(self, image: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    def answer(self, image: Floats, out: Floats) -> None:
         """Write the magnitudes `(count, H, W)` of the answers to one image into `out`.
 
         A filter's frequencies lie in a narrow wedge: only its rows (or columns, if these are fewer)
@@ -108,9 +106,7 @@ _NEGLIGIBLE = 1e-6
 
 
 @lru_cache(maxsize=4)
-def _wedges(
-    bank: LogGaborBank, height: int, width: int
-) -> list[tuple[int, NDArray[np.int64], NDArray[np.float32]]]:
+def _wedges(bank: LogGaborBank, height: int, width: int) -> list[tuple[int, Ints, Floats]]:
     """Each filter's axis to transform first, the lines along it that are not 0, and their values.
 
     Axis 1 has rows `(R, width)`, axis 0 columns `(height, C)`.
@@ -134,11 +130,11 @@ class OrientationMap:
     for a single orientation. It is 0 outside the mask.
     """
 
-    angle: NDArray[np.float32]
-    confidence: NDArray[np.float32]
+    angle: Floats
+    confidence: Floats
 
 
-def texture(image: Images, mask: Bools, scale: float = 4.0) -> NDArray[np.float32]:
+def texture(image: AnyFloats, mask: Bools, scale: float = 4.0) -> Floats:
     """The image's relative detail `(H, W)`: over its mean near by in the mask, less 1.
 
     The mean is a Gaussian one of `scale` pixels. Detail is 0 outside the mask, so the hair's
@@ -157,7 +153,7 @@ Merge = Literal["angles", "responses"]
 
 
 def orientations(
-    images: Images,
+    images: AnyFloats,
     mask: Bools,
     bank: LogGaborBank = LogGaborBank(),
     merge: Merge = "angles",
@@ -193,8 +189,8 @@ def orientations(
 
 
 def _of_averaged_angles(
-    images: Images, mask: Bools, bank: LogGaborBank, responses: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    images: AnyFloats, mask: Bools, bank: LogGaborBank, responses: Floats
+) -> tuple[Array, Array]:
     total = np.zeros(mask.shape, np.complex128)
     weight = np.zeros(mask.shape)
     for image in images:
@@ -206,8 +202,8 @@ def _of_averaged_angles(
 
 
 def _of_summed_responses(
-    images: Images, mask: Bools, bank: LogGaborBank, responses: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    images: AnyFloats, mask: Bools, bank: LogGaborBank, responses: Floats
+) -> tuple[Array, Array]:
     total = np.zeros_like(responses)
     bright = float(np.abs(images[:, mask]).mean()) if mask.any() and len(images) else 0.0
     for image in images:
@@ -221,8 +217,8 @@ def _of_summed_responses(
 
 
 def _winner(
-    responses: NDArray[np.float32],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    responses: Floats,
+) -> tuple[Array, Array, Array]:
     """Angle of the strongest answer below a bin, its confidence and strength; each `(H, W)`."""
     count = len(responses)
     peak = responses[0].copy()

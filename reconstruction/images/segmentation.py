@@ -10,7 +10,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from reconstruction.arrays import AnyFloats, Array, Bools
 
 
 class NetworkError(ValueError):
@@ -34,7 +35,7 @@ class Network:
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
-    def hair_pixels(self, image: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def hair_pixels(self, image: AnyFloats) -> Bools:
         """The hair's pixels `(H, W)` of a scene-linear picture `(H, W, 3)`; raises as above."""
         height, width = image.shape[:2]
         picture = cv2.resize(
@@ -81,7 +82,7 @@ class Network:
             raise NetworkError(f"{self.file}: not an ONNX network ({error.err})") from error
 
 
-def _srgb(image: NDArray[np.floating]) -> NDArray[np.float64]:
+def _srgb(image: AnyFloats) -> Array:
     """Exposed to a white of the 99th percentile, display-coded (IEC 61966-2-1)."""
     white = float(np.percentile(image, 99))
     linear = np.clip(image / white, 0, 1) if white > 0 else np.zeros(image.shape)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import AnyFloats, Bools, Floats
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.undistorted import StraightenedCapture
 
@@ -19,7 +19,7 @@ class NoSilhouette(ValueError):
     """A camera without the frames that a silhouette needs."""
 
 
-def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
+def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> Floats:
     """Mean of the camera's dark frames `(H, W, 3)`; zeros where none was shot.
 
     With `exposure`, only the dark frames at the nearest exposure count.
@@ -34,12 +34,12 @@ def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> ND
     return np.mean([capture.frame(s, camera) for s in steps], axis=0)
 
 
-def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> NDArray[np.float32]:
+def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> Floats:
     """`dark_rgb`'s mean over the channels `(H, W)`."""
     return np.asarray(dark_rgb(capture, camera, exposure).mean(axis=-1))
 
 
-def background_noise(image: NDArray[np.floating]) -> float:
+def background_noise(image: AnyFloats) -> float:
     """Standard deviation of the unlit pixels of a dark-subtracted `image (...)`.
 
     Noise about zero is symmetric and the subject only adds light, so the values below zero are the
@@ -49,12 +49,12 @@ def background_noise(image: NDArray[np.floating]) -> float:
     return 1.4826 * float(np.median(below)) if below.size else 0.0
 
 
-def lit_image(capture: Capture, camera: str) -> NDArray[np.float32]:
+def lit_image(capture: Capture, camera: str) -> Floats:
     """`lit_rgb`'s mean over the channels `(H, W)`."""
     return np.asarray(lit_rgb(capture, camera).mean(axis=-1))
 
 
-def lit_rgb(capture: Capture, camera: str) -> NDArray[np.float32]:
+def lit_rgb(capture: Capture, camera: str) -> Floats:
     """The subject under as many lamps as the capture has, less the dark frame `(H, W, 3)`.
 
     The all-on frames' mean at full level, else the sum of the OLAT frames, else the first tracking
@@ -67,7 +67,7 @@ def lit_rgb(capture: Capture, camera: str) -> NDArray[np.float32]:
     raise NoSilhouette(f"{capture.path}: {camera} has no all_on, olat or tracking frame")
 
 
-def silhouette(capture: Capture, camera: str) -> NDArray[np.bool_]:
+def silhouette(capture: Capture, camera: str) -> Bools:
     """Pixels `(H, W)` where the subject adds light: above the noise, specks removed, holes filled.
 
     Raises `NoSilhouette` where the camera has no frame to tell from.
@@ -87,15 +87,15 @@ def silhouette(capture: Capture, camera: str) -> NDArray[np.bool_]:
     return np.asarray(_fill_pinholes(mask))
 
 
-def _fill_pinholes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _fill_pinholes(mask: Bools) -> Bools:
     """Close holes of under `SMALLEST` pixels; larger ones are what one sees through a curl."""
     holes, count = ndimage.label(~mask)
     area = np.bincount(holes.ravel(), minlength=count + 1)
     return mask | ((area < SMALLEST)[holes] & ~mask)
 
 
-def _sum(capture: Capture, camera: str, steps: list[Step]) -> NDArray[np.float32]:
-    dark: dict[float, NDArray[np.float32]] = {}
+def _sum(capture: Capture, camera: str, steps: list[Step]) -> Floats:
+    dark: dict[float, Floats] = {}
     c = capture.rig.camera(camera)
     total = np.zeros((c.height, c.width, 3), np.float32)
     for step in steps:

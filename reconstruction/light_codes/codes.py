@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Bools, Floats
+
 Words = NDArray[np.uint32]
-Bools = NDArray[np.bool_]
-Images = NDArray[np.floating]
 
 WORD = 32
 
@@ -48,7 +48,7 @@ def unpack(words: Words, count: int) -> Bools:
     return np.unpackbits(raw, axis=-1, bitorder="little", count=count).astype(bool)
 
 
-def match(a: Words, b: Words, asked: Words) -> NDArray[np.float32]:
+def match(a: Words, b: Words, asked: Words) -> Floats:
     """Share of equal bits among those `asked`: `(...)` of `(..., W)` words; 1 where none is."""
     equal = np.bitwise_count(~(a ^ b) & asked).sum(axis=-1, dtype=np.int64)
     total = np.bitwise_count(asked).sum(axis=-1, dtype=np.int64)
@@ -72,9 +72,7 @@ camera, what stands beside that light counted as hidden though it sees the pixel
 """
 
 
-def along_lines(
-    images: NDArray[np.float32], angle: NDArray[np.floating], half: int = 4
-) -> NDArray[np.float32]:
+def along_lines(images: Floats, angle: AnyFloats, half: int = 4) -> Floats:
     """Means of `images (L, H, W)` over `half` pixels to both sides along the line at each pixel.
 
     Shadows run along strands for some millimetres, noise does not; across a strand they change.
@@ -89,7 +87,7 @@ def along_lines(
 
 
 def code_map(
-    responses: Images,
+    responses: AnyFloats,
     mask: Bools,
     furthest: int,
     noise: float = 0.0,

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.visual_hull import VoxelGrid, visual_hull
 from reconstruction.growth.envelope import inside_mesh
-
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 def hair_volume(
@@ -22,7 +19,7 @@ def hair_volume(
     subject: Mapping[str, Bools],
     head: Mesh | None,
     spacing: float,
-    bounds: NDArray[np.float64] | None = None,
+    bounds: Array | None = None,
 ) -> VoxelGrid:
     """Voxels that can hold hair: in the hull of the masks `(H, W)` of the subject, off the head.
 

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.light_codes.views import View
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ def _grow(
     views: Sequence[View], tips: Array, heading: Array, options: ExtensionOptions
 ) -> list[Array]:
     """The points `(n_i, 3)` that follow each tip."""
-    columns: list[tuple[NDArray[np.int64], Array]] = []
+    columns: list[tuple[Ints, Array]] = []
     active, p, d = np.arange(len(tips)), tips.copy(), heading.copy()
     least = fewest_views(len(views))
     for _ in range(int(options.longest / options.step)):

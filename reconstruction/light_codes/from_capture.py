@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -16,9 +16,6 @@ from reconstruction.images.silhouettes import background_noise, dark_frame
 from reconstruction.light_codes.codes import along_lines, code_map
 from reconstruction.light_codes.views import View, furthest_light, light_beside, line_vectors
 from reconstruction.report.report import Progress, Stage, silent
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float32]
 
 
 def views_of(

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.growth.envelope import surface_samples
@@ -18,8 +18,6 @@ from reconstruction.light_codes.segments import Segments
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
-
-Array = NDArray[np.float64]
 
 
 def line_strands(

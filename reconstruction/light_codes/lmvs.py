@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import Pixels, line_through
-from reconstruction.light_codes.search import DepthSearch, Floats
+from reconstruction.light_codes.search import DepthSearch
 
 FAN = np.radians(np.linspace(-50, 50, 5))
 """Inclinations towards the camera at which a line is tried at every depth."""
@@ -28,7 +29,7 @@ ROUNDS = 3
 class LmvsSearch(DepthSearch):
     """Searches depth and inclination; same inputs and outputs as `DepthSearch`."""
 
-    def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def visible(self, view: int, y: Ints, x: Ints) -> Bools:
         """All neighbours `(P, N)`: nothing says which of them see a pixel."""
         return np.ones((len(x), len(self.neighbours[view])), bool)
 
@@ -71,7 +72,7 @@ class LmvsSearch(DepthSearch):
             line.misfit.numpy(),
         )
 
-    def _in_plane(self, view: int, x: NDArray[np.int64], y: NDArray[np.int64]) -> Any:
+    def _in_plane(self, view: int, x: Ints, y: Ints) -> Any:
         """A function from inclinations to unit directions in the plane of each pixel's line."""
         own, t = self.views[view], self.types
         pixel = np.stack([x, y], axis=1).astype(float)

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.visual_hull import VoxelGrid
@@ -28,8 +28,6 @@ from reconstruction.light_codes.views import View
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
-
-Array = NDArray[np.float64]
 
 
 def look_at_hair(
@@ -164,7 +162,7 @@ def _metres(polylines: list[Array]) -> float:
     return float(sum(np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in polylines))
 
 
-def _percentiles(values: NDArray[np.floating]) -> dict[str, float]:
+def _percentiles(values: AnyFloats) -> dict[str, float]:
     if not len(values):
         return {}
     return {f"p{q}": float(np.percentile(values, q)) for q in (10, 50, 90)}

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.array_backend import array_types, for_kernels
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.light_codes.codes import unpack
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import (
@@ -19,9 +20,6 @@ from reconstruction.light_codes.objective import (
     line_through,
 )
 from reconstruction.light_codes.views import View, nearest_views
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 FEW_SAMPLES = 3
 """Points of a segment in the first stage. Sun's compares lightcodes alone there, which change too
@@ -75,14 +73,14 @@ class DepthMap:
     [0, 1]; `spread` and `misfit` as in `objective.Line`; `seen_by` counts the visible neighbours.
     """
 
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
+    x: Ints
+    y: Ints
     depth: Floats
     direction: Floats
     agreement: Floats
     spread: Floats
     misfit: Floats
-    seen_by: NDArray[np.int64]
+    seen_by: Ints
 
 
 class DepthSearch:
@@ -101,7 +99,7 @@ class DepthSearch:
         self.device = DeviceViews(self.types, views)
         self.neighbours = nearest_views(views, subject, options.neighbours)
 
-    def visible(self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def visible(self, view: int, y: Ints, x: Ints) -> Bools:
         """Which neighbours see the pixels `(P, N)`: a light beside them reaches the pixel.
 
         A neighbour without a light beside it is taken to see what it stands near to.
@@ -115,9 +113,7 @@ class DepthSearch:
         ]
         return np.stack(sees, axis=1) if sees else np.zeros((len(x), 0), bool)
 
-    def pixels(
-        self, view: int, y: NDArray[np.int64], x: NDArray[np.int64]
-    ) -> tuple[Pixels, NDArray[np.int64]]:
+    def pixels(self, view: int, y: Ints, x: Ints) -> tuple[Pixels, Ints]:
         """The pixels as lanes, and how many neighbours see each `(P,)`."""
         t, own = self.types, self.views[view]
         visible = self.visible(view, y, x)

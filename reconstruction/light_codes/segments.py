@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.light_codes.search import DepthMap
 from reconstruction.light_codes.views import View
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +24,8 @@ class Segments:
     points: Array
     directions: Array
     confidence: Array
-    view: NDArray[np.int64]
-    supports: NDArray[np.int64]
+    view: Ints
+    supports: Ints
 
     def __len__(self) -> int:
         return len(self.points)

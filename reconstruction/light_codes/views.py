@@ -6,14 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Bools, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.light_codes.codes import CodeMap
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 BESIDE_DEG = 5.0
 """Degrees, seen from the subject, within which a light counts as standing beside a camera."""
@@ -29,17 +27,17 @@ class View:
 
     camera: Camera
     mask: Bools
-    lines: NDArray[np.float32]
+    lines: Floats
     codes: CodeMap
     beside: int
 
     @property
-    def confidence(self) -> NDArray[np.float32]:
+    def confidence(self) -> Floats:
         """Confidence `(H, W)` of the lines."""
         return np.hypot(self.lines[..., 0], self.lines[..., 1])
 
 
-def line_vectors(angle: ArrayLike, confidence: ArrayLike) -> NDArray[np.float32]:
+def line_vectors(angle: ArrayLike, confidence: ArrayLike) -> Floats:
     """Lines `(..., 2)` from angles and confidences `(...)`."""
     a, w = np.asarray(angle, float), np.asarray(confidence, float)
     return np.stack([w * np.cos(a), w * np.sin(a)], axis=-1).astype(np.float32)

@@ -6,8 +6,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.projectors import Projector
@@ -52,9 +53,7 @@ class RigConditioning:
         return asdict(self)
 
 
-def ray_plane_angles(
-    camera: Camera, projector: Projector, points: ArrayLike
-) -> NDArray[np.float64]:
+def ray_plane_angles(camera: Camera, projector: Projector, points: ArrayLike) -> Array:
     """Angles `(N,)` in [0, π/2] between the camera's rays to `points (N, 3)` and the planes.
 
     The plane of a point is that of the (fractional) row that lights it. Near 0 the depth along the
@@ -67,7 +66,7 @@ def ray_plane_angles(
     return np.asarray(np.arcsin(np.clip(np.abs((rays * normals).sum(axis=1)), 0, 1)))
 
 
-def row_pitch(projector: Projector, points: ArrayLike) -> NDArray[np.float64]:
+def row_pitch(projector: Projector, points: ArrayLike) -> Array:
     """Distance `(N,)` across the light plane between rows at `points (N, 3)`, metres."""
     points = np.asarray(points, float).reshape(-1, 3)
     y = (points @ projector.R.T + projector.t)[:, 1:]
@@ -87,7 +86,7 @@ def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigC
     points = dome_positions(4000, radius)
     normals = points / radius
 
-    def faces(device: Camera | Projector) -> NDArray[np.bool_]:
+    def faces(device: Camera | Projector) -> Bools:
         to = device.center - points
         cosine = (to * normals).sum(axis=1) / np.linalg.norm(to, axis=1)
         pixels, depth = device.project(points)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.light_planes.point_cloud import PointCloud
 
-Array = NDArray[np.float64]
 
-
-def supported(points: Array, neighbours: int, isolation: float) -> NDArray[np.bool_]:
+def supported(points: Array, neighbours: int, isolation: float) -> Bools:
     """Which `points (N, 3)` are not outliers `(N,)`.
 
     A point stays whose distance to its neighbour number `neighbours` is at most `isolation` times

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array, Bools, Ints
+
 Between = Literal["interpolate", "hold"]
 
 
@@ -28,13 +29,13 @@ class Motion:
                           known from the tracking frame before each to the one after it
     """
 
-    steps: NDArray[np.int64]
+    steps: Ints
     rotations: Array
     translations: Array
     between: Between = "interpolate"
     still: bool = False
     determined: int = 6
-    lost: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    lost: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         t = len(self.steps)
@@ -67,7 +68,7 @@ class Motion:
         columns = [np.interp(time, knots, self.translations[:, k]) for k in range(3)]
         return np.asarray(rotations), np.stack(columns, axis=1)
 
-    def known(self, steps: ArrayLike) -> NDArray[np.bool_]:
+    def known(self, steps: ArrayLike) -> Bools:
         """Whether the pose at the steps `(N,)` is known: no lost tracking frame has a say in it."""
         index = np.asarray(steps, np.int64).reshape(-1)
         if not len(self.lost):

@@ -10,8 +10,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.geometry.projectors import Projector
 from reconstruction.images.silhouettes import background_noise, dark_frame
@@ -51,12 +51,12 @@ class Peaks:
 
     camera: str
     projector: str
-    pixel: NDArray[np.int64]
-    row: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-    brightness: NDArray[np.float64]
-    step: NDArray[np.int64]
-    saturated: NDArray[np.bool_]
+    pixel: Ints
+    row: Array
+    deviation: Array
+    brightness: Array
+    step: Ints
+    saturated: Bools
     candidates: int = 0
     bright: int = 0
     side_responses: int = 0
@@ -105,9 +105,7 @@ def find_peaks(
     )
 
 
-def fit_stripes(
-    window: NDArray[np.float64], projector: Projector, noise: float
-) -> tuple[NDArray[np.float64], ...]:
+def fit_stripes(window: Array, projector: Projector, noise: float) -> tuple[Array, ...]:
     """Fit the projector's line profile on a constant to `window (N, 7)` about each maximum.
 
     Least squares over the stripe's centre (searched, then refined by a parabola), its extra width
@@ -147,9 +145,7 @@ def fit_stripes(
     return centre, np.minimum(deviation, 1.0), np.clip(best, 0, 1), np.maximum(light, 0)
 
 
-def _profiles(
-    projector: Projector, centres: NDArray[np.float64], width: float
-) -> NDArray[np.float64]:
+def _profiles(projector: Projector, centres: Array, width: float) -> Array:
     """Line profiles `(C, 7)` at the window's rows, spread by a Gaussian of `width` rows."""
     rows = np.arange(-REACH, REACH + 1)
     nodes, weights = np.polynomial.hermite_e.hermegauss(9 if width > 0 else 1)
@@ -158,7 +154,7 @@ def _profiles(
     return np.asarray((projector.row_weight(rows[None, :, None], v) * weights).sum(axis=-1))
 
 
-def _bright(value: NDArray[np.float32]) -> float:
+def _bright(value: Floats) -> float:
     some = value[value > 0]
     return float(np.percentile(some, 95)) if some.size else 0.0
 
@@ -169,7 +165,7 @@ class _Tally:
     def __init__(self) -> None:
         self._counts = np.zeros(1 << 15, np.int64)
 
-    def add(self, values: NDArray[np.float32]) -> None:
+    def add(self, values: Floats) -> None:
         # the upper half of a positive float32: its exponent and seven bits more
         positive = values[values > 0].view(np.uint32) >> 16
         self._counts += np.bincount(positive, minlength=len(self._counts))
@@ -187,8 +183,8 @@ class _Scan:
         c = capture.rig.camera(camera)
         shape = (c.height, c.width)
         self.capture, self.camera, self.sweep, self.rows = capture, camera, sweep, rows
-        self.ring: deque[NDArray[np.float32]] = deque(maxlen=WINDOW)
-        self.clip: deque[NDArray[np.bool_]] = deque(maxlen=WINDOW)
+        self.ring: deque[Floats] = deque(maxlen=WINDOW)
+        self.clip: deque[Bools] = deque(maxlen=WINDOW)
         self.held: deque[bool] = deque(maxlen=WINDOW)
         self.value = np.zeros((layers, *shape), np.float32)
         self.at = np.zeros((layers, *shape), np.int64)
@@ -198,7 +194,7 @@ class _Scan:
         self.bright, self.maxima = _Tally(), _Tally()
         self.missing: list[int] = []
         self._noises: list[float] = []
-        self._dark: dict[float, NDArray[np.float32]] = {}
+        self._dark: dict[float, Floats] = {}
 
     def noise(self) -> float:
         """Median over frames of the unlit pixels' deviation, in units of the response."""
@@ -224,7 +220,7 @@ class _Scan:
         if len(self.ring) == WINDOW and all(list(self.held)[REACH - 1 : REACH + 2]):
             self._insert(middle)
 
-    def _read(self, step: Step) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _read(self, step: Step) -> tuple[Floats, Bools]:
         if step.exposure not in self._dark:
             self._dark[step.exposure] = dark_frame(self.capture, self.camera, step.exposure)
         response, saturated = self.capture.response_and_saturated(step, self.camera)

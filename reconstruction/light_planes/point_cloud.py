@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reconstruction.arrays import Array, Floats
+
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
@@ -31,16 +33,16 @@ class PointCloud:
     Raises `ValueError` when shapes disagree or a coordinate is not finite.
     """
 
-    points: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    view: NDArray[np.float64]
+    points: Array
+    covariance: Array
+    view: Array
     pixel: NDArray[np.int32]
     camera: NDArray[np.int16]
     projector: NDArray[np.int16]
-    row: NDArray[np.float32]
+    row: Floats
     step: NDArray[np.int32]
-    brightness: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    brightness: Floats
+    weight: Floats
     cameras: tuple[str, ...]
     projectors: tuple[str, ...]
 
@@ -84,7 +86,7 @@ class PointCloud:
         """The points that the camera called `name` saw."""
         return self.subset(self.camera == self.cameras.index(name))
 
-    def deviation_along_view(self) -> NDArray[np.float64]:
+    def deviation_along_view(self) -> Array:
         """Standard deviation along the ray `(N,)`, metres."""
         variance = np.einsum("ni,nij,nj->n", self.view, self.covariance, self.view)
         return np.asarray(np.sqrt(variance))

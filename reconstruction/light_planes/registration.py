@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import AnyFloats, Array, Bools
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +39,7 @@ class Template:
     which pixels count. Raises `ValueError` for an empty mask or a picture without any detail.
     """
 
-    def __init__(
-        self, image: NDArray[np.floating], mask: NDArray[np.bool_], sigma: float = 1.0
-    ) -> None:
+    def __init__(self, image: AnyFloats, mask: Bools, sigma: float = 1.0) -> None:
         if image.shape != mask.shape or image.ndim != 2:
             raise ValueError(f"image {image.shape} and mask {mask.shape} must be the same (H, W)")
         if not mask.any():
@@ -65,7 +62,7 @@ class Template:
         self.inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
 
     def register(
-        self, image: NDArray[np.floating], *, iterations: int = 30, tolerance: float = 1e-3
+        self, image: AnyFloats, *, iterations: int = 30, tolerance: float = 1e-3
     ) -> Registration:
         """Register `image (H, W)` by inverse compositional Gauss-Newton (Baker and Matthews 2004).
 
@@ -100,7 +97,7 @@ class Template:
         )
 
 
-def smooth(image: NDArray[np.floating], sigma: float) -> Array:
+def smooth(image: AnyFloats, sigma: float) -> Array:
     """`image (H, W)` under a Gaussian of `sigma` pixels, edges repeated."""
     source = np.ascontiguousarray(image, dtype=np.float64)
     return np.asarray(cv2.GaussianBlur(source, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Camera
 
-Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 LEVER = 0.1  # metres: rotations count by what they move at this distance, so that units agree
 

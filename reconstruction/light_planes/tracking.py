@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import dark_frame
@@ -38,8 +38,6 @@ from reconstruction.light_planes.rigid_fit import (
     numeric,
 )
 from reconstruction.report.report import Progress, Stage, silent
-
-Array = NDArray[np.float64]
 
 SIGMA = 1.5
 """Pixels of the Gaussian under which pictures are compared."""

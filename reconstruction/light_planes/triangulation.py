@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.projectors import Projector
 from reconstruction.images.silhouettes import NoSilhouette, silhouette
@@ -17,8 +17,6 @@ from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.peaks import CLEAN, PeakOptions, Peaks, find_peaks
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Progress, Stage, silent
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -188,7 +186,7 @@ def intersect(
 
 def inside_hull(
     capture: Capture, points: Array, margin: float, stage: Stage | None = None
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Which `points (N, 3)` lie in every camera's silhouette, `margin` pixels of play allowed.
 
     A camera that does not have the point in its picture, or has no silhouette, says nothing.

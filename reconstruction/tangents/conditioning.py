@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.tangents.line_evidence import LineEvidence
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 NEARLY_PARALLEL = 0.1
 """`spread` under which a line may turn freely within the planes: they cross at some ten degrees."""
@@ -28,7 +25,7 @@ class LineConditioning:
     line, as two always do (Sun Eq. 4; Photobooth §3.2 takes the two most frontal views alone).
     """
 
-    views: NDArray[np.int64]
+    views: Ints
     spread: Array
     misfit: Array
 
@@ -54,7 +51,7 @@ class LineConditioning:
 
 def condition_lines(
     evidences: Sequence[LineEvidence],
-    points: NDArray[np.floating],
+    points: AnyFloats,
     seen: Bools,
     *,
     least_confidence: float = 0.1,

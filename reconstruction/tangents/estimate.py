@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.visual_hull import VoxelGrid
@@ -25,8 +25,6 @@ from reconstruction.tangents.line_evidence import (
     seen_by,
 )
 from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -60,12 +58,12 @@ class Measured:
     directions: Array
     confidence: Array
 
-    def where(self, keep: NDArray[np.bool_]) -> Measured:
+    def where(self, keep: Bools) -> Measured:
         """Those that are to be kept `(N,)`."""
         return Measured(self.points[keep], self.directions[keep], self.confidence[keep])
 
 
-def light_groups(lights: list[Light], count: int) -> NDArray[np.int64]:
+def light_groups(lights: list[Light], count: int) -> Ints:
     """Group number `(L,)` of each light: nearest of `count` seeds spread over the lights.
 
     Seeds are chosen one after the other, each the light furthest from all before it, then moved

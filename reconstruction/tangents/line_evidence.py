@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats
 from reconstruction.geometry.cameras import Camera
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 def half_sphere(count: int) -> Array:
@@ -35,12 +32,12 @@ class LineEvidence:
     """
 
     camera: Camera
-    support: NDArray[np.float32]
+    support: Floats
     mask: Bools
     depth: Array
 
 
-def line_support(responses: NDArray[np.floating]) -> NDArray[np.float32]:
+def line_support(responses: AnyFloats) -> Floats:
     """Support `(K, H, W)` from a filter bank's answers `(K, H, W)`: their excess over the mean.
 
     Normalised by the mean over angles, so that contrast does not count twice.
@@ -50,7 +47,7 @@ def line_support(responses: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray((responses - mean) / (mean + floor), np.float32)
 
 
-def seen_by(evidence: LineEvidence, points: NDArray[np.floating], tolerance: float) -> Bools:
+def seen_by(evidence: LineEvidence, points: AnyFloats, tolerance: float) -> Bools:
     """Points `(N,)` that project onto the mask at no more than `tolerance` behind its depth."""
     pixels, depth = evidence.camera.project(points)
     ok = (depth > 0) & evidence.camera.inside(pixels)
@@ -60,8 +57,8 @@ def seen_by(evidence: LineEvidence, points: NDArray[np.floating], tolerance: flo
 
 
 def line_scores(
-    evidence: LineEvidence, points: NDArray[np.floating], candidates: Array, seen: Bools
-) -> NDArray[np.float32]:
+    evidence: LineEvidence, points: AnyFloats, candidates: Array, seen: Bools
+) -> Floats:
     """Support `(N, D)` that a camera's texture gives each of `candidates (D, 3)` at the points.
 
     A candidate is looked up at the angle of its projection and weighted by the squared sine of
@@ -91,7 +88,7 @@ def line_scores(
     return out
 
 
-def pool(points: NDArray[np.floating], radius: float, most: int = 24) -> sparse.csr_array:
+def pool(points: AnyFloats, radius: float, most: int = 24) -> sparse.csr_array:
     """Weights `(N, N)` that average over neighbours within `radius` metres: a Gaussian of half it.
 
     Each row sums to 1. At most `most` neighbours count.
@@ -123,9 +120,7 @@ class Tangents:
     confidence: Array
 
 
-def decide(
-    scores: NDArray[np.floating], candidates: Array, sharpness: float | None = None
-) -> Tangents:
+def decide(scores: AnyFloats, candidates: Array, sharpness: float | None = None) -> Tangents:
     """The best direction for each row of `scores (N, D)` over `candidates (D, 3)`.
 
     Scores are turned into weights by a softmax whose temperature is their median spread over the
@@ -152,7 +147,7 @@ def decide(
     return Tangents(direction, np.where(flat, 0.0, np.clip(confidence, 0, 1)))
 
 
-def _full(tensors: NDArray[np.floating]) -> Array:
+def _full(tensors: AnyFloats) -> Array:
     full = np.empty((len(tensors), 3, 3))
     for n, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
         full[:, i, j] = full[:, j, i] = tensors[:, n]

@@ -12,15 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 FEWEST_LIGHTS = 60
 """Under about one light for each 15 degrees the highlight falls between them."""
@@ -58,7 +54,7 @@ class Observations:
     surface's normal.
     """
 
-    index: NDArray[np.int64]
+    index: Ints
     response: Floats
     to_light: Floats
     to_camera: Floats
@@ -67,7 +63,7 @@ class Observations:
 
 def observe(
     camera: Camera,
-    olat: NDArray[np.floating],
+    olat: AnyFloats,
     lights: Sequence[Light],
     points: Array,
     normals: Array,
@@ -97,7 +93,7 @@ def observe(
     )
 
 
-def _cell(sin_i: Floats, sin_r: Floats, cos_between: Floats) -> NDArray[np.int64]:
+def _cell(sin_i: Floats, sin_r: Floats, cos_between: Floats) -> Ints:
     """Cell of the reflection table for sines of inclination to light and camera."""
     cos = np.sqrt(np.maximum((1 - sin_i**2) * (1 - sin_r**2), 1e-6))
     azimuth = np.clip((cos_between - sin_i * sin_r) / cos, -1, 1)
@@ -107,7 +103,7 @@ def _cell(sin_i: Floats, sin_r: Floats, cos_between: Floats) -> NDArray[np.int64
     return np.asarray((s * _AZIMUTHS + a) * _TILTS + r)
 
 
-def _facing_cell(facing: Floats) -> NDArray[np.int64]:
+def _facing_cell(facing: Floats) -> Ints:
     return np.clip(((facing + 0.2) * (_FACINGS / 1.2)).astype(np.int64), 0, _FACINGS - 1)
 
 
@@ -192,7 +188,7 @@ class Reflection:
 
 def reflection_scores(
     cameras: Sequence[Camera],
-    olats: Mapping[str, NDArray[np.floating]],
+    olats: Mapping[str, AnyFloats],
     lights: Sequence[Light],
     points: Array,
     seen: Bools,

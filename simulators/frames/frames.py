@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Array, Floats
 from reconstruction.geometry.rig import Rig
 from simulators.frames.responses import Responder, Response
 from simulators.frames.sensor import Sensor
@@ -28,7 +29,7 @@ class Snapshot:
     """
 
     pulse: int
-    power: NDArray[np.float64]
+    power: Array
     show: Show
     pose: int
 
@@ -72,7 +73,7 @@ class FrameMaker:
         radiance = self.radiance(camera, shot)
         return self._sensor.expose(radiance, exposure, (self._seed, index, shot.pulse))
 
-    def radiance(self, camera: str, shot: Snapshot) -> NDArray[np.float32]:
+    def radiance(self, camera: str, shot: Snapshot) -> Floats:
         """Radiance `(H, W, 3)`, W/(sr m²), without noise."""
         c = self._rig.camera(camera)
         flat = np.zeros((c.height * c.width, 3), np.float32)
@@ -82,7 +83,7 @@ class FrameMaker:
             self._add_projectors(flat, camera, shot)
         return flat.reshape(c.height, c.width, 3)
 
-    def _add_lamps(self, flat: NDArray[np.float32], camera: str, shot: Snapshot) -> None:
+    def _add_lamps(self, flat: Floats, camera: str, shot: Snapshot) -> None:
         if shot.pose == 0:
             response = self._all_lamps(camera)
             lit = np.flatnonzero(shot.power)
@@ -97,7 +98,7 @@ class FrameMaker:
         )
         flat[response.pixels] += response.images[0]
 
-    def _add_projectors(self, flat: NDArray[np.float32], camera: str, shot: Snapshot) -> None:
+    def _add_projectors(self, flat: Floats, camera: str, shot: Snapshot) -> None:
         sweep = _kept(
             self._sweeps[camera], shot.pose, lambda: self._responder.sweep(camera, shot.pose), 2
         )

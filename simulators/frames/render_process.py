@@ -10,9 +10,7 @@ from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from reconstruction.arrays import Array
 from simulators.frames.responses import Responder, Response
 
 
@@ -41,7 +39,7 @@ class RenderProcess:
         answer: Response = self._call("lamps", camera)
         return answer
 
-    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lamps_together`; raises `RenderError`."""
         answer: Response = self._call("lamps_together", camera, pose, power)
         return answer
@@ -89,7 +87,7 @@ class RenderPool:
         """See `Responder.lamps`; raises `RenderError`."""
         return self._of(camera).lamps(camera)
 
-    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lamps_together`; raises `RenderError`."""
         return self._of(camera).lamps_together(camera, pose, power)
 

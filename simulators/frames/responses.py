@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.scene.backend import ensure_backend
+from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rig import Rig
 from simulators.subject.drift import Drift
 from simulators.subject.subject import Subject
-
-Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -47,21 +46,21 @@ class Response:
     row: float32, or float16 for sweeps, whose rounding (0.05 %) is far below a camera's noise.
     """
 
-    pixels: NDArray[np.int64]
-    images: Image | NDArray[np.float16]
+    pixels: Ints
+    images: Floats | NDArray[np.float16]
     scale: float = 1.0
 
     @classmethod
-    def halved(cls, pixels: NDArray[np.int64], images: Image) -> Response:
+    def halved(cls, pixels: Ints, images: Floats) -> Response:
         """In half the memory; the brightest value becomes 1024, far from overflow in sums of it."""
         scale = float(images.max(initial=0.0)) / 1024 or 1.0
         return cls(pixels, (images * np.float32(1 / scale)).astype(np.float16), scale)
 
-    def image(self, index: int) -> Image:
+    def image(self, index: int) -> Floats:
         """Radiance `(P, 3)` of one light or row."""
         return self.images[index] * np.float32(self.scale)
 
-    def total(self) -> Image:
+    def total(self) -> Floats:
         """Radiance `(P, 3)` of all of them together."""
         return self.images.sum(axis=0, dtype=np.float32) * np.float32(self.scale)
 
@@ -72,7 +71,7 @@ class Responder(Protocol):
     def lamps(self, camera: str) -> Response:
         """The answer at pose 0 to each lamp alone, in the rig's order."""
 
-    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
         """The one answer at `pose` to all lamps at `power (L,)` together."""
 
     def sweep(self, camera: str, pose: int) -> Mapping[str, Response]:
@@ -127,7 +126,7 @@ class MitsubaResponder:
         )
         return Response(pixels, images)
 
-    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lamps_together`; a vertex asks a sample of the lit lamps."""
         from appearance.render.olat import render_olat
 
@@ -176,7 +175,7 @@ class MitsubaResponder:
             self._scene = build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
         return self._scene
 
-    def _view(self, camera: str, pose: int) -> tuple[Camera, NDArray[np.int64]]:
+    def _view(self, camera: str, pose: int) -> tuple[Camera, Ints]:
         from appearance.render.coverage import covered_pixels
 
         seen = self._rig.camera(camera).moved(*self._drift.pose(pose))

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -24,7 +26,7 @@ class Sensor:
     read_noise: float = 4.0
 
     def expose(
-        self, radiance: NDArray[np.floating], exposure: float, seed: tuple[int, ...]
+        self, radiance: AnyFloats, exposure: float, seed: tuple[int, ...]
     ) -> NDArray[np.uint16]:
         """Counts of `radiance (H, W, 3)`, W/(sr m²), after `exposure` seconds.
 

@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from reconstruction.arrays import Array, Bools
 
 FULL = 65535
 ALL_ON = 65535
@@ -63,7 +64,7 @@ class Lamps:
         """Lamps that stay as they are when nobody speaks any more, as those on DMX."""
         self._dead_man = False
 
-    def power(self) -> NDArray[np.float64]:
+    def power(self) -> Array:
         """Share of full intensity `(count,)` that each lamp gives right now, 0 to 1."""
         with self._lock:
             self._look()
@@ -204,10 +205,10 @@ class Lamps:
         if self._armed:
             raise NotNow
 
-    def _chosen(self, command: int) -> NDArray[np.bool_]:
+    def _chosen(self, command: int) -> Bools:
         return (np.arange(self.count) == command - 1) | (command == ALL_ON)
 
-    def _set(self, wanted: NDArray[np.bool_]) -> None:
+    def _set(self, wanted: Bools) -> None:
         self._look()
         if any(self._cut()):
             wanted = np.zeros(self.count, bool)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from reconstruction.arrays import Array
 
 _TURN_DEG_PER_M = 0.4 / 1.5e-3  # a head that sways by 1.5 mm also turns by about 0.4°
 

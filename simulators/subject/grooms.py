@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from simulators.subject.head import HeadField
-
-Array = NDArray[np.float64]
 
 # A human head: 100,000 fibres of 40 µm. Fewer, thicker strands keep its coverage.
 _COVERAGE = 100_000 * 40e-6
@@ -244,7 +242,7 @@ def _push_out(paths: Array, field: HeadField) -> Array:
     return flat.reshape(count, steps, 3)
 
 
-def _nearest(candidates: Array, points: Array) -> NDArray[np.int64]:
+def _nearest(candidates: Array, points: Array) -> Ints:
     return np.asarray(cKDTree(candidates).query(points)[1], dtype=np.int64)
 
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
+from reconstruction.arrays import Array
 from reconstruction.geometry.signed_distance import blend, ellipsoid
 from reconstruction.head.generic import HEAD_BOX, NECK_END, skin_distance
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfinv
 
+from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.boards import Board
 from reconstruction.geometry.cameras import Camera, facing
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.rig import Rig
 from simulators.frames.responses import Response
 
-Array = NDArray[np.float64]
 LAMP_RADIUS = 4e-3  # metres: what a mirror shows of a lamp that is called a point
 
 
@@ -32,7 +31,7 @@ class Seen:
     `points` and `normals (P, S, 3)`, and `albedo (P, S)`, 0 where the ray misses.
     """
 
-    pixels: NDArray[np.int64]
+    pixels: Ints
     points: Array
     normals: Array
     albedo: Array
@@ -260,7 +259,7 @@ def _offsets(camera: Camera, n: int) -> Array:
     return np.stack(np.meshgrid(one, one), axis=-1).reshape(-1, 2)
 
 
-def _rays(camera: Camera, offsets: Array, around: Array) -> tuple[NDArray[np.int64], Array]:
+def _rays(camera: Camera, offsets: Array, around: Array) -> tuple[Ints, Array]:
     """Flat pixels `(P,)` about the picture of points `around (N, 3)`, and rays `(P, S, 3)`."""
     at, depth = camera.project(around)
     low, high = np.floor(at.min(axis=0)) - 2, np.ceil(at.max(axis=0)) + 3

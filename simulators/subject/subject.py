@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.scene.hair_appearance import HairAppearance
+from reconstruction.arrays import Array
 from reconstruction.files.strands import READABLE, read_strands
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh, read_obj
@@ -136,7 +136,7 @@ def check_fits(subject: Subject, rig: Rig) -> None:
             )
 
 
-def _filled(camera: Camera, pixels: NDArray[np.float64]) -> float:
+def _filled(camera: Camera, pixels: Array) -> float:
     """Share of the image's 16x16 tiles that `pixels (N, 2)` fall into."""
     tiles = (pixels + 0.5) * 16 / [camera.width, camera.height]
     return len(np.unique(tiles.astype(int) @ [1, 16])) / 256

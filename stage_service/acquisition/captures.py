@@ -11,9 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from reconstruction.arrays import Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.writer import CaptureWriter, utc_now
 from reconstruction.files.durable import RESERVE
@@ -94,7 +92,7 @@ class CaptureManager:
         self,
         plan: CapturePlan,
         *,
-        masks: dict[str, NDArray[np.bool_]] | None = None,
+        masks: dict[str, Bools] | None = None,
         head: Mesh | None = None,
         extra: dict[str, Any] | None = None,
         armed_by: str | None = None,

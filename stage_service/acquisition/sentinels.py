@@ -8,8 +8,8 @@ it, or the last all-on frame is dark or shows one lamp.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture, MissingFrame, Step
 from stage_service.devices.errors import IndexShift
 
@@ -71,7 +71,7 @@ def _zip(dark: tuple[Step, Step], bright: tuple[Step, Step]) -> tuple[Step, ...]
     return dark[0], bright[0], dark[1], bright[1]
 
 
-def _grey(capture: Capture, step: Step, camera: str) -> NDArray[np.float32]:
+def _grey(capture: Capture, step: Step, camera: str) -> Floats:
     """A quarter of the picture in each direction; radiance, mean of the channels."""
     image = capture.frame(step, camera)
     h, w = (max(4 * (n // 4), 1) for n in image.shape[:2])

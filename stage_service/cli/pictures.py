@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.metrics.scores import Exposure, psnr, srgb, ssim
+from reconstruction.arrays import Array, Bools
 from reconstruction.files.exr import read_exr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
@@ -43,14 +43,14 @@ def compare_pictures(pred: Path, true: Path, mask: Path | None) -> dict[str, flo
     return {"psnr": psnr(a, b, hair), "ssim": ssim(a, b, hair)}
 
 
-def _picture(path: Path) -> NDArray[np.float64]:
+def _picture(path: Path) -> Array:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image is None:
         raise ValueError(f"{path}: not a picture that can be read")
     return np.asarray(image, np.float64) / np.iinfo(image.dtype).max
 
 
-def _mask(path: Path | None) -> NDArray[np.bool_] | None:
+def _mask(path: Path | None) -> Bools | None:
     if path is None:
         return None
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)

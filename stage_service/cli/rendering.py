@@ -7,9 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from appearance.metrics.pictures import write_png
 from appearance.metrics.scores import Exposure, srgb
 from appearance.model.fitted_appearance import FittedAppearance
@@ -18,6 +15,7 @@ from appearance.render.environment import render_environment
 from appearance.render.environment_maps import load_environment
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene, build_scene
+from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.files.exr import write_exr
 from reconstruction.files.strands import read_strands
@@ -68,13 +66,13 @@ def render_model(args: argparse.Namespace, progress: Progress) -> dict[str, Any]
     }
 
 
-def _environment(scene: HairScene, camera: Camera, args: argparse.Namespace) -> NDArray[np.float32]:
+def _environment(scene: HairScene, camera: Camera, args: argparse.Namespace) -> Floats:
     procedural = PROCEDURAL.get(args.environment)
     envmap = procedural() if procedural is not None else load_environment(Path(args.environment))
     return render_environment(scene, camera, envmap, spp=args.spp, seed=args.seed)
 
 
-def _write(out: Path, image: NDArray[np.float32]) -> None:
+def _write(out: Path, image: Floats) -> None:
     if out.suffix == ".exr":
         write_exr(out, image)
     else:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering.loop import ROWS, Stage1Options, run
@@ -20,10 +19,10 @@ from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.sun_fit.fit import FitOptions
 from benchmarks.known_subjects import Captured
+from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.lights import Light
 from reconstruction.report.report import Progress, Stage, silent
 
-Array = NDArray[np.float64]
 GROUPS = ("train views", "held-out views")
 TRUTH = "truth, fresh numbers"
 """The true parameters on the true strands: how far a PSNR can go with this much noise."""
@@ -164,7 +163,7 @@ class Table:
             figures[group] = mean
         self.rows[row] = figures
 
-    def _nearest(self, o: Observed, frames: NDArray[np.float32], light: int) -> Array:
+    def _nearest(self, o: Observed, frames: Floats, light: int) -> Array:
         """The view's own frames under the three nearest training lights, by inverse angle."""
         towards = np.array([x.position / np.linalg.norm(x.position) for x in o.lights])
         others = list(self.captured.train_lights)
@@ -175,7 +174,7 @@ class Table:
         return np.asarray(np.tensordot(share / share.sum(), near, 1))
 
 
-def _image(values: Array, pixels: NDArray[np.int64], size: tuple[int, int]) -> Array:
+def _image(values: Array, pixels: Ints, size: tuple[int, int]) -> Array:
     out = np.zeros((size[0] * size[1], 3))
     out[pixels] = values
     return out.reshape(*size, 3)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from appearance.metrics.pictures import Row, comparison_picture
@@ -19,6 +18,7 @@ from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from benchmarks.path_reference import PathReference
+from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.import_folder import import_folder
 from reconstruction.geometry.cameras import Camera
@@ -27,8 +27,6 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, silent
 from reconstruction.tangents.line_evidence import half_sphere
-
-Array = NDArray[np.float64]
 
 CYCLES, OURS, STOCK = "Cycles", "ours", "Mitsuba"
 PAIRS = ((OURS, CYCLES), (STOCK, CYCLES), (OURS, STOCK))
@@ -99,11 +97,11 @@ class View:
 
     camera: Camera
     lights: Sequence[Light]
-    pixels: NDArray[np.int64]
-    radiance: Mapping[str, NDArray[np.float32]]
+    pixels: Ints
+    radiance: Mapping[str, Floats]
 
     @property
-    def tile(self) -> NDArray[np.int64]:
+    def tile(self) -> Ints:
         """Index of each pixel's tile."""
         row, column = np.divmod(self.pixels, self.camera.width)
         tiles = (row // _TILE) * self.camera.width + column // _TILE
@@ -151,7 +149,7 @@ def _view(
     path = PathReference(scene.with_hair(scene.hair, bsdf="hair"), depth)
     seeds, spp = samples
 
-    def runs(render: Callable[[int], NDArray[np.float32]]) -> NDArray[np.float32]:
+    def runs(render: Callable[[int], Floats]) -> Floats:
         return np.stack([render(k) for k in range(seeds)])
 
     return View(
@@ -195,11 +193,11 @@ def compare(views: Sequence[View], one: str, other: str, seed: int = 0) -> dict[
     return figures
 
 
-def _tiles(view: View, one: NDArray[np.float32], other: NDArray[np.float32]) -> _Tiles:
+def _tiles(view: View, one: Floats, other: Floats) -> _Tiles:
     tile = view.tile
     count = np.bincount(tile).astype(float)
 
-    def sums(radiance: NDArray[np.float32]) -> Array:
+    def sums(radiance: Floats) -> Array:
         out = np.zeros((len(count), len(radiance), 3))
         np.add.at(out, tile, radiance.transpose(1, 0, 2))
         return out.transpose(1, 0, 2)

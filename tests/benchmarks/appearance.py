@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.loop import Stage1Options, run
@@ -19,11 +18,10 @@ from appearance.observations import Observed
 from appearance.scene.hair_appearance import HairAppearance
 from benchmarks.ablation_table import GROUPS, Table, named
 from benchmarks.known_subjects import SUBJECTS, Captured, Rig, on_bent, subject
+from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, silent
-
-Array = NDArray[np.float64]
 
 QUICK = Stage1Options(
     steps=30,

@@ -11,12 +11,11 @@ from math import pi
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf import reference as ref
 from appearance.bsdf.lobes import Fibre
+from reconstruction.arrays import Array
 
-Array = NDArray[np.float64]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
 
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import srgb
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import SCALE, build_scene
+from reconstruction.arrays import Array
 from reconstruction.geometry.strands import Strands
 
 ROUGHNESS = (0.05, 0.15, 0.3, 0.6)
@@ -42,7 +42,7 @@ def wig(strands: int, seed: int = 0) -> Strands:
 
 def pictured(
     shape: Any, bsdf: dict[str, Any], light: dict[str, Any], size: int, spp: int, depth: int
-) -> NDArray[np.float64]:
+) -> Array:
     """Radiance `(size, size, 3)` of the curves `shape` with a BSDF, seen from the side."""
     import mitsuba as mi
 

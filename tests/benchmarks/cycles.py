@@ -23,6 +23,7 @@ from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fit import FitOptions
+from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.import_folder import import_folder
 from reconstruction.geometry.cameras import Camera
@@ -31,7 +32,6 @@ from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, Stage, silent
 from reconstruction.tangents.line_evidence import half_sphere
 
-Array = NDArray[np.float64]
 HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = Stage1Options(

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.differentiable import DifferentiableOlat
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
+from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh
@@ -61,9 +61,7 @@ def _lamp(x: float) -> Light:
     return Light("l", np.array([x, 0.0, 1.0]), np.full(3, 8.0))
 
 
-def moved_lamp(
-    scene: HairScene, places: NDArray[np.float64], spp: int, runs: int
-) -> dict[str, list[float]]:
+def moved_lamp(scene: HairScene, places: Array, spp: int, runs: int) -> dict[str, list[float]]:
     """Derivatives of the picture's mean by the lamp's x at `places (N,)`, in two ways.
 
     Means and standard errors over `runs` seeds; both sides of a difference share their seed.

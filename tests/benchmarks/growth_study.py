@@ -6,13 +6,11 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reconstruction.arrays import AnyFloats
 from reconstruction.growth.field import OrientationField
 from reconstruction.growth.from_roots import Method, trace
 from reconstruction.report.report import Series
-
-Array = NDArray[np.float64]
 
 METHODS: tuple[Method, ...] = ("euler", "midpoint", "rk4")
 COST: dict[Method, int] = {"euler": 1, "midpoint": 2, "rk4": 4}
@@ -21,8 +19,8 @@ COST: dict[Method, int] = {"euler": 1, "midpoint": 2, "rk4": 4}
 
 def compare_growth(
     field: OrientationField,
-    starts: NDArray[np.floating],
-    along: NDArray[np.floating],
+    starts: AnyFloats,
+    along: AnyFloats,
     *,
     steps: Sequence[float] = (4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4),
     max_length: float = 0.1,

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, root_normals, scalp_coordinates
 from appearance.bsdf.strand_coordinates import transported
@@ -20,12 +19,12 @@ from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
+from reconstruction.arrays import Array, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 
-Array = NDArray[np.float64]
 SUBJECTS = ("a", "b", "c")
 TANGENT_NOISE_DEG = 5.0
 _BEND = 0.1
@@ -61,7 +60,7 @@ class Captured:
     truth: HairMaps
     skin: Array
     views: tuple[Observed, ...]
-    halves: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+    halves: tuple[tuple[Floats, Floats], ...]
     held_views: tuple[int, ...]
     held_lights: tuple[int, ...]
     exposure: Exposure

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import coverage
@@ -22,13 +21,12 @@ from benchmarks.light_plots import plot_errors, plot_growth
 from benchmarks.path_reference import PathReference
 from benchmarks.scanlines import measure_scanlines
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.strands import Strands
-
-Image = NDArray[np.float32]
 
 DEGREE = 6
 _JUDGED = 12  # lights whose error is measured
@@ -100,7 +98,7 @@ def run(
     return result
 
 
-def hair_pixels(scene: HairScene, camera: Camera, count: int, seed: int) -> NDArray[np.int64]:
+def hair_pixels(scene: HairScene, camera: Camera, count: int, seed: int) -> Ints:
     """At most `count` pixels that hair covers more than half, in random places, sorted."""
     covered = np.flatnonzero(coverage(scene, camera)["hair"].ravel() > 0.5)
     if not len(covered):
@@ -137,7 +135,7 @@ def _errors(scene: HairScene, camera: Camera, effort: Effort, seed: int) -> dict
         lights = dome(count, seed)
         seen = min(count, _JUDGED)
 
-        def ours(spp: int, seed: int, degree: int | None = None, lights: Any = lights) -> Image:
+        def ours(spp: int, seed: int, degree: int | None = None, lights: Any = lights) -> Floats:
             return render_olat(
                 scene,
                 camera,
@@ -149,13 +147,13 @@ def _errors(scene: HairScene, camera: Camera, effort: Effort, seed: int) -> dict
                 degree=degree,
             )
 
-        def projected(spp: int, seed: int, lights: Any = lights) -> Image:
+        def projected(spp: int, seed: int, lights: Any = lights) -> Floats:
             return ours(spp, seed, DEGREE, lights)
 
-        def theirs(spp: int, seed: int, seen: int = seen) -> Image:
+        def theirs(spp: int, seed: int, seen: int = seen) -> Floats:
             return path.render(camera, judged[:seen], index, spp=spp, seed=seed)
 
-        methods: dict[str, Callable[[int, int], Image]] = {
+        methods: dict[str, Callable[[int, int], Floats]] = {
             "ours": ours,
             "ours projected": projected,
             "mitsuba path": theirs,
@@ -175,10 +173,10 @@ def _errors(scene: HairScene, camera: Camera, effort: Effort, seed: int) -> dict
 
 
 def _measure(
-    method: Callable[[int, int], Image],
+    method: Callable[[int, int], Floats],
     spp: int,
     seed: int,
-    halves: list[Image],
+    halves: list[Floats],
     seen: int,
     scale: float,
 ) -> dict[str, float]:
@@ -194,7 +192,7 @@ def _measure(
     }
 
 
-def relative_mse(image: Image, first: Image, second: Image) -> float:
+def relative_mse(image: Floats, first: Floats, second: Floats) -> float:
     """Relative mean squared error of `image (L, P, 3)`, without the reference's own variance.
 
     The reference is the mean of two independent unbiased renders `first` and `second`; a quarter
@@ -231,9 +229,9 @@ def _agreement(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
-    index: NDArray[np.int64],
+    index: Ints,
     depth: int,
-    halves: list[Image],
+    halves: list[Floats],
     effort: Effort,
     seed: int,
 ) -> dict[str, float]:
@@ -262,7 +260,7 @@ def _growth(
     """Cost over strands, bounces and pixels under 36 lights, and beside the bare rays'."""
     lights = dome(36, seed)
 
-    def cost(scene: HairScene, index: NDArray[np.int64], depth: int | None) -> dict[str, float]:
+    def cost(scene: HairScene, index: Ints, depth: int | None) -> dict[str, float]:
         spp = effort.growth_spp
         render_olat(scene, camera, lights, spp=spp, pixels=index, max_depth=depth)
         start = time.process_time()
@@ -303,7 +301,7 @@ def with_count(strands: Strands, count: int, seed: int) -> Strands:
 
 
 def bare_rays(
-    scene: HairScene, camera: Camera, index: NDArray[np.int64], seed: int, rounds: int = 64
+    scene: HairScene, camera: Camera, index: Ints, seed: int, rounds: int = 64
 ) -> dict[str, float]:
     """Microseconds of CPU a ray of the scene takes when nothing else is done.
 

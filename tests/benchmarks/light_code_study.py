@@ -9,9 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank
@@ -81,9 +82,7 @@ def study_depths(
     return out
 
 
-def _right(
-    points: NDArray[np.float64], along: NDArray[np.float64], tree: cKDTree, tangents: Any
-) -> NDArray[np.bool_]:
+def _right(points: Array, along: Array, tree: cKDTree, tangents: Any) -> Bools:
     reach, turn = RIGHT
     _, index = tree.query(points, k=32, distance_upper_bound=reach, workers=-1)
     there = index < tree.n
@@ -98,7 +97,7 @@ def _same(a: DepthMap, b: DepthMap, within: float) -> int:
     return int((np.abs(a.depth[i] - b.depth[j]) <= within).sum())
 
 
-def opencv_loop(bank: LogGaborBank, image: ArrayLike, margin: int) -> NDArray[np.float32]:
+def opencv_loop(bank: LogGaborBank, image: ArrayLike, margin: int) -> Floats:
     """`bank.responses` of one image `(H, W)` by `cv2.filter2D`: two kernels for every filter.
 
     A kernel is a filter's transform on the padded image, cut to `margin` pixels around its middle.
@@ -130,12 +129,12 @@ def compare_filters(bank: LogGaborBank, image: ArrayLike, margin: int = 48) -> d
     """
     pixels = np.asarray(image, np.float32)
     times: dict[str, float] = {}
-    answers: dict[str, NDArray[np.float32]] = {}
+    answers: dict[str, Floats] = {}
 
-    def ours() -> NDArray[np.float32]:
+    def ours() -> Floats:
         return bank.responses(pixels)
 
-    def opencv() -> NDArray[np.float32]:
+    def opencv() -> Floats:
         return opencv_loop(bank, pixels, margin)
 
     for run in (ours, opencv):

@@ -13,11 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from benchmarks.light_code_study import compare_filters, study_depths
 from benchmarks.model_pictures import picture_strands
+from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.import_folder import import_folder
 from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical
@@ -261,7 +262,7 @@ def controls(
 
     Only in the `ball`, its centre and radius: cameras that see a patch bound no hull elsewhere.
     """
-    masks: dict[str, NDArray[np.bool_]] = {}
+    masks: dict[str, Bools] = {}
     for camera in capture.rig.cameras:
         file = model / "masks" / f"{camera.name}_hair.png"
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
@@ -304,7 +305,7 @@ def _save(path: Path, results: dict[str, Any]) -> None:
     part.replace(path)
 
 
-def thresholds_met(row: dict[str, Any], sun: NDArray[np.floating]) -> dict[str, list[bool]]:
+def thresholds_met(row: dict[str, Any], sun: AnyFloats) -> dict[str, list[bool]]:
     """For visible and all, at which thresholds F is above Sun's `(3,)` per cent."""
     return {
         over: [100 * s["f"] > f for s, f in zip(row[over].values(), sun, strict=True)]

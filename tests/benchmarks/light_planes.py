@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.growth_study import compare_growth
 from benchmarks.model_pictures import picture_model, picture_motion
 from benchmarks.motion_errors import motion_errors, true_motion
 from benchmarks.stage_costs import of_field, of_strands, of_triangulation
+from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.matching import compare_strands
@@ -71,7 +71,7 @@ class Truth:
         self._visibility = Visibility(capture.rig.cameras, self._strands, capture.head)
 
     @property
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Floats:
         """Of the true strands `(N, 3)`."""
         return self._strands.points
 
@@ -139,7 +139,7 @@ def subject(
 
 
 def motion_study(
-    capture: Capture, points: NDArray[np.floating], true: Motion, progress: Progress = silent
+    capture: Capture, points: AnyFloats, true: Motion, progress: Progress = silent
 ) -> dict[str, Any]:
     """Each way to solve the motion: seconds, and its errors beside those of no motion at all."""
     peaks = sweep_peaks(capture, progress=progress)

@@ -9,7 +9,6 @@ from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import i0e
 
 from appearance.bsdf import lobes, reference
@@ -17,6 +16,7 @@ from appearance.bsdf.bessel import scaled_i0
 from appearance.scene.backend import ensure_backend
 from benchmarks.bsdf_integrals import Case, array_types, fibre, sphere, uniforms
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Array
 
 SAMPLES = 200_000
 CASES = [
@@ -137,7 +137,7 @@ def reciprocity_error(case: Case, pairs: int = 400, offsets: int = 200) -> float
     )
     theta_l, turn = reference.inclination(lit.T), reference.azimuth(lit.T) - first
 
-    def sent(known: NDArray[np.float64], other: NDArray[np.float64], turn: Any) -> Any:
+    def sent(known: Array, other: Array, turn: Any) -> Any:
         gamma = np.arcsin(h)
         wi = reference.direction(known[:, None], gamma).reshape(-1, 3)
         wo = reference.direction(other[:, None], gamma + turn[:, None]).reshape(-1, 3)

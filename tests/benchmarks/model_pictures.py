@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
@@ -89,7 +90,7 @@ def picture_motion(path: Path, clouds: Mapping[str, PointCloud]) -> None:
     figure.savefig(path, dpi=90)
 
 
-def _exposed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _exposed(image: Floats) -> NDArray[np.uint8]:
     white = max(float(np.percentile(image, 99.5)), 1e-12)
     return (np.clip(image / white, 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
 

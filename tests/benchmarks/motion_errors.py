@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture
 from reconstruction.light_planes.motion import Motion
-
-Array = NDArray[np.float64]
 
 PAPER_PIXELS = 1300
 """Photobooth's cameras have 1300 pixels along their longer side: errors are scaled to those."""
@@ -41,7 +39,7 @@ def true_motion(capture: Capture, truth: Path) -> Motion:
 
 
 def motion_errors(
-    capture: Capture, points: NDArray[np.floating], solved: Motion, true: Motion
+    capture: Capture, points: AnyFloats, solved: Motion, true: Motion
 ) -> dict[str, Any]:
     """Errors of `solved` at `points (N, 3)` of the subject, over cameras and tracking frames.
 

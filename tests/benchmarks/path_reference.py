@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.paths import passes, wave
 from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
@@ -38,11 +38,11 @@ class PathReference:
         self,
         camera: Camera,
         lights: Sequence[Light],
-        pixels: NDArray[np.int64],
+        pixels: Ints,
         *,
         spp: int,
         seed: int = 0,
-    ) -> NDArray[np.float32]:
+    ) -> Floats:
         """Radiance `(L, P, 3)` of the flat `pixels (P,)` under each light alone, W/(sr m²).
 
         Raises `ValueError` for lamps that are not isotropic points.
@@ -56,16 +56,14 @@ class PathReference:
             out[i] = self._light(camera, pixels, spp, (seed, i))
         return out
 
-    def _move(self, position: NDArray[np.float32], intensity: NDArray[np.float32]) -> None:
+    def _move(self, position: Floats, intensity: Floats) -> None:
         import mitsuba as mi
 
         self._parameters["light.position"] = mi.Point3f(*(float(p) for p in position))
         self._parameters["light.intensity.value"] = mi.Color3f(*(float(c) for c in intensity))
         self._parameters.update()
 
-    def _light(
-        self, camera: Camera, pixels: NDArray[np.int64], spp: int, seed: tuple[int, int]
-    ) -> NDArray[np.float32]:
+    def _light(self, camera: Camera, pixels: Ints, spp: int, seed: tuple[int, int]) -> Floats:
         import drjit as dr
         import mitsuba as mi
 

@@ -7,17 +7,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.paths import wave
 from appearance.render.scanlines import render_scanlines
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.projectors import Projector
-
-Image = NDArray[np.float32]
 
 _FINE = 2  # texels of Mitsuba's projector per row
 
@@ -26,7 +24,7 @@ def measure_scanlines(
     scene: HairScene,
     camera: Camera,
     projector: Projector,
-    index: NDArray[np.int64],
+    index: Ints,
     *,
     lines: int = 6,
     spp: int = 32,
@@ -42,13 +40,13 @@ def measure_scanlines(
     middle = np.linspace(0.35, 0.65, lines) * projector.height
     rows = [int(row) for row in middle]
 
-    def sweep(seed: int) -> Image:
+    def sweep(seed: int) -> Floats:
         films = render_scanlines(
             scene, camera, [projector], spp=spp, max_depth=depth, seed=seed, pixels=index
         )
         return films[projector.name][rows]
 
-    def one_by_one(seed: int) -> Image:
+    def one_by_one(seed: int) -> Floats:
         return np.concatenate(
             [
                 render_scanlines(
@@ -67,7 +65,7 @@ def measure_scanlines(
 
     theirs = _Lines(scene, projector, depth)
 
-    def path(seed: int) -> Image:
+    def path(seed: int) -> Floats:
         return np.array([theirs.render(camera, index, row, spp, seed) for row in rows])
 
     whole = projector.height / lines
@@ -81,7 +79,7 @@ def measure_scanlines(
     return found
 
 
-def _measure(render: Callable[[int], Image], scale: float, seed: int) -> dict[str, float]:
+def _measure(render: Callable[[int], Floats], scale: float, seed: int) -> dict[str, float]:
     render(seed)
     start = time.process_time()
     a = render(seed + 1).astype(float)
@@ -120,15 +118,13 @@ class _Lines:
         self._parameters = mi.traverse(self._scene)
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth + 1, "rr_depth": 5})
 
-    def _picture(self, row: int) -> Image:
+    def _picture(self, row: int) -> Floats:
         p = self._rows
         v = (np.arange(p.height * _FINE) + 0.5) / _FINE - 0.5
         weight = p.row_weight(row, v).astype(np.float32)
         return np.broadcast_to(weight[:, None, None], (len(v), p.width * _FINE, 3)).copy()
 
-    def render(
-        self, camera: Camera, index: NDArray[np.int64], row: int, spp: int, seed: int
-    ) -> Image:
+    def render(self, camera: Camera, index: Ints, row: int, spp: int, seed: int) -> Floats:
         """Radiance `(P, 3)` under one row, in the emitter's own unit."""
         import drjit as dr
         import mitsuba as mi

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Ints
 from reconstruction.geometry.strands import Strands
 
 
@@ -25,7 +26,7 @@ def strands_of(
         raise StrandFileError(f"{path}: {error}") from error
 
 
-def require_finite(path: Path, points: NDArray[Any], byte_of: NDArray[np.int64] | range) -> None:
+def require_finite(path: Path, points: NDArray[Any], byte_of: Ints | range) -> None:
     """Raise `StrandFileError` where one of `points (N, 3)` is not finite.
 
     `byte_of (N,)` says where in the file each point begins.

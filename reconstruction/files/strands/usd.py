@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
+from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.files.durable import replace_durably
 from reconstruction.files.strands.errors import StrandFileError, strands_of
 from reconstruction.geometry.strands import Strands
@@ -47,9 +47,7 @@ def read_usd(path: Path) -> Strands:
     return strands_of(path, points, offsets, float(radius[0]) if same else radius)
 
 
-def _curves(
-    path: Path, prim: Any, cache: Any, turn: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+def _curves(path: Path, prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
     """Points in metres, vertex counts and per-point radii of one prim."""
     curves = UsdGeom.BasisCurves(prim)
     where = f"{path}: {prim.GetPath()}"

@@ -9,6 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction.arrays import Floats
+
 
 @dataclass(frozen=True)
 class CameraInfo:
@@ -35,7 +37,7 @@ class Frame:
     exposure: float
     left: int = 0
 
-    def radiance(self, info: CameraInfo) -> NDArray[np.float32]:
+    def radiance(self, info: CameraInfo) -> Floats:
         """Scene-linear radiance `(H, W, 3)`, W/(sr m²); noise may push it below zero."""
         scale = np.float32(self.count_scale(info))
         radiance = self.counts.astype(np.float32)

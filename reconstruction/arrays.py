@@ -1,0 +1,12 @@
+"""The array types of the house; shapes stand in docstrings, as `(N, 3)`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+AnyFloats = NDArray[np.floating]
