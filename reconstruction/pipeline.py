@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,10 +12,8 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.capture.undistorted import as_shot, straightened
 from reconstruction.files.strands import write_strands
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
@@ -114,7 +111,7 @@ def reconstruct(
     model = Path(model)
     (model / "masks").mkdir(parents=True, exist_ok=True)
     report = Report.load(model / "report.json")
-    whole = straightened(capture, report)
+    whole = _undistorted(capture, report)
     capture = _without(whole, options.held_out)
     head, fitted = capture.head, _digitised_head(capture, model, options, report)
     if fitted is not None:
@@ -131,7 +128,7 @@ def reconstruct(
             stage.figures["network"] = network.to_dict()
         for name, mask in every.items():
             for kind, pixels in (("hair", mask.hair), ("skin", mask.skin)):
-                image = as_shot(whole, name, pixels).astype(np.uint8) * 255
+                image = whole.mask_as_shot(name, pixels).astype(np.uint8) * 255
                 cv2.imwrite(str(model / "masks" / f"{name}_{kind}.png"), image)
         masks = usable_masks(capture, every, stage)
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
@@ -222,17 +219,31 @@ def _digitised_head(
         return lay_head(points, options.head_mesh, model, stage, seed=options.seed)
 
 
+def _undistorted(capture: Capture, report: Report) -> Capture:
+    """The capture through pinholes; "lenses" says how much of each picture with a lens is left."""
+    report.stages = [s for s in report.stages if s.name != "lenses"]
+    if not any(c.distorted for c in capture.rig.cameras):
+        return capture
+    with report.stage("lenses") as stage:
+        out = capture.view(undistorted=True)
+        kept = {name: lens.kept() for name, lens in out.lenses.items()}
+        stage.figures["pixels_kept"] = kept
+        for name, share in kept.items():
+            if share < 0.85:
+                stage.warn(
+                    f"{name}: {1 - share:.0%} of the picture lie outside the undistorted one"
+                )
+    return out
+
+
 def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
     """The capture as if it had never had these cameras."""
     for name in cameras:
         capture.rig.camera(name)
-    out = copy.copy(capture)
-    rig = capture.rig
-    left = tuple(c for c in rig.cameras if c.name not in cameras)
+    left = [c.name for c in capture.rig.cameras if c.name not in cameras]
     if len(left) < 2:
         raise CaptureError(f"{capture.path}: {len(left)} cameras are left, at least 2 are needed")
-    out.rig = Rig(rig.name, left, rig.lights, rig.projectors)
-    return out
+    return capture.view(cameras=left)
 
 
 def _points(

@@ -14,9 +14,10 @@ capture/
 
 from __future__ import annotations
 
+import copy
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
@@ -26,6 +27,7 @@ import numpy as np
 
 from reconstruction.arrays import Bools, Floats
 from reconstruction.files.exr import read_exr
+from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig
 
@@ -97,7 +99,7 @@ class FrameRecord:
 
 
 class Capture:
-    """A capture folder, read. See the module's docstring for its layout."""
+    """A capture folder, read; `view` sees a part of it. The module's docstring has the layout."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -107,6 +109,60 @@ class Capture:
         self.plan: dict[str, Any] = json.loads((self.path / "plan.json").read_text())
         self.steps = tuple(Step.from_dict(s) for s in self.plan["steps"])
         self.records = dict(self._journal())
+        self._lenses: dict[str, Lens] = {}
+
+    def view(
+        self,
+        *,
+        cameras: Iterable[str] | None = None,
+        lights: Iterable[str] | None = None,
+        undistorted: bool | None = None,
+    ) -> Capture:
+        """The capture as if it had only these `cameras` and `lights`, and with pinholes if asked.
+
+        Both in the rig's order; None keeps those that this view has. `lights` are those that are
+        shot one at a time; the rig keeps its lamps. `undistorted` resamples frames and masks of
+        lenses that bend lines as they are read; False takes them as shot. The view reads the same
+        folder; this one stays as it is. Raises `CaptureError` for names that are not there.
+        """
+        out = copy.copy(self)
+        out.__dict__.pop("_of_light", None)
+        chosen = list(self.rig.cameras)
+        if cameras is not None:
+            names = self._known("camera", cameras, [c.name for c in chosen])
+            chosen = [c for c in chosen if c.name in names]
+        if undistorted is not None:
+            chosen = [self._lenses[c.name].as_shot if c.name in self._lenses else c for c in chosen]
+            out._lenses = {}
+            if undistorted:
+                out._lenses = {c.name: Lens.of(c) for c in chosen if c.distorted}
+                chosen = [out._lenses[c.name].undistorted if c.distorted else c for c in chosen]
+        out.rig = replace(self.rig, cameras=tuple(chosen))
+        if lights is not None:
+            names = self._known("light", lights, self.olat_lights())
+            out.steps = tuple(s for s in self.steps if s.kind != "olat" or s.light in names)
+        return out
+
+    @property
+    def lenses(self) -> Mapping[str, Lens]:
+        """What an undistorted view resamples, by camera."""
+        return self._lenses
+
+    def _known(self, kind: str, names: Iterable[str], known: list[str]) -> set[str]:
+        wanted = set(names)
+        if unknown := sorted(wanted - set(known)):
+            raise CaptureError(f"{self.path}: there is no {kind} {unknown}; there are {known}")
+        return wanted
+
+    def mask_as_shot(self, camera: str, mask: Bools) -> Bools:
+        """A mask `(H, W)` in the pixels of this view, in those of the frames on disk."""
+        lens = self._lenses.get(camera)
+        return mask if lens is None else lens.distort_mask(mask)
+
+    def mask_in_view(self, camera: str, mask: Bools) -> Bools:
+        """The inverse of `mask_as_shot`."""
+        lens = self._lenses.get(camera)
+        return mask if lens is None else lens.undistort_mask(mask)
 
     def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:
         """Records by (step, camera); later lines win. A torn last line is what a crash leaves."""
@@ -137,7 +193,8 @@ class Capture:
 
         Noise may push dark pixels below zero. Raises `MissingFrame`.
         """
-        return self._read(step, camera)[0]
+        image, lens = self._read(step, camera)[0], self._lenses.get(camera)
+        return image if lens is None else lens.undistort(image)
 
     def response(self, step: Step, camera: str) -> Floats:
         """`frame` divided by the step's level: the answer to the lamp at full intensity."""
@@ -153,7 +210,11 @@ class Capture:
         image, attributes = self._read(step, camera)
         full_scale = float(attributes.get("fullScale", np.inf))
         saturated = np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))
-        return (image if step.level in (0, 1) else image / np.float32(step.level)), saturated
+        image = image if step.level in (0, 1) else image / np.float32(step.level)
+        lens = self._lenses.get(camera)
+        if lens is None:
+            return image, saturated
+        return lens.undistort(image), lens.undistort_any(saturated)
 
     def count_scale(self, step: Step, camera: str) -> float:
         """Radiance of one count of the sensor in this frame; 0 where it was not quantised."""
@@ -251,11 +312,7 @@ class Capture:
         path = self.path / "masks" / f"{camera}.png"
         if not path.is_file():
             return None
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None or image.shape != self._shape(camera):
-            found = None if image is None else image.shape
-            raise CaptureError(f"{path}: expected a {self._shape(camera)} grey PNG, got {found}")
-        return np.asarray(image >= 128)
+        return self.mask_in_view(camera, read_mask(path, self._shape_as_shot(camera)))
 
     @cached_property
     def head(self) -> Mesh | None:
@@ -263,6 +320,19 @@ class Capture:
         path = self.path / "head.obj"
         return read_obj(path) if path.is_file() else None
 
+    def _shape_as_shot(self, camera: str) -> tuple[int, int]:
+        lens = self._lenses.get(camera)
+        return self._shape(camera) if lens is None else (lens.as_shot.height, lens.as_shot.width)
+
     def _shape(self, camera: str) -> tuple[int, int]:
         c = self.rig.camera(camera)
         return c.height, c.width
+
+
+def read_mask(path: Path, shape: tuple[int, int]) -> Bools:
+    """A grey PNG as a mask `(H, W)` of `shape`: half grey and above. Raises `CaptureError`."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None or image.shape != shape:
+        found = None if image is None else image.shape
+        raise CaptureError(f"{path}: expected a {shape} grey PNG, got {found}")
+    return np.asarray(image >= 128)

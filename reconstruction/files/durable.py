@@ -86,6 +86,22 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[Path]:
+    """A temporary path to write to; afterwards `path` is whole on the disk.
+
+    Where the block raises, nothing is left of what it wrote. The temporary name keeps the suffix,
+    by which many writers choose their format.
+    """
+    temporary = path.with_name(f".part-{path.name}")
+    try:
+        yield temporary
+        replace_durably(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
 def append_whole(file: FileIO, data: bytes) -> None:
     """Append to an unbuffered file and flush it; what fails is cut off again."""
     before = os.fstat(file.fileno()).st_size

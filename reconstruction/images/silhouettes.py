@@ -8,7 +8,6 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Bools, Floats
 from reconstruction.capture.folder import Capture, Step
-from reconstruction.capture.undistorted import StraightenedCapture
 
 NOISE_FACTOR = 5.0
 FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light, even without noise
@@ -72,8 +71,8 @@ def silhouette(capture: Capture, camera: str) -> Bools:
 
     Raises `NoSilhouette` where the camera has no frame to tell from.
     """
-    if isinstance(capture, StraightenedCapture):  # resampled, the faintest light spreads by a pixel
-        return capture.straight(camera, silhouette(capture.source, camera))
+    if camera in capture.lenses:  # resampled, the faintest light spreads by a pixel
+        return capture.mask_in_view(camera, silhouette(capture.view(undistorted=False), camera))
     image = lit_image(capture, camera)
     positive = image[image > 0]
     bright = float(np.percentile(positive, 95)) if positive.size else 0.0

@@ -53,7 +53,8 @@ def reconstruct(context: StepContext) -> Figures:
         {"held_out": asked.held_out_cameras, "seed": asked.seed, **asked.reconstruct},
     )
     capture = Capture(context.capture)
-    capture.steps = tuple(s for s in capture.steps if s.light not in asked.held_out_lights)
+    left = [name for name in capture.olat_lights() if name not in asked.held_out_lights]
+    capture = capture.view(lights=left)
     run(capture, context.model, method=asked.method, options=options, progress=context.progress)
     return {"strands": "strands.npz"}
 

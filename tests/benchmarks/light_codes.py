@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import shutil
 import time
@@ -25,7 +24,6 @@ from reconstruction.evaluation.baselines import control_hull, hull_smooth_field,
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.files.strands import read_strands
-from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.growth.envelope import mesh_depth
@@ -114,14 +112,8 @@ def write_hair_masks(capture: Capture, truth_folder: Path) -> None:
 
 def part_of(capture: Capture, cameras: int | None = None, lights: int | None = None) -> Capture:
     """The capture with `cameras` and `lights` of it, evenly picked in the rig's order."""
-    out = copy.copy(capture)
-    rig = capture.rig
-    some = _every(rig.cameras, cameras)
-    lit = set(_every(capture.olat_lights(), lights))
-    out.rig = Rig(rig.name, tuple(some), rig.lights, rig.projectors)
-    out.steps = tuple(s for s in capture.steps if s.kind != "olat" or s.light in lit)
-    out.__dict__.pop("_of_light", None)  # cached for the steps that it had
-    return out
+    some = [c.name for c in _every(capture.rig.cameras, cameras)]
+    return capture.view(cameras=some, lights=_every(capture.olat_lights(), lights))
 
 
 def _every(items: Sequence[Any], count: int | None) -> list[Any]:

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.undistorted import StraightenedCapture, _Lens, as_shot, straightened
+from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lens import Lens
 from reconstruction.images.silhouettes import silhouette
 from reconstruction.light_planes import solve_motion, triangulate
-from reconstruction.report.report import Report
 
 BARREL, PINCUSHION = [-3.5, 6.0, 0.03, -0.03], [4.0, 0.0, -0.03, 0.05]
 POSES = [(np.eye(3), np.array([0.0, 2e-4 * k, -3e-4 * k])) for k in range(4)]
@@ -43,9 +42,8 @@ def test_a_lens_moves_pixels_by_more_than_the_test_allows(bent: Capture) -> None
 
 
 def test_points_and_motion_are_those_of_pinholes(bent: Capture, plain: Capture) -> None:
-    report = Report()
-    capture = straightened(bent, report)
-    assert all(0.85 < share <= 1 for share in report["lenses"].figures["pixels_kept"].values())
+    capture = bent.view(undistorted=True)
+    assert all(0.85 < lens.kept() <= 1 for lens in capture.lenses.values())
     clouds, shifts = [], []
     for source in (plain, capture):
         cloud = triangulate(source)
@@ -63,7 +61,7 @@ def test_points_and_motion_are_those_of_pinholes(bent: Capture, plain: Capture) 
 def test_through_the_bent_pictures_the_points_are_off(bent: Capture, plain: Capture) -> None:
     """What the test above is worth: pinholes that were bent are seen."""
     off = []
-    for source in (plain, StraightenedCapture(bent)):
+    for source in (plain, bent.view(undistorted=True)):
         if source is not plain:
             source.rig = plain.rig
             source._lenses = {}
@@ -74,7 +72,7 @@ def test_through_the_bent_pictures_the_points_are_off(bent: Capture, plain: Capt
 
 def test_frames_masks_and_saturation_are_straight(bent: Capture) -> None:
     (bent.path / "masks").mkdir(exist_ok=True)
-    capture = StraightenedCapture(bent)
+    capture = bent.view(undistorted=True)
     for device in bent.rig.cameras:
         shot = silhouette(bent, device.name)
         cv2.imwrite(str(bent.path / "masks" / f"{device.name}.png"), shot.astype(np.uint8) * 255)
@@ -82,9 +80,9 @@ def test_frames_masks_and_saturation_are_straight(bent: Capture) -> None:
         assert mask is not None
         assert mask.shape == straight.shape
         assert (mask ^ straight).sum() < 0.04 * mask.sum()
-        again = as_shot(capture, device.name, straight)
+        again = capture.mask_as_shot(device.name, straight)
         assert (again ^ shot).sum() < 0.04 * shot.sum()
-        assert as_shot(bent, device.name, shot) is shot
+        assert bent.mask_as_shot(device.name, shot) is shot
         step = next(s for s in bent.of_kind("scanline") if s.row == 20)
         for image in (capture.frame(step, device.name), bent.frame(step, device.name)):
             assert image.min() == 0  # nothing rings
@@ -97,7 +95,7 @@ def test_frames_masks_and_saturation_are_straight(bent: Capture) -> None:
 def test_a_wave_of_eleven_pixels_is_resampled_to_two_hundredths() -> None:
     camera = Camera.look_at("c", 96, 80, (0, -1, 0), (0, 0, 0), 30.0)
     lens = replace(camera, distortion=[-0.4, 0.1, 0.005, 0.002])
-    way = _Lens.of(lens)
+    way = Lens.of(lens)
 
     def wave(device: Camera) -> np.ndarray:
         x, y = np.meshgrid(np.arange(device.width), np.arange(device.height))
@@ -106,13 +104,27 @@ def test_a_wave_of_eleven_pixels_is_resampled_to_two_hundredths() -> None:
         picture = 1 + 0.5 * np.sin(100 * u) * np.cos(80 * v)
         return np.repeat(picture[..., None], 3, axis=-1).astype(np.float32)
 
-    assert way.straight.width > 96  # a barrel's middle is drawn out
-    error = np.abs(way.straighten(wave(lens)) - wave(way.straight))
+    assert way.undistorted.width > 96  # a barrel's middle is drawn out
+    error = np.abs(way.undistort(wave(lens)) - wave(way.undistorted))
     assert np.percentile(error, 99) < 0.02
     assert error.max() < 0.04
 
 
 def test_cameras_without_a_lens_are_read_as_they_are(plain: Capture) -> None:
-    report = Report()
-    assert straightened(plain, report) is plain
-    assert not report.stages
+    view = plain.view(undistorted=True)
+    assert not view.lenses
+    step, camera = plain.steps[0], plain.rig.cameras[0]
+    assert np.array_equal(view.frame(step, camera.name), plain.frame(step, camera.name))
+
+
+def test_a_view_is_a_part_and_leaves_the_whole_alone(bent: Capture) -> None:
+    lights = bent.olat_lights()
+    view = bent.view(cameras=["right"], undistorted=True).view(lights=lights[1:2])
+    assert [c.name for c in view.rig.cameras] == ["right"]
+    assert view.olat_lights() == lights[1:2]
+    assert not view.rig.cameras[0].distorted
+    assert view.view(undistorted=False).rig.cameras == bent.rig.cameras[1:]
+    assert len(bent.rig.cameras) == 2
+    assert bent.olat_lights() == lights
+    with pytest.raises(CaptureError, match=r"no camera \['middle'\]"):
+        bent.view(cameras=["middle"])

@@ -1,0 +1,207 @@
+"""A model: the folder in which everything that is made of one capture comes to lie.
+
+Nobody else joins a path to a model folder. Every file is written under a temporary name, flushed
+and renamed: after a crash it is the old one or the new one, whole.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.arrays import Array, Bools
+from reconstruction.capture.folder import Capture, read_mask
+from reconstruction.files.durable import write_whole, writing
+from reconstruction.files.strands import read_strands, write_strands
+from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
+from reconstruction.geometry.strands import Strands
+from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.report.report import Report
+
+MaskKind = Literal["hair", "skin"]
+
+FILES = {
+    "strands.npz": "the strands, roots first (also .hair and .usdc)",
+    "strands.hair": "the strands for cyHair's readers",
+    "strands.usdc": "the strands as USD curves",
+    "points.npz": "the triangulated points",
+    "head.obj": "the head that was laid under points, where the capture has none",
+    "scalp_map.npz": "where strands are rooted on the flat map of the scalp",
+    "masks": "hair and skin of every camera, in the pixels of its frames",
+    "appearance.json": "the hair as one material, the skin, the exposure (Sun's fit)",
+    "hair_maps.npz": "the hair's material over the scalp (inverse rendering)",
+    "lights.json": "the lights as inverse rendering found them",
+    "comparison.png": "held-out frames, captured and rendered",
+    "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",
+    "relit.png": "the hair under an environment map",
+    "relit.exr": "the same as radiance",
+    "report.json": "every stage: seconds, figures, error against run time, warnings",
+    "plots": "the report's plots",
+    "results.json": "the job's figures in one object",
+    "progress.json": "what a running job is at",
+}
+"""What a model folder may hold, by its place in it. Checkpoints are there while a fit runs."""
+
+
+_RECONSTRUCT = "hairstage reconstruct CAPTURE --out"
+
+
+class ModelError(ValueError):
+    """A model that lacks what was asked for; the message names the file and what to do."""
+
+
+class Model:
+    """A model folder. It need not be there yet: `create` makes it."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def create(self) -> Model:
+        """Make the folder where it is not there; returns the model."""
+        (self.path / "masks").mkdir(parents=True, exist_ok=True)
+        return self
+
+    def file(self, name: str) -> Path:
+        """The path of one of `FILES`, or of what lies under one that is a folder."""
+        if name.split("/")[0] not in FILES:
+            raise KeyError(f"a model has no file {name!r}; there are {', '.join(FILES)}")
+        return self.path / name
+
+    def has(self, name: str) -> bool:
+        """Whether the file is there."""
+        return self.file(name).exists()
+
+    def remove(self, name: str) -> None:
+        """Remove a file where it is there."""
+        self.file(name).unlink(missing_ok=True)
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """A temporary path to write the file `name` to; see `durable.writing`."""
+        path = self.file(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with writing(path) as temporary:
+            yield temporary
+
+    def listing(self) -> list[Path]:
+        """The files that are whole, relative to the folder, in order."""
+        root = self.path.resolve()
+        return [
+            p.relative_to(root)
+            for p in sorted(root.rglob("*"))
+            if p.is_file() and not _unfinished(p) and p.resolve().is_relative_to(root)
+        ]
+
+    def strands(self) -> Strands:
+        """The strands. Raises `ModelError` where there are none yet."""
+        return read_strands(self._needed("strands.npz", _RECONSTRUCT))
+
+    def write_strands(self, strands: Strands) -> None:
+        """Write the strands in all three formats."""
+        for suffix in ("npz", "hair", "usdc"):
+            write_strands(self.file(f"strands.{suffix}"), strands)
+
+    def points(self) -> PointCloud:
+        """The triangulated points; none where there was no sweep."""
+        return PointCloud.load(self._needed("points.npz", _RECONSTRUCT))
+
+    def write_points(self, points: PointCloud) -> None:
+        """Write the triangulated points."""
+        points.save(self.file("points.npz"))
+
+    def head(self, capture: Capture | None) -> Mesh | None:
+        """The head that later steps use: the one laid under points, else the capture's."""
+        if self.has("head.obj"):
+            return read_obj(self.file("head.obj"))
+        return capture.head if capture is not None else None
+
+    def write_head(self, head: Mesh) -> None:
+        """Write the head that was laid under points."""
+        with self.writing("head.obj") as temporary:
+            write_obj(temporary, head)
+
+    def mask(self, camera: str, kind: MaskKind, capture: Capture) -> Bools:
+        """The mask `(H, W)` of `camera`, in the pixels of `capture`'s frames.
+
+        A hair mask that is absent falls back to the user's in the capture, an absent skin mask to
+        an empty one. Raises `CaptureError` for a mask of another size, `ModelError` where there is
+        no hair mask at all.
+        """
+        size, name = capture.rig.camera(camera), f"masks/{camera}_{kind}.png"
+        shape = (size.height, size.width)
+        if not self.has(name):
+            if kind == "skin":
+                return np.zeros(shape, bool)
+            user = capture.mask(camera)
+            if user is not None:
+                return user
+        return read_mask(self._needed(name, _RECONSTRUCT), shape)
+
+    def write_mask(self, camera: str, kind: MaskKind, mask: Bools) -> None:
+        """Write a mask `(H, W)`, in the pixels of the capture's frames."""
+        self.write_png(f"masks/{camera}_{kind}.png", mask.astype(np.uint8) * 255)
+
+    def write_png(self, name: str, image: NDArray[np.uint8]) -> None:
+        """Write a grey `(H, W)` or BGR `(H, W, 3)` picture."""
+        with self.writing(name) as temporary:
+            if not cv2.imwrite(str(temporary), image):
+                raise OSError(f"{self.file(name)}: OpenCV could not write it")
+
+    def arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        """The arrays of an `.npz` file by name. Raises `ModelError` where it is not there."""
+        with np.load(self._needed(name, "hairstage fit CAPTURE"), allow_pickle=False) as data:
+            return dict(data)
+
+    def write_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write arrays as a compressed `.npz` file."""
+        with self.writing(name) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    def root_uv(self, strands: Strands) -> Array | None:
+        """(u, v) of each strand's root on the scalp's map `(S, 2)`; None where there is no map."""
+        if not self.has("scalp_map.npz"):
+            return None
+        roots = np.asarray(self.arrays("scalp_map.npz")["roots"], float)
+        return np.clip(roots, 0, 1) if len(roots) == len(strands) else None
+
+    def json(self, name: str) -> Any:
+        """A JSON file. Raises `ModelError` where it is not there."""
+        return json.loads(self._needed(name, "hairstage fit CAPTURE").read_text())
+
+    def write_json(self, name: str, data: Any) -> None:
+        """Write JSON; numbers that are not finite are an error, never NaN."""
+        text = json.dumps(data, indent=1, allow_nan=False) + "\n"
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_whole(self.file(name), text.encode())
+
+    def report(self) -> Report:
+        """The report of what was done so far; an empty one where nothing was."""
+        return Report.load(self.file("report.json"))
+
+    def write_report(self, report: Report) -> None:
+        """Write the report."""
+        self.write_json("report.json", report.to_dict())
+
+    def checkpoint(self, variant: str) -> Path:
+        """Where a fit of this variant keeps its state while it runs."""
+        return self.path / f"inverse_rendering-{variant}.checkpoint.npz"
+
+    def _needed(self, name: str, command: str) -> Path:
+        path = self.file(name)
+        if not path.exists():
+            raise ModelError(f"{path} is missing: run '{command} {self.path}' first")
+        return path
+
+
+def _unfinished(path: Path) -> bool:
+    return path.suffix == ".part" or path.name.startswith(".part-")

@@ -1,0 +1,40 @@
+"""Options: frozen dataclasses that pydantic checks where they arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar, dataclass_transform
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+T = TypeVar("T")
+
+
+class BadOptions(ValueError):
+    """Options that cannot be used; one sentence for each field that is wrong, with its place."""
+
+
+@dataclass_transform(frozen_default=True)
+def options(cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass of options.
+
+    Unknown fields, NaN, infinity and values out of the range that a field is annotated with (as
+    `Annotated[float, Field(gt=0)]`) raise pydantic's `ValidationError`, which names the field's
+    place at any depth.
+    """
+    config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    made: type[T] = dataclass(frozen=True, config=config)(cls)  # type: ignore[assignment]
+    return made
+
+
+def parse_options(kind: type[T], values: Mapping[str, Any], place: str = "options") -> T:
+    """`kind` from JSON-like `values`; raises `BadOptions`, where `place` is what they are of."""
+    try:
+        return TypeAdapter(kind).validate_python(dict(values))
+    except ValidationError as error:
+        raise BadOptions(
+            "; ".join(
+                ".".join((place, *map(str, e["loc"]))) + f": {e['msg']}" for e in error.errors()
+            )
+        ) from error
