@@ -14,9 +14,9 @@ BENCHMARKS = (
     "acquisition",
     "agreement",
     "appearance",
-    "light",
-    "lightplanes",
-    "photometric",
+    "renderers",
+    "light_planes",
+    "light_codes",
     "all",
 )
 

@@ -71,7 +71,7 @@ def _light(args: argparse.Namespace) -> dict[str, Any]:
     import numpy as np
 
     from appearance.scene.hair_appearance import HairAppearance
-    from benchmarks.light import Subject, run
+    from benchmarks.renderers.errors import Subject, run
     from reconstruction.files.strands import read_strands
     from reconstruction.geometry.cameras import Camera
     from reconstruction.geometry.mesh import read_obj
@@ -107,7 +107,7 @@ def _light(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _agreement(args: argparse.Namespace) -> dict[str, Any]:
-    from benchmarks.agreement import agreement
+    from benchmarks.renderers.agreement import agreement
 
     folder = args.capture or Path(os.environ.get(_DATA, ".")) / _CAPTURE
     if not folder.is_dir():
@@ -126,8 +126,8 @@ def _appearance(args: argparse.Namespace) -> dict[str, Any]:
     import numpy as np
 
     from appearance.scene.hair_appearance import HairAppearance
-    from benchmarks.appearance import run_bench as run
-    from benchmarks.cycles import fit_cycles
+    from benchmarks.appearance.ablations import run_bench as run
+    from benchmarks.appearance.cycles import fit_cycles
     from reconstruction.files.strands import read_strands
     from reconstruction.geometry.mesh import read_obj
 
@@ -155,7 +155,7 @@ def _appearance(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
-    from benchmarks.acquisition import run
+    from benchmarks.acquisition.rates import run
     from stage_service.cli.children import Children
     from stage_service.config import RigFile, load_rig_file
 
@@ -178,7 +178,7 @@ def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _photometric(args: argparse.Namespace) -> dict[str, Any]:
-    from benchmarks.photometric import run
+    from benchmarks.light_codes.photometric import run
 
     data = os.environ.get(_DATA)
     with progress_bar("bench photometric") as progress:
@@ -187,7 +187,7 @@ def _photometric(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _lightplanes(args: argparse.Namespace) -> dict[str, Any]:
-    from benchmarks.light_plane_subjects import run
+    from benchmarks.light_planes.subjects import run
 
     data = os.environ.get(_DATA)
     with progress_bar("bench lightplanes") as progress:
@@ -196,12 +196,12 @@ def _lightplanes(args: argparse.Namespace) -> dict[str, Any]:
 
 
 BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
-    "light": _light,
+    "renderers": _light,
     "agreement": _agreement,
     "appearance": _appearance,
     "acquisition": _acquisition,
-    "lightplanes": _lightplanes,
-    "photometric": _photometric,
+    "light_planes": _lightplanes,
+    "light_codes": _photometric,
 }
 
 

@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-from benchmarks.bsdf_integrals import (
+from benchmarks.bsdf.integrals import (
     Case,
     array_types,
     cases,

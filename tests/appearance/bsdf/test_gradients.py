@@ -5,7 +5,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from benchmarks.bsdf_integrals import Case, array_types, fibre, known_direction
+from benchmarks.bsdf.integrals import Case, array_types, fibre, known_direction
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import absorption, lobes, reference

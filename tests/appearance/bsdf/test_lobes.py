@@ -5,7 +5,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
-from benchmarks.bsdf_integrals import Case, array_types, cases, fibre, known_direction, uniforms
+from benchmarks.bsdf.integrals import Case, array_types, cases, fibre, known_direction, uniforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-from benchmarks.bsdf_integrals import Case, panels
+from benchmarks.bsdf.integrals import Case, panels
 
 from appearance.bsdf import lobes, reference
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from benchmarks.bsdf_integrals import Case
+from benchmarks.bsdf.integrals import Case
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import reference

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from benchmarks.bsdf_integrals import (
+from benchmarks.bsdf.integrals import (
     Case,
     array_types,
     fibre,

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from benchmarks.path_reference import PathReference
+from benchmarks.renderers.path_reference import PathReference
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.olat import olat_tiles, render_olat

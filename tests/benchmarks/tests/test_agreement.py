@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from benchmarks.agreement import View, agreement, compare
+from benchmarks.renderers.agreement import View, agreement, compare
 
 from reconstruction.geometry.cameras import Camera
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.captures import SimulatedCapture
-from benchmarks.light_plane_subjects import FRAMINGS, rig_text
+from benchmarks.light_planes.subjects import FRAMINGS, rig_text
 
 from stage_service.config import load_rig_file
 

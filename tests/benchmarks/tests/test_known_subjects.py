@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.ablation_table import GROUPS, Table
-from benchmarks.appearance import from_afar, markdown, recovery
-from benchmarks.known_subjects import Rig, bent, dyed, subject
+from benchmarks.appearance.ablations import from_afar, markdown, recovery
+from benchmarks.appearance.known_subjects import Rig, bent, dyed, subject
+from benchmarks.appearance.table import GROUPS, Table
 
 from appearance.bsdf.maps import scalp_coordinates
 from appearance.inverse_rendering.loop import Stage1Options

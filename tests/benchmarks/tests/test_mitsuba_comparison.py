@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from benchmarks.bsdf_integrals import Case
-from benchmarks.mitsuba_comparison import CASES, bessel_errors, both, reciprocity_error
+from benchmarks.bsdf.integrals import Case
+from benchmarks.bsdf.mitsuba_comparison import CASES, bessel_errors, both, reciprocity_error
 
 TABLE = Path(__file__).parents[3] / "docs" / "bsdf.md"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.motion_errors import PAPER_PIXELS, motion_errors, true_motion
-from benchmarks.stage_costs import Growth, extrapolated, measure_growth, regridded
+from benchmarks.light_planes.motion_errors import PAPER_PIXELS, motion_errors, true_motion
+from benchmarks.light_planes.stage_costs import Growth, extrapolated, measure_growth, regridded
 
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.visual_hull import VoxelGrid

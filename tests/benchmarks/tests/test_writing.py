@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.writing import measure
+from benchmarks.acquisition.writing import measure
 
 
 def test_both_writes_are_measured_on_as_many_bytes(tmp_path):

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from benchmarks.growth_study import METHODS, compare_growth
+from benchmarks.light_planes.growth_study import METHODS, compare_growth
 
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.visual_hull import VoxelGrid

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from benchmarks.light_codes import cut_to_ball, part_of, within_ball
+from benchmarks.light_codes.patches import cut_to_ball, part_of, within_ball
 
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.evaluation.matching import compare_strands

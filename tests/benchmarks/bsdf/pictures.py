@@ -1,6 +1,6 @@
 """Pictures of the hair BSDF for docs/bsdf.md: a sheet of its looks, and white furnaces.
 
-`python -m benchmarks.bsdf_pictures FOLDER` writes `bsdf_sheet.png` and `bsdf_furnace.png`.
+`python -m benchmarks.bsdf.pictures FOLDER` writes `bsdf_sheet.png` and `bsdf_furnace.png`.
 """
 
 from __future__ import annotations

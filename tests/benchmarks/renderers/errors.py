@@ -17,9 +17,9 @@ from appearance.render.olat import render_olat
 from appearance.render.paths import Surface, stream, wave
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from benchmarks.light_plots import plot_errors, plot_growth
-from benchmarks.path_reference import PathReference
-from benchmarks.scanlines import measure_scanlines
+from benchmarks.renderers.path_reference import PathReference
+from benchmarks.renderers.plots import plot_errors, plot_growth
+from benchmarks.renderers.scanlines import measure_scanlines
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera

@@ -1,6 +1,6 @@
 """Our hair BSDF beside Mitsuba's stock `hair`: the tables of docs/bsdf.md.
 
-`python -m benchmarks.mitsuba_comparison` prints them; a test holds both to what they say.
+`python -m benchmarks.bsdf.mitsuba_comparison` prints them; a test holds both to what they say.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.special import i0e
 from appearance.bsdf import lobes, reference
 from appearance.bsdf.bessel import scaled_i0
 from appearance.scene.backend import ensure_backend
-from benchmarks.bsdf_integrals import Case, array_types, fibre, sphere, uniforms
+from benchmarks.bsdf.integrals import Case, array_types, fibre, sphere, uniforms
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
 

@@ -18,7 +18,7 @@ from appearance.metrics.scores import mean_scores, scores, scores_unavailable
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.sun_fit.fit import FitOptions
-from benchmarks.known_subjects import Captured
+from benchmarks.appearance.known_subjects import Captured
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.lights import Light
 from reconstruction.report.report import Progress, Stage, silent

@@ -149,7 +149,7 @@ def run(
 
     Captures are kept in `cache`. Leaves `OUT/<subject>/` and `OUT/lightplanes.json`.
     """
-    from benchmarks.light_planes import PAPER, SUN, Case, subject
+    from benchmarks.light_planes.study import PAPER, SUN, Case, subject
 
     for k, (name, framing) in enumerate(FRAMINGS.items()):
         if only not in (None, name) or (name != "curly" and data is None):

@@ -11,10 +11,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from benchmarks.growth_study import compare_growth
-from benchmarks.model_pictures import picture_model, picture_motion
-from benchmarks.motion_errors import motion_errors, true_motion
-from benchmarks.stage_costs import of_field, of_strands, of_triangulation
+from benchmarks.light_planes.growth_study import compare_growth
+from benchmarks.light_planes.motion_errors import motion_errors, true_motion
+from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangulation
+from benchmarks.pictures import picture_model, picture_motion
 from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical

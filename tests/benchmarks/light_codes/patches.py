@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from benchmarks.light_code_study import compare_filters, study_depths
-from benchmarks.model_pictures import picture_strands
+from benchmarks.light_codes.study import compare_filters, study_depths
+from benchmarks.pictures import picture_strands
 from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.import_folder import import_folder

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.light_codes import quick, run_imported, run_patch
-from benchmarks.photometric_rig import TARGETS, patch
+from benchmarks.light_codes.patches import quick, run_imported, run_patch
+from benchmarks.light_codes.rig import TARGETS, patch
 from reconstruction.pipeline import ReconstructOptions
 from reconstruction.report.report import Progress, silent
 from stage_service.cli.evaluate import geometry_table

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from benchmarks import light_code_study as study
+from benchmarks.light_codes import study
 
 from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank

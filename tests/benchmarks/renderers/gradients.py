@@ -1,6 +1,6 @@
 """Gradients by path replay beside finite differences, and what they cost.
 
-`python -m benchmarks.gradients OUT` writes `gradients.json` and `gradients.png`.
+`python -m benchmarks.renderers.gradients OUT` writes `gradients.json` and `gradients.png`.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.writing import measure
+from benchmarks.acquisition.writing import measure
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.report.report import Progress, silent
 from stage_service.acquisition.sequencer import Sequencer

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from benchmarks.light import Effort, Subject, relative_mse, run, with_count
+from benchmarks.renderers.errors import Effort, Subject, relative_mse, run, with_count
 
 from appearance.scene.hair_appearance import HairAppearance
 

@@ -17,7 +17,7 @@ from appearance.metrics.scores import Exposure
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from benchmarks.path_reference import PathReference
+from benchmarks.renderers.path_reference import PathReference
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.import_folder import import_folder

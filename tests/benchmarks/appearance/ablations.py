@@ -16,8 +16,8 @@ from appearance.inverse_rendering.loop import Stage1Options, run
 from appearance.inverse_rendering.problem import Effort, Problem
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import HairAppearance
-from benchmarks.ablation_table import GROUPS, Table, named
-from benchmarks.known_subjects import SUBJECTS, Captured, Rig, on_bent, subject
+from benchmarks.appearance.known_subjects import SUBJECTS, Captured, Rig, on_bent, subject
+from benchmarks.appearance.table import GROUPS, Table, named
 from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
