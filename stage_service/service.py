@@ -23,7 +23,9 @@ from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.jobs.slots import worker_is_alive
-from stage_service.plan.capture_plan import CapturePlan, PlanCost
+from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.cost import PlanCost
+from stage_service.plan.resolved import resolve
 from stage_service.records.events import EventLog
 
 T = TypeVar("T")
@@ -188,7 +190,7 @@ class Stage:
 
     def validate(self, plan: CapturePlan) -> PlanCost:
         """Cost a plan without touching a device. Raises `PlanError`."""
-        return plan.cost(self.rig_file)
+        return resolve(plan, self.rig_file).cost
 
     def start_capture(self, request: CaptureRequest, by: Caller) -> CaptureView:
         """Begin a capture. Raises `BadInput`, and what `Control.start` raises."""

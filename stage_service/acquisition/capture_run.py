@@ -8,11 +8,12 @@ from typing import Any
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.writer import CaptureWriter
 from stage_service.acquisition.capture_status import CaptureStatus, read_status
+from stage_service.acquisition.flash_watch import FlashWatch
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
 from stage_service.devices.device_set import Stage
-from stage_service.plan.capture_plan import CapturePlan, PlanError
-from stage_service.plan.flash import FlashWatch
+from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
 from stage_service.records.events import EventLog
 
 
@@ -26,8 +27,7 @@ class CaptureRun:
     def __init__(
         self,
         capture_id: str,
-        plan: CapturePlan,
-        rig_file: RigFile,
+        plan: ResolvedPlan,
         stage: Stage,
         writer: CaptureWriter,
         events: EventLog,
@@ -39,16 +39,10 @@ class CaptureRun:
         self._events = events
         self._writer = writer
         self._first = read_status(writer.path)
-        free = not rig_file.safety.living_subject or (plan.consent is not None and consented)
-        self.sequencer = Sequencer(
-            stage,
-            writer,
-            retries=plan.retries_on(rig_file),
-            runs=plan.runs(rig_file, writer.steps)[0],
-            rate_hz=plan.rate_hz,
-            watch=_any_rate if free else FlashWatch(),
-            notify=self._notify,
-        )
+        living = plan.rig_file.safety.living_subject
+        free = not living or (plan.plan.consent is not None and consented)
+        watch = _any_rate if free else FlashWatch()
+        self.sequencer = Sequencer(stage, writer, plan, watch=watch, notify=self._notify)
 
     def status(self) -> CaptureStatus:
         """Where it is now."""
@@ -70,14 +64,14 @@ class CaptureRun:
         self._events.publish(kind, {"id": self.id, **data})
 
 
-def plan_of(capture: Capture, rig_file: RigFile) -> CapturePlan:
+def plan_of(capture: Capture, rig_file: RigFile) -> ResolvedPlan:
     """The plan of a capture that is to go on. Raises `PlanError` where it no longer fits."""
     if "plan" not in capture.plan:
         raise PlanError([f"{capture.path}: this capture was not shot by a plan"])
-    plan = CapturePlan.model_validate(capture.plan["plan"])
     if capture.rig.to_dict() != rig_file.rig.to_dict():
         raise PlanError([f"{rig_file.path}: the rig has changed since this capture: begin anew"])
-    if plan.steps(rig_file) != capture.steps:
+    plan = resolve(CapturePlan.model_validate(capture.plan["plan"]), rig_file)
+    if plan.steps != capture.steps:
         raise PlanError(
             [
                 f"{rig_file.path}: [capture] has changed since this capture, and with it the "

@@ -24,8 +24,9 @@ from stage_service.acquisition.states import WrongState, possible
 from stage_service.config import RigFile
 from stage_service.devices.device_set import Stage
 from stage_service.devices.lights.limited import LitTimes
-from stage_service.plan.capture_plan import CapturePlan, PlanCost, PlanError
+from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.flash import SLOW_HZ, FlashRefusal
+from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
 from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 from stage_service.records.lease import RootLock
@@ -104,8 +105,9 @@ class CaptureManager:
         `FlashRefusal`; `PlanError` and `CaptureError` (masks) before any device is touched.
         Trouble with devices appears as outcome "failed" with `error`.
         """
-        cost = plan.cost(self.rig_file)
-        self._check_flashing(plan, cost, armed_by)
+        resolved = resolve(plan, self.rig_file)
+        cost = resolved.cost
+        _check_flashing(resolved, armed_by)
         free = shutil.disk_usage(self.folder).free
         if cost.bytes + RESERVE > free:
             need, have = cost.bytes / 1e9, free / 1e9
@@ -117,7 +119,7 @@ class CaptureManager:
             now = datetime.now(UTC)
             capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
             description = {
-                "steps": list(plan.steps(self.rig_file)),
+                "steps": list(resolved.steps),
                 "plan": plan.model_dump(mode="json"),
                 "cost": cost.model_dump(mode="json"),
                 "started": utc_now(),
@@ -128,7 +130,7 @@ class CaptureManager:
             writer = CaptureWriter.create(
                 self.folder / capture_id, self.rig_file.rig, description, masks=masks, head=head
             )
-            self._begin(capture_id, plan, stage, writer, armed_by)
+            self._begin(capture_id, resolved, stage, writer, armed_by)
         return capture_id
 
     def _continue(self, capture_id: str, armed_by: str | None) -> None:
@@ -140,7 +142,7 @@ class CaptureManager:
             self._check_free()
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
-            self._check_flashing(plan, plan.cost(self.rig_file), armed_by)
+            _check_flashing(plan, armed_by)
             stage = Stage.of(self.rig_file, self._lit)
             self._begin(capture_id, plan, stage, CaptureWriter.reopen(path), armed_by)
             del self._done[capture_id]
@@ -154,24 +156,15 @@ class CaptureManager:
             raise Busy(self._running.id)
         self.latch.check()
 
-    def _check_flashing(self, plan: CapturePlan, cost: PlanCost, armed_by: str | None) -> None:
-        if cost.flash.needs_consent and not (plan.consent and armed_by):
-            slow = plan.model_copy(update={"rate_hz": SLOW_HZ}).cost(self.rig_file)
-            raise FlashRefusal(
-                cost.flash, plan.consent, seconds=cost.seconds, slow_seconds=slow.seconds
-            )
-
     def _begin(
         self,
         capture_id: str,
-        plan: CapturePlan,
+        plan: ResolvedPlan,
         stage: Stage,
         writer: CaptureWriter,
         armed_by: str | None,
     ) -> None:
-        run = CaptureRun(
-            capture_id, plan, self.rig_file, stage, writer, self.events, consented=bool(armed_by)
-        )
+        run = CaptureRun(capture_id, plan, stage, writer, self.events, consented=bool(armed_by))
         run.thread = threading.Thread(
             target=self._run, args=(run,), name=f"capture-{capture_id}", daemon=True
         )
@@ -362,3 +355,10 @@ class CaptureManager:
         if change is not None:
             self.audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
             self.events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
+
+
+def _check_flashing(plan: ResolvedPlan, armed_by: str | None) -> None:
+    cost, consent = plan.cost, plan.plan.consent
+    if cost.flash.needs_consent and not (consent and armed_by):
+        slow = plan.at_rate(SLOW_HZ).cost
+        raise FlashRefusal(cost.flash, consent, seconds=cost.seconds, slow_seconds=slow.seconds)

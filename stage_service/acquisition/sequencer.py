@@ -23,7 +23,8 @@ from stage_service.devices.cameras.interface import Camera, Frame
 from stage_service.devices.device_set import Stage
 from stage_service.devices.errors import Cancelled, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
-from stage_service.plan.stepping import SHORTEST_RUN, Run
+from stage_service.plan.resolved import ResolvedPlan
+from stage_service.plan.stepping import SHORTEST_RUN
 
 Notify = Callable[[str, dict[str, Any]], None]
 QUEUED_STEPS = 2
@@ -47,8 +48,7 @@ class Sequencer:
     """One run over the frames that a capture still lacks, so an interrupted one goes on where it
     stopped. `run` blocks; the other methods may be called from any thread.
 
-    `runs` says who clocks which steps (default: the service all), `rate_hz` how many steps a
-    second there are at most. `watch` is called before the service lights a step, and raises what
+    `plan` is the writer's. `watch` is called before the service lights a step, and raises what
     forbids it; what the box clocks keeps to the plan's prediction. `notify(kind, data)` hears
     "capture.state", "capture.step" and "capture.frame_missing". Whatever ends the run, lamps and
     projectors are put off and read back.
@@ -58,10 +58,8 @@ class Sequencer:
         self,
         stage: Stage,
         writer: CaptureWriter,
+        plan: ResolvedPlan,
         *,
-        retries: int = 2,
-        runs: Sequence[Run] | None = None,
-        rate_hz: float | None = None,
         watch: Callable[[Step], None] = lambda _step: None,
         notify: Notify = lambda _kind, _data: None,
     ) -> None:
@@ -72,9 +70,7 @@ class Sequencer:
         self._began: float | None = None
         self._ended: float | None = None
         self._writer = writer
-        self._retries = retries
-        self._runs = [Run(writer.steps, "software")] if runs is None else list(runs)
-        self._rate_hz = rate_hz
+        self._retries, self._runs, self._rate_hz = plan.retries, plan.runs, plan.plan.rate_hz
         self._notify = notify
         self._machine = Machine()
         self._changed = threading.Condition()
@@ -91,7 +87,7 @@ class Sequencer:
         self._unclear: dict[str, str] = {}
         self._spent = Spent()
         self._exposing = Exposing(
-            stage, self._lamp, self._cancel, self._spent, rate_hz=rate_hz, watch=watch
+            stage, self._lamp, self._cancel, self._spent, rate_hz=self._rate_hz, watch=watch
         )
         self._pulses = PulseAccount(stage.trigger.name)
         self._accounts = {

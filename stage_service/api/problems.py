@@ -19,8 +19,8 @@ from stage_service.acquisition.captures import Busy, UnknownCapture
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
 from stage_service.jobs.queue import NoSuchJob
-from stage_service.plan.capture_plan import PlanError
 from stage_service.plan.flash import FlashRefusal
+from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
 from stage_service.service import (
     BadInput,

@@ -12,7 +12,8 @@ from fastapi.responses import FileResponse
 from stage_service.api.frames import png_preview
 from stage_service.api.steering import By, OnStage, ResumeRequest
 from stage_service.jobs.records import Job
-from stage_service.plan.capture_plan import CapturePlan, PlanCost
+from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.cost import PlanCost
 from stage_service.service import (
     Artifact,
     CaptureRequest,

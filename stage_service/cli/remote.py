@@ -88,6 +88,7 @@ def run_check(args: argparse.Namespace, output: Output, service: Service) -> int
 
         from stage_service.config import load_rig_file
         from stage_service.plan.capture_plan import CapturePlan
+        from stage_service.plan.resolved import resolve
 
         try:
             plan = CapturePlan.model_validate(_read_json(args.plan))
@@ -97,7 +98,7 @@ def run_check(args: argparse.Namespace, output: Output, service: Service) -> int
                 for e in error.errors()
             )
             raise CommandError(f"{args.plan}: {problems}", BAD_INPUT) from error
-        cost = plan.cost(load_rig_file(args.rig)).model_dump(mode="json")
+        cost = resolve(plan, load_rig_file(args.rig)).cost.model_dump(mode="json")
     else:
         cost = service.post("/plans:validate", _read_json(args.plan))
     output.result(cost, _costed(cost))

@@ -30,6 +30,7 @@ def run_check(args: argparse.Namespace, output: Output) -> int:
     from reconstruction.light_planes.conditioning import condition
     from stage_service.config import load_rig_file
     from stage_service.plan.capture_plan import CapturePlan
+    from stage_service.plan.resolved import resolve
 
     rig_file = load_rig_file(args.file)
     rig = rig_file.rig
@@ -39,7 +40,7 @@ def run_check(args: argparse.Namespace, output: Output) -> int:
         "lights": len(rig.lights),
         "projectors": len(rig.projectors),
         "lights_beside_cameras": sum(light.beside is not None for light in rig.lights),
-        "cost": CapturePlan().cost(rig_file).model_dump(mode="json"),
+        "cost": resolve(CapturePlan(), rig_file).cost.model_dump(mode="json"),
         "warnings": [],
         "triangulation": None,
     }

@@ -6,16 +6,13 @@ epilepsy"); up to three flashes in a second pass (W3C, WCAG 2.2, success criteri
 
 from __future__ import annotations
 
-import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from reconstruction.capture.folder import Step
-from stage_service.devices.errors import SafetyRefusal
 from stage_service.plan.timeline import Lit
 
 SLOWEST_HZ, FASTEST_HZ = 3.0, 30.0
@@ -93,7 +90,7 @@ class _Train:
         return IN_A_ROW / (self._newest[-1] - self._newest[0])
 
 
-class _Trains:
+class Trains:
     """Every light of the plan as one train, and the full-field flashes among them as another.
 
     A tracking frame before every tenth scanline outshines them: it flashes at its own rate.
@@ -114,7 +111,7 @@ class _Trains:
 
 def flash_rate(lights: Iterable[Lit], living_subject: bool) -> FlashRate:
     """Classify a plan by its predicted course."""
-    trains, worst, fastest = _Trains(), 0.0, 0.0
+    trains, worst, fastest = Trains(), 0.0, 0.0
     kinds, by_kind = dict[str, _Train](), dict[str, float]()
     for lit in lights:
         worst = max(worst, trains.add(lit.step, lit.at) or 0.0)
@@ -127,31 +124,3 @@ def flash_rate(lights: Iterable[Lit], living_subject: bool) -> FlashRate:
         return FlashRate(hz=worst, band=IN_BAND, by_kind=by_kind, needs_consent=living_subject)
     band: Band = "above 30 Hz" if fastest > FASTEST_HZ else "below 3 Hz"
     return FlashRate(hz=fastest, band=band, by_kind=by_kind, needs_consent=False)
-
-
-class FlashWatch:
-    """Measures the flash rate while running. Call it as each step's light is about to go on.
-
-    Raises `SafetyRefusal` before the flash that makes the rate fall into the band.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._trains = _Trains()
-        self._lock = threading.Lock()
-
-    def __call__(self, step: Step) -> None:
-        """Take the flash of a step that is about to be lit. Raises `SafetyRefusal`."""
-        if step.kind == "dark":
-            return
-        with self._lock:
-            rate = self._trains.add(step, self._clock())
-        if rate is not None:
-            raise SafetyRefusal(
-                "stage",
-                f"lighting step {step.index} ({step.kind})",
-                expected=f"flashes slower than {SLOWEST_HZ:g} or faster than {FASTEST_HZ:g} Hz: "
-                "no consent is armed",
-                received=f"{rate:.1f} Hz",
-                todo=f"Set rate_hz to {SLOW_HZ:g} in the plan, or record consent and arm it.",
-            )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Literal
@@ -29,7 +30,7 @@ class Run:
 
 def runs(
     steps: tuple[Step, ...], rig_file: RigFile, asked: Literal["auto", "software", "hardware"]
-) -> tuple[list[Run], str]:
+) -> tuple[tuple[Run, ...], str]:
     """Divide the steps of a plan into runs, and say why they are clocked as they are.
 
     A hardware-stepped run is never longer than what the cameras hold unread: the box cannot wait
@@ -45,7 +46,7 @@ def runs(
     elif devices.cameras.buffers < SHORTEST_RUN:
         why = f"the cameras hold only {devices.cameras.buffers} frames unread"
     if why:
-        return [Run(steps, "software")], why
+        return (Run(steps, "software"),), why
     assert devices is not None
     out: list[Run] = []
     gated = devices.lights.sequences
@@ -65,8 +66,8 @@ def runs(
     clocked = sum(len(r.steps) for r in out if r.stepping == "hardware")
     lamps = "" if gated else "; the light bank has no sequence table, so the service lights lamps"
     if clocked == 0:
-        return out, f"no {SHORTEST_RUN} steps in a row share an exposure time{lamps}"
-    return out, f"the trigger box clocks {clocked} of {len(steps)} steps{lamps}"
+        return tuple(out), f"no {SHORTEST_RUN} steps in a row share an exposure time{lamps}"
+    return tuple(out), f"the trigger box clocks {clocked} of {len(steps)} steps{lamps}"
 
 
 def period_s(step: Step, devices: DevicesConfig, rate_hz: float | None) -> float:
@@ -76,7 +77,7 @@ def period_s(step: Step, devices: DevicesConfig, rate_hz: float | None) -> float
 
 
 def seconds_by_cause(
-    parts: list[Run],
+    parts: Sequence[Run],
     rig_file: RigFile,
     *,
     wire_bytes: int,

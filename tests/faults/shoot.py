@@ -18,6 +18,7 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 
 
 def stand_still(place: str, call: int) -> None:
@@ -43,10 +44,10 @@ def stand_still(place: str, call: int) -> None:
 
 rig, devices, capture, plan, place, call = sys.argv[1:]
 stand_still(place, int(call))
-rig_file, wanted = load_rig_file(rig, devices), CapturePlan.model_validate_json(plan)
-steps = wanted.steps(rig_file)
+rig_file = load_rig_file(rig, devices)
+wanted = resolve(CapturePlan.model_validate_json(plan), rig_file)
 if (Path(capture) / "plan.json").exists():
     writer = CaptureWriter.reopen(capture)
 else:
-    writer = CaptureWriter.create(capture, rig_file.rig, {"steps": steps})
-Sequencer(Stage.of(rig_file), writer, runs=wanted.runs(rig_file, steps)[0]).run()
+    writer = CaptureWriter.create(capture, rig_file.rig, {"steps": wanted.steps})
+Sequencer(Stage.of(rig_file), writer, wanted).run()

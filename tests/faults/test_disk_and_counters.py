@@ -14,6 +14,7 @@ from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 
 STEPPING = pytest.mark.parametrize("stepping", ["software", "hardware"])
 
@@ -26,13 +27,12 @@ def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monke
     rig_file, world = simulated(
         rig=small_rig.replace("[devices.cameras]", "[devices.cameras]\nbuffers = 16")
     )
-    plan = CapturePlan(stepping=stepping)
-    steps = plan.steps(rig_file)
-    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
-    run = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, steps)[0])
+    plan = resolve(CapturePlan(stepping=stepping), rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
+    run = Sequencer(Stage.of(rig_file), writer, plan)
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
-    assert world.pulses == len(steps) > 2 * 21
+    assert world.pulses == len(plan.steps) > 2 * 21
     assert max(r.block_id for r in writer.records.values()) == 21
     told("camera: wrapped block ids", stepping, "completed", 0, None)
 
@@ -40,9 +40,8 @@ def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monke
 @STEPPING
 def test_a_full_disk(stepping, simulated, tmp_path, told):
     rig_file, world = simulated()
-    plan = CapturePlan(stepping=stepping)
-    steps = plan.steps(rig_file)
-    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
+    plan = resolve(CapturePlan(stepping=stepping), rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
     filled = []
 
     def notify(kind: str, data: dict[str, object]) -> None:
@@ -51,10 +50,9 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
             # As if another program had taken what was left.
             writer.reserve = 2 * shutil.disk_usage(tmp_path).total
 
-    runs = plan.runs(rig_file, steps)[0]
     if stepping == "hardware":
         writer.reserve = 2 * shutil.disk_usage(tmp_path).total
-    run = Sequencer(Stage.of(rig_file), writer, runs=runs, notify=notify)
+    run = Sequencer(Stage.of(rig_file), writer, plan, notify=notify)
     assert run.run() == "failed"
     assert "bytes are needed and a reserve" in str(run.error)
     assert not world.lamps.power().any()
@@ -65,7 +63,7 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     told("disk: no room left", stepping, "failed", 0, run.error)
 
     again = CaptureWriter.reopen(tmp_path / "c")
-    run = Sequencer(Stage.of(rig_file), again, runs=runs)
+    run = Sequencer(Stage.of(rig_file), again, plan)
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
 

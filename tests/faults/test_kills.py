@@ -19,6 +19,7 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
@@ -91,7 +92,7 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, tmp_path
     seconds = time.monotonic() - killed
     kept = frames(tmp_path / "c")
     writer = CaptureWriter.reopen(tmp_path / "c")
-    again = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, plan.steps(rig_file))[0])
+    again = Sequencer(Stage.of(rig_file), writer, resolve(plan, rig_file))
     assert again.run() == "completed", again.error
     assert verify(tmp_path / "c") == []
     assert kept.items() <= frames(tmp_path / "c").items(), "a finished frame was shot again"
@@ -118,15 +119,15 @@ def test_sigkill_of_the_devices(simulated, tmp_path, told):
     try:
         until(lambda: (state / DEVICES_FILE).exists() or peers.poll() is not None, 60)
         there = load_rig_file(rig, state / DEVICES_FILE)
-        plan = CapturePlan(projectors=())
-        writer = CaptureWriter.create(tmp_path / "c", there.rig, {"steps": plan.steps(there)})
+        plan = resolve(CapturePlan(projectors=(), stepping="software"), there)
+        writer = CaptureWriter.create(tmp_path / "c", there.rig, {"steps": plan.steps})
 
         def notify(kind: str, data: dict[str, Any]) -> None:
             if kind == "capture.step" and data["steps_done"] == 6:
                 peers.kill()
                 peers.wait()
 
-        run = Sequencer(Stage.of(there), writer, notify=notify)
+        run = Sequencer(Stage.of(there), writer, plan, notify=notify)
         assert run.run() == "failed"
     finally:
         peers.kill()

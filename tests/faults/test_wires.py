@@ -16,6 +16,7 @@ from simulators.peers.faults import Fault
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 
 PULSE = 9
 LIGHTS = tuple(f"light_{i:03d}" for i in range(12))
@@ -246,10 +247,9 @@ RTU = '[devices.lights]\nkind = "modbus_rtu"\nport = "lights"'
 def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, tmp_path, told):
     rig = small_rig if link == "Modbus TCP" else small_rig.replace("[devices.lights]", RTU)
     rig_file, world = simulated(*one.faults, rig=rig)
-    plan = CapturePlan(lights=LIGHTS, stepping=stepping)
-    steps = plan.steps(rig_file)
-    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
-    run = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, steps)[0])
+    plan = resolve(CapturePlan(lights=LIGHTS, stepping=stepping), rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
+    run = Sequencer(Stage.of(rig_file), writer, plan)
     run.run()
     assert run.outcome == one.outcome, run.error
     until = time.monotonic() + rig_file.devices.watchdog_s + 1.0
@@ -266,7 +266,7 @@ def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, tmp_path
         assert re.search(DEVICE_ERROR, str(run.error), re.S)
     else:
         assert run.error is None
-        assert len(capture.records) == len(steps) * 2
+        assert len(capture.records) == len(plan.steps) * 2
     name = one.name if len(one.links) == 1 else f"{one.name} ({link})"
     told(name, stepping, run.outcome, missing, run.error)
 

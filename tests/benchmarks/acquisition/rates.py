@@ -20,6 +20,7 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 from stage_service.plan.stepping import period_s
 
 Simulate = Callable[[str], AbstractContextManager[RigFile]]
@@ -130,12 +131,13 @@ def _capture(out: Path, stepping: str, simulate: Simulate) -> dict[str, Any]:
     time has the drivers' and the writer's work in it, on all threads.
     """
     with simulate(_rig("modbus_tcp")) as rig_file:
-        plan = CapturePlan(stepping="hardware" if stepping == "hardware" else "software")
-        steps, cost = plan.steps(rig_file), plan.cost(rig_file)
+        asked = CapturePlan(stepping="hardware" if stepping == "hardware" else "software")
+        plan = resolve(asked, rig_file)
+        steps, cost = plan.steps, plan.cost
         for attempt in range(2):
             folder = out / str(attempt)
             writer = CaptureWriter.create(folder, rig_file.rig, {"steps": steps})
-            sequencer = Sequencer(Stage.of(rig_file), writer, runs=plan.runs(rig_file, steps)[0])
+            sequencer = Sequencer(Stage.of(rig_file), writer, plan)
             cpu = time.process_time()
             outcome = sequencer.run()
             cpu = time.process_time() - cpu

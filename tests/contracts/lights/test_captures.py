@@ -15,6 +15,7 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import LightBankConfig
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 
 WIRE_PAGE = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
 DMX = """[devices.lights]
@@ -40,11 +41,11 @@ accept_unverified_blackout = true"""
 def test_a_capture_over_a_bank_without_read_back(wire, simulated, small_rig, tmp_path):
     rig = small_rig.replace("[devices.lights]", wire) + "[capture.level]\nall_on = 1.0\n"
     rig_file, world = simulated(rig=rig)
-    plan = CapturePlan(lights=("light_003", "light_004"), stepping="software")
-    steps = plan.steps(rig_file)
-    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": steps})
+    wanted = CapturePlan(lights=("light_003", "light_004"), stepping="software")
+    plan = resolve(wanted, rig_file)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
     stage = Stage.of(rig_file)
-    run = Sequencer(stage, writer, runs=plan.runs(rig_file, steps)[0])
+    run = Sequencer(stage, writer, plan)
     run.run()
     assert run.outcome == "completed", run.error
     assert not world.lamps.power().any()

@@ -20,7 +20,8 @@ from reconstruction.geometry.rig import RigError
 from stage_service.acquisition.captures import Busy, CaptureManager, UnknownCapture
 from stage_service.acquisition.states import WrongState
 from stage_service.config import RigFile
-from stage_service.plan.capture_plan import CapturePlan, PlanError
+from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import PlanError
 
 SHORT = CapturePlan(lights=("light_003", "light_000"), projectors=())
 LONG = CapturePlan(projectors=())

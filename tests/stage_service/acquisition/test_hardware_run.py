@@ -19,17 +19,14 @@ from stage_service.acquisition.safety import blackout
 from stage_service.acquisition.sequencer import CannotPause, Sequencer
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import resolve
 
 
 def sequencer(rig_file: Any, path: Path, heard: list[Any], **plan: Any) -> Sequencer:
-    wanted = CapturePlan(**plan)
-    steps = wanted.steps(rig_file)
-    writer = CaptureWriter.create(path, rig_file.rig, {"steps": steps})
-    runs, _ = wanted.runs(rig_file, steps)
-    assert "hardware" in {r.stepping for r in runs}
-    return Sequencer(
-        Stage.of(rig_file), writer, runs=runs, notify=lambda *event: heard.append(event)
-    )
+    wanted = resolve(CapturePlan(**plan), rig_file)
+    writer = CaptureWriter.create(path, rig_file.rig, {"steps": wanted.steps})
+    assert "hardware" in {r.stepping for r in wanted.runs}
+    return Sequencer(Stage.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event))
 
 
 def expected(step: Any, pose: int) -> float | None:
@@ -167,7 +164,7 @@ def test_a_sweep_needs_projectors_that_are_on(simulated, small_rig, tmp_path):
 def test_brackets_are_clocked_one_exposure_at_a_time(simulated, tmp_path):
     rig_file, _ = simulated()
     plan = CapturePlan(brackets=(1.0, 0.25), projectors=())
-    runs, _why = plan.runs(rig_file, plan.steps(rig_file))
+    runs = resolve(plan, rig_file).runs
     assert [(len(r.steps), r.stepping) for r in runs] == [
         (26, "hardware"),  # dark, all on, the lights
         (24, "hardware"),
@@ -220,7 +217,7 @@ def test_lamps_without_a_sequence_table_are_lit_by_the_service(
     rig_file, _world = simulated(rig=small_rig.replace("[devices.lights]", table))
     lights = tuple(f"light_{i:03d}" for i in range(9))
     plan = CapturePlan(lights=lights, level={"all_on": 1.0})
-    cost = plan.cost(rig_file)
+    cost = resolve(plan, rig_file).cost
     assert cost.stepping == {"software": 12, "hardware": 20}
     assert "the light bank has no sequence table" in cost.stepping_why
     run = sequencer(rig_file, tmp_path / "c", [], lights=lights, level={"all_on": 1.0})

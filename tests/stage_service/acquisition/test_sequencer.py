@@ -16,6 +16,7 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import ResolvedPlan, resolve
 
 LIGHTS = ("light_003", "light_000", "light_150")
 GAIN = 10000.0
@@ -25,12 +26,14 @@ SIGNALS = {"dark": 0, "all_on": 700, "tracking": 900}
 def sequencer(
     rig_file: RigFile, path: Path, events: list[Any] | None = None, **plan: Any
 ) -> Sequencer:
-    steps = CapturePlan(**{"lights": LIGHTS, **plan}).steps(rig_file)
-    writer = CaptureWriter.create(path, rig_file.rig, {"steps": steps})
+    wanted = in_software(rig_file, **plan)
+    writer = CaptureWriter.create(path, rig_file.rig, {"steps": wanted.steps})
     heard: list[Any] = [] if events is None else events
-    return Sequencer(
-        Stage.of(rig_file), writer, retries=2, notify=lambda *event: heard.append(event)
-    )
+    return Sequencer(Stage.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event))
+
+
+def in_software(rig_file: RigFile, **plan: Any) -> ResolvedPlan:
+    return resolve(CapturePlan(**{"lights": LIGHTS, "stepping": "software", **plan}), rig_file)
 
 
 def is_dark(world: Any) -> bool:
@@ -112,7 +115,7 @@ def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world,
 
     world.double = set()
     writer = CaptureWriter.reopen(tmp_path / "c")
-    assert Sequencer(Stage.of(rig_file), writer).run() == "completed"
+    assert Sequencer(Stage.of(rig_file), writer, in_software(rig_file)).run() == "completed"
     assert verify(tmp_path / "c") == []
     capture = Capture(tmp_path / "c")
     for step, light in zip((2, 3, 4), LIGHTS, strict=True):
@@ -200,7 +203,9 @@ def test_abort_keeps_what_is_finished_and_reopening_shoots_the_rest(rig_file, wo
     assert problems[0] == "The capture's outcome is 'aborted', not 'completed'."
     assert len(Capture(tmp_path / "c").records) == 15
     pulses = len(Capture(tmp_path / "c").steps) - 5
-    again = Sequencer(Stage.of(rig_file), CaptureWriter.reopen(tmp_path / "c"))
+    again = Sequencer(
+        Stage.of(rig_file), CaptureWriter.reopen(tmp_path / "c"), in_software(rig_file)
+    )
     assert again.run() == "completed"
     assert world.pulses == pulses
     assert verify(tmp_path / "c") == []

@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 import uvicorn
 
+from reconstruction.capture.folder import Step
 from reconstruction.files.exr import read_exr
 from stage_service.api.app import LOOPBACK, create_app
 from stage_service.api.problems import KINDS, Problem, errors_page
 from stage_service.config import RigFile
 from stage_service.jobs.records import Job, JobOptions
+from stage_service.plan import resolved, steps
+from stage_service.plan.capture_plan import CapturePlan
 from stage_service.service import CaptureRequest, CaptureView, JobRequest, Stage
 
 SHORT = {
@@ -149,6 +152,19 @@ def test_a_capture_its_frames_and_its_job(http, server, head):
     refused = {"name": "fit", "options": {"held_out_cameras": ["cam_7"]}}
     refused = http.post("/jobs", json={"capture": done["id"], "pipeline": refused})
     assert "cam_7" in problem(refused, "bad-input")["detail"]
+
+
+def test_a_plan_is_expanded_once_for_a_capture(http, monkeypatch):
+    """Costing, the check of its flashes, the folder and the sequencer share one `ResolvedPlan`."""
+    expanded = []
+
+    def expand(plan: CapturePlan, rig_file: RigFile) -> tuple[Step, ...]:
+        expanded.append(plan)
+        return steps.expand(plan, rig_file)
+
+    monkeypatch.setattr(resolved, "expand", expand)
+    assert capture_done(http, {"plan": SHORT})["outcome"] == "completed"
+    assert len(expanded) == 1
 
 
 def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, tmp_path, head):

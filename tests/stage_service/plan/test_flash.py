@@ -9,10 +9,12 @@ import pytest
 from pydantic import ValidationError
 
 from reconstruction.capture.folder import Step
+from stage_service.acquisition.flash_watch import FlashWatch
 from stage_service.config import RigFile, SafetyLimits, load_rig_file
 from stage_service.devices.errors import SafetyRefusal
 from stage_service.plan.capture_plan import CapturePlan
-from stage_service.plan.flash import FlashWatch, flash_rate
+from stage_service.plan.flash import flash_rate
+from stage_service.plan.resolved import resolve
 from stage_service.plan.timeline import Lit
 
 RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
@@ -73,10 +75,10 @@ def test_tracking_frames_flash_at_their_own_rate():
 
 def test_a_plan_is_classified_by_what_it_predicts(living):
     plan = CapturePlan(projectors=(), stepping="software")
-    cost = plan.cost(living)
+    cost = resolve(plan, living).cost
     per_step = cost.seconds / cost.steps
     assert cost.flash.by_kind["olat"] == pytest.approx(1 / per_step, rel=0.05)
-    slow = plan.model_copy(update={"rate_hz": 2.5}).cost(living)
+    slow = resolve(plan.model_copy(update={"rate_hz": 2.5}), living).cost
     assert (slow.flash.band, slow.flash.needs_consent) == ("below 3 Hz", False)
     assert slow.flash.hz == pytest.approx(2.5)
     assert slow.seconds >= slow.steps / 2.5
@@ -84,9 +86,9 @@ def test_a_plan_is_classified_by_what_it_predicts(living):
 
 def test_a_plan_in_the_band_needs_consent_before_a_living_subject_only(living):
     plan = CapturePlan(projectors=(), exposure={"olat": 0.08}, stepping="software", rate_hz=5.0)
-    assert plan.cost(living).flash.needs_consent
+    assert resolve(plan, living).cost.flash.needs_consent
     puppet = replace(living, safety=SafetyLimits(living_subject=False))
-    assert not plan.cost(puppet).flash.needs_consent
+    assert not resolve(plan, puppet).cost.flash.needs_consent
     with pytest.raises(ValidationError):
         CapturePlan(consent="yes")
 
@@ -96,7 +98,7 @@ def test_steps_of_the_trigger_box_are_classified_by_its_period(living):
     wired = living.devices.model_copy(update={"hardware_stepping": True})
     rig_file = replace(living, devices=wired)
     plan = CapturePlan(projectors=(), sentinels=False, exposure={"olat": 0.004}, rate_hz=20.0)
-    cost = plan.cost(rig_file)
+    cost = resolve(plan, rig_file).cost
     assert cost.stepping["hardware"] > 300
     assert cost.flash.hz == pytest.approx(20.0)
 

@@ -24,8 +24,9 @@ from stage_service.config import (
 from stage_service.devices.errors import DeviceTimeout, SafetyRefusal
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
 from stage_service.devices.lights.limited import LimitedLightBank
-from stage_service.plan.capture_plan import CapturePlan, PlanError
+from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.limits import longest_on
+from stage_service.plan.resolved import PlanError, resolve
 
 RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
 LAMPS = 10
@@ -249,7 +250,7 @@ def demo() -> RigFile:
 def test_a_plan_that_exceeds_a_limit_is_refused_with_numbers(demo, limits, plan, problem):
     rig_file = replace(demo, safety=SafetyLimits(**limits))
     with pytest.raises(PlanError) as error:
-        CapturePlan(projectors=(), **plan).cost(rig_file)
+        resolve(CapturePlan(projectors=(), **plan), rig_file)
     assert problem in str(error.value)
 
 
@@ -283,10 +284,10 @@ def test_a_level_that_the_bank_does_not_have_is_refused_in_the_plan(demo, bank, 
     rig_file = replace(demo, devices=demo.devices.model_copy(update={"lights": lights}))
     plan = CapturePlan(projectors=(), stepping="software", level=level)
     if problem is None:
-        plan.check(rig_file)
+        resolve(plan, rig_file)
         return
     with pytest.raises(PlanError) as error:
-        plan.check(rig_file)
+        resolve(plan, rig_file)
     assert len(error.value.problems) == 1
     assert problem in error.value.problems[0]
 
@@ -297,15 +298,14 @@ def test_entries_of_a_table_have_levels_where_the_lamps_have_none(demo):
     devices = demo.devices.model_copy(update={"lights": lights, "hardware_stepping": True})
     rig_file = replace(demo, devices=devices)
     plan = CapturePlan(projectors=(), sentinels=False, level={"olat": 0.5}, stepping="hardware")
-    plan.check(rig_file)
-    assert plan.cost(rig_file).stepping["software"] == 0
+    assert resolve(plan, rig_file).cost.stepping["software"] == 0
     with pytest.raises(PlanError, match="has no levels"):
-        plan.model_copy(update={"stepping": "software"}).check(rig_file)
+        resolve(plan.model_copy(update={"stepping": "software"}), rig_file)
 
 
 def test_a_plan_within_its_limits_passes(demo):
     limits = SafetyLimits(max_on_s=0.1, max_duty=0.1, max_power_w=70.0, max_lamps=331)
-    assert CapturePlan().cost(replace(demo, safety=limits)).steps > 331
+    assert resolve(CapturePlan(), replace(demo, safety=limits)).cost.steps > 331
 
 
 @given(
@@ -325,5 +325,5 @@ def test_the_longest_on_time_is_that_of_the_plain_search(gaps, window):
 
 
 def test_the_page_on_safety_names_every_limit():
-    page = (RIGS.parents[2] / "docs" / "safety.md").read_text()
+    page = (RIGS.parents[1] / "docs" / "safety.md").read_text()
     assert [f for f in SafetyLimits.model_fields if f"`{f}`" not in page] == []

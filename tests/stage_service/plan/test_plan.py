@@ -12,7 +12,8 @@ from pydantic import ValidationError
 
 from reconstruction.geometry.rig import Rig
 from stage_service.config import RigFile, load_rig_file
-from stage_service.plan.capture_plan import CapturePlan, PlanError
+from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import PlanError, resolve
 
 RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
 
@@ -28,7 +29,7 @@ def stage331() -> RigFile:
 
 
 def test_the_default_plan_of_the_demonstration(demo):
-    steps = CapturePlan().steps(demo)
+    steps = resolve(CapturePlan(), demo).steps
     kinds = [s.kind for s in steps]
     assert kinds[:3] == ["dark", "all_on", "olat"]
     assert kinds[-2:] == ["dark", "all_on"]
@@ -40,7 +41,7 @@ def test_the_default_plan_of_the_demonstration(demo):
 
 
 def test_a_tracking_frame_stands_before_each_full_group_of_ten(demo):
-    steps = CapturePlan(lights=(), sentinels=False, projectors=("proj_1",)).steps(demo)
+    steps = resolve(CapturePlan(lights=(), sentinels=False, projectors=("proj_1",)), demo).steps
     rows_after = [steps[i + 1].row for i, s in enumerate(steps) if s.kind == "tracking"]
     assert rows_after == [0, 10, 20, 30, 40, 50]
 
@@ -48,14 +49,14 @@ def test_a_tracking_frame_stands_before_each_full_group_of_ten(demo):
 def test_photobooth_counts_as_in_the_paper(stage331):
     rig = stage331.rig
     sixteen = replace(stage331, rig=Rig("booth", rig.cameras[:16], (), rig.projectors))
-    cost = CapturePlan(lights=(), sentinels=False).cost(sixteen)
+    cost = resolve(CapturePlan(lights=(), sentinels=False), sixteen).cost
     assert cost.frames_by_kind == {"tracking": 3648, "scanline": 36864}
     assert cost.frames == 40512
 
 
 def test_a_full_stage_is_costed_in_under_a_second(stage331):
     start = time.perf_counter()
-    cost = CapturePlan().cost(stage331)
+    cost = resolve(CapturePlan(), stage331).cost
     assert time.perf_counter() - start < 1.0
     assert cost.frames == 50 * (331 + 3 * (768 + 76) + 4)
     assert cost.seconds == pytest.approx(sum(cost.seconds_by_cause.values()))
@@ -65,13 +66,13 @@ def test_bytes_are_those_of_the_files(demo, tmp_path):
     from reconstruction.capture.writer import CaptureWriter
 
     plan = CapturePlan(lights=("light_007",), projectors=(), sentinels=False)
-    writer = CaptureWriter.create(tmp_path / "c", demo.rig, {"steps": plan.steps(demo)})
+    writer = CaptureWriter.create(tmp_path / "c", demo.rig, {"steps": resolve(plan, demo).steps})
     for camera in demo.rig.cameras:
         image = np.zeros((camera.height, camera.width, 3), np.float32)
         writer.write_frame(writer.steps[0], camera.name, image, full_scale=1.0, count_scale=0.1)
     writer.close()
     size = sum(f.stat().st_size for f in tmp_path.rglob("*.exr"))
-    assert plan.cost(demo).bytes == pytest.approx(size, rel=0.01)
+    assert resolve(plan, demo).cost.bytes == pytest.approx(size, rel=0.01)
 
 
 def test_dose_follows_the_inverse_square_law(demo):
@@ -83,7 +84,7 @@ def test_dose_follows_the_inverse_square_law(demo):
         exposure={"olat": 1.0},
         level={"olat": 0.5},
     )
-    cost = plan.cost(demo)
+    cost = resolve(plan, demo).cost
     distance = np.linalg.norm(light.position)
     np.testing.assert_allclose(cost.dose, 0.5 * light.intensity / distance**2, rtol=3e-3)
     assert cost.lamp_seconds == pytest.approx(0.5, rel=3e-3)
@@ -91,7 +92,7 @@ def test_dose_follows_the_inverse_square_law(demo):
 
 def test_exposure_and_level_are_the_plan_s_then_the_rig_file_s(demo):
     plan = CapturePlan(lights=("light_000",), exposure={"olat": 0.5}, level={"tracking": 0.3})
-    by_kind = {s.kind: (s.exposure, s.level) for s in plan.steps(demo)}
+    by_kind = {s.kind: (s.exposure, s.level) for s in resolve(plan, demo).steps}
     assert by_kind["olat"] == (0.5, demo.capture.level.olat)
     assert by_kind["tracking"] == (demo.capture.exposure.tracking, 0.3)
     assert by_kind["dark"][1] == 0.0
@@ -110,7 +111,7 @@ def test_exposure_and_level_are_the_plan_s_then_the_rig_file_s(demo):
 )
 def test_what_the_rig_cannot_do_is_refused_before_anything_lights(demo, plan, problem):
     with pytest.raises(PlanError) as error:
-        CapturePlan(**plan).cost(demo)
+        resolve(CapturePlan(**plan), demo)
     assert problem in str(error.value)
 
 
@@ -132,7 +133,7 @@ def test_values_out_of_range_are_refused(plan):
 
 def test_no_projector_no_sweep_and_it_is_said(demo):
     without = replace(demo, rig=Rig("dome", demo.rig.cameras, demo.rig.lights))
-    cost = CapturePlan().cost(without)
+    cost = resolve(CapturePlan(), without).cost
     assert "scanline" not in cost.frames_by_kind
     (left_out,) = cost.left_out
     assert (left_out.what, left_out.why) == ("scanline sweep", "the rig has no projector")
@@ -141,7 +142,7 @@ def test_no_projector_no_sweep_and_it_is_said(demo):
 def test_no_projector_controller_leaves_the_sweep_out(demo):
     assert demo.devices is not None
     bare = replace(demo, devices=demo.devices.model_copy(update={"projectors": None}))
-    (left_out,) = CapturePlan().cost(bare).left_out
+    (left_out,) = resolve(CapturePlan(), bare).cost.left_out
     assert left_out.saved == f"{3 * 64 * 8} frames"
     with pytest.raises(PlanError, match=r"no \[devices.projectors\]"):
-        CapturePlan(projectors=("proj_0",)).cost(bare)
+        resolve(CapturePlan(projectors=("proj_0",)), bare)

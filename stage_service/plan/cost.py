@@ -1,0 +1,90 @@
+"""What a plan takes: frames, bytes, seconds, light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from reconstruction.capture.folder import Step
+from reconstruction.geometry.rig import Rig
+from stage_service.plan.flash import FlashRate
+
+EXR_HEADER_BYTES = 700
+"""What an EXR file holds beside 12 bytes a pixel, not counting its table of lines."""
+
+
+class _Told(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class LeftOutWork(_Told):
+    """Work that this plan does not need on this rig."""
+
+    what: str
+    why: str
+    saved: str
+
+
+class PlanCost(_Told):
+    """What a plan takes, retries apart.
+
+    `frames` counts pictures (steps times cameras), `bytes` what the capture folder gets while
+    shooting, `seconds` includes exposure, settling, readout, link and storage; `limited_by` names
+    what takes most of it. `stepping` counts the steps that the service and the trigger box clock,
+    and `stepping_why` says why. `lamp_seconds` sums level times on-time over lamps; `dose` is the
+    radiant exposure at the head's centre, J/m² per channel, lamps and projectors together. `flash`
+    says how fast it flashes, and whether a living subject must have consented to that.
+    """
+
+    steps: int
+    frames: int
+    frames_by_kind: dict[str, int]
+    bytes: int
+    seconds: float
+    seconds_by_cause: dict[str, float]
+    limited_by: str
+    stepping: dict[str, int]
+    stepping_why: str
+    lamp_seconds: float
+    dose: tuple[float, float, float]
+    flash: FlashRate
+    left_out: tuple[LeftOutWork, ...]
+
+
+def folder_bytes(rig: Rig) -> int:
+    """Bytes of one step's frames, as they are written while shooting."""
+    return sum(EXR_HEADER_BYTES + 16 * c.height + 12 * c.width * c.height for c in rig.cameras)
+
+
+def dose_of(
+    rig: Rig, steps: Sequence[Step], overhead_s: float
+) -> tuple[float, tuple[float, float, float]]:
+    """Lamp seconds, and radiant exposure at the head's centre, J/m² per channel.
+
+    By the inverse-square law; a light is on `overhead_s` longer than its exposure. A row lights a
+    point for about one row's time: it counts as 1/height of its projector.
+    """
+    lamps = {
+        x.name: x.intensity_towards(np.zeros(3)) / (x.position @ x.position) for x in rig.lights
+    }
+    beams = {p.name: (p.intensity / (p.center @ p.center), p.height) for p in rig.projectors}
+    all_lamps = sum(lamps.values(), np.zeros(3))
+    all_beams = sum((beam for beam, _ in beams.values()), np.zeros(3))
+    dose, lamp_seconds = np.zeros(3), 0.0
+    for step in steps:
+        time = step.level * (step.exposure + overhead_s)
+        if step.kind == "all_on":
+            dose += time * all_lamps
+            lamp_seconds += time * len(lamps)
+        elif step.light is not None:
+            dose += time * lamps[step.light]
+            lamp_seconds += time
+        elif step.kind == "tracking":
+            dose += time * all_beams
+        elif step.projector is not None:
+            beam, height = beams[step.projector]
+            dose += time * beam / height
+    r, g, b = (float(x) for x in dose)
+    return lamp_seconds, (r, g, b)

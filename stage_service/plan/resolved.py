@@ -1,0 +1,159 @@
+"""A plan on a rig: `resolve` makes it once, and everybody who shoots or costs it gets that one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+from reconstruction.capture.folder import Step
+from stage_service.config import LONGEST_S, SHORTEST_S, RigFile
+from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.cost import LeftOutWork, PlanCost, dose_of, folder_bytes
+from stage_service.plan.flash import flash_rate
+from stage_service.plan.limits import check_levels, check_limits
+from stage_service.plan.stepping import LATENCY_S, Run, limited_by, runs, seconds_by_cause
+from stage_service.plan.steps import expand, exposures_of, no_controller, rows_of, swept
+from stage_service.plan.timeline import timeline
+
+
+class PlanError(ValueError):
+    """A plan that this rig cannot shoot; `problems` has one sentence for each reason."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("; ".join(problems))
+        self.problems = problems
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedPlan:
+    """A plan that `rig_file` can shoot: its steps in order, divided into runs.
+
+    `stepping_why` says why they are clocked as they are.
+    """
+
+    plan: CapturePlan
+    rig_file: RigFile
+    steps: tuple[Step, ...]
+    runs: tuple[Run, ...]
+    stepping_why: str
+
+    @property
+    def retries(self) -> int:
+        """How often a missing frame is shot again."""
+        asked = self.plan.retries
+        return self.rig_file.capture.retries if asked is None else asked
+
+    def at_rate(self, hz: float) -> ResolvedPlan:
+        """The same steps, at most `hz` a second."""
+        return replace(self, plan=self.plan.model_copy(update={"rate_hz": hz}))
+
+    @cached_property
+    def cost(self) -> PlanCost:
+        """What it takes, predicted."""
+        rig, steps, rate_hz = self.rig_file.rig, self.steps, self.plan.rate_hz
+        cameras, folder = len(rig.cameras), folder_bytes(rig)
+        causes = seconds_by_cause(
+            self.runs,
+            self.rig_file,
+            wire_bytes=6 * sum(c.width * c.height for c in rig.cameras),
+            folder_bytes=folder,
+            rate_hz=rate_hz,
+        )
+        lag = causes["storage"] / len(steps)
+        lights = timeline(self.runs, self.rig_file, rate_hz=rate_hz, lag_s=lag)
+        lamp_seconds, dose = dose_of(rig, steps, causes["settle"] / len(steps) + LATENCY_S)
+        clocked = Counter({"software": 0, "hardware": 0})
+        for run in self.runs:
+            clocked[run.stepping] += len(run.steps)
+        return PlanCost(
+            steps=len(steps),
+            frames=len(steps) * cameras,
+            frames_by_kind={k: n * cameras for k, n in Counter(s.kind for s in steps).items()},
+            bytes=len(steps) * folder,
+            seconds=sum(causes.values()),
+            seconds_by_cause=causes,
+            limited_by=limited_by(causes),
+            stepping=dict(clocked),
+            stepping_why=self.stepping_why,
+            lamp_seconds=lamp_seconds,
+            dose=dose,
+            flash=flash_rate(lights, self.rig_file.safety.living_subject),
+            left_out=self._left_out(),
+        )
+
+    def _left_out(self) -> tuple[LeftOutWork, ...]:
+        """What "all" does not contain on this rig, and why."""
+        rig = self.rig_file.rig
+        if self.plan.projectors != "all":
+            return ()
+        if not rig.projectors:
+            why, saved = "the rig has no projector", "its frames and its time"
+        elif no_controller(self.rig_file):
+            rows = sum(len(rows_of(self.plan.rows, p)) for p in rig.projectors)
+            why = "the rig file has no [devices.projectors]"
+            saved = f"{rows * len(rig.cameras)} frames"
+        else:
+            return ()
+        return (LeftOutWork(what="scanline sweep", why=why, saved=saved),)
+
+
+def resolve(plan: CapturePlan, rig_file: RigFile) -> ResolvedPlan:
+    """The plan on this rig; touches no device. Raises `PlanError` with all that it cannot do."""
+    problems = _misfits(plan, rig_file)
+    steps = () if problems else expand(plan, rig_file)
+    if not problems and not steps:
+        problems.append("the plan has no steps: no lights, no projectors, no sentinels")
+    if problems:
+        raise PlanError(problems)
+    parts, why = runs(steps, rig_file, plan.stepping)
+    lights = timeline(parts, rig_file, rate_hz=plan.rate_hz)
+    problems += check_limits(lights, rig_file.rig, rig_file.safety)
+    if rig_file.devices is not None:
+        problems += check_levels(parts, rig_file.devices.lights)
+    if problems:
+        raise PlanError(problems)
+    return ResolvedPlan(plan, rig_file, steps, parts, why)
+
+
+def _misfits(plan: CapturePlan, rig_file: RigFile) -> list[str]:
+    """What the plan asks for that the rig does not have."""
+    rig, devices = rig_file.rig, rig_file.devices
+    problems = _unknown("light", plan.lights, [x.name for x in rig.lights])
+    problems += _unknown("projector", plan.projectors, [x.name for x in rig.projectors])
+    for p in swept(plan, rig_file):
+        last = p.height - 1 if plan.rows.last is None else plan.rows.last
+        if last >= p.height or plan.rows.first > last:
+            problems.append(
+                f"rows {plan.rows.first} to {last}: projector {p.name} has rows 0 to {p.height - 1}"
+            )
+    if len(set(plan.brackets)) < len(plan.brackets):
+        problems.append(f"brackets: {list(plan.brackets)} has a factor twice")
+    olat = exposures_of(plan, rig_file).olat
+    for factor in plan.brackets:
+        if not SHORTEST_S <= factor * olat <= LONGEST_S:
+            problems.append(
+                f"brackets: {factor:g} times {olat:g} s is an exposure of {factor * olat:g} s; "
+                f"the trigger box makes {SHORTEST_S:g} to {LONGEST_S:g} s"
+            )
+    if plan.stepping == "hardware" and (devices is None or not devices.hardware_stepping):
+        problems.append(
+            "stepping: the rig file does not say that the trigger box's gates are wired; set "
+            "hardware_stepping in [devices], or let the service step"
+        )
+    if plan.projectors != "all" and plan.projectors and no_controller(rig_file):
+        problems.append("projectors: the rig file has no [devices.projectors]")
+    return problems
+
+
+def _unknown(kind: str, chosen: Literal["all"] | tuple[str, ...], known: list[str]) -> list[str]:
+    if chosen == "all":
+        return []
+    problems = [
+        f"{kind}s: the rig has no {kind} {name!r} (it has {', '.join(known[:5])}, …)"
+        for name in chosen
+        if name not in set(known)
+    ]
+    twice = sorted({name for name in chosen if chosen.count(name) > 1})
+    return problems + [f"{kind}s: {name!r} is listed twice" for name in twice]

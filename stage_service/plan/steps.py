@@ -1,0 +1,69 @@
+"""The steps of a plan on a rig, in the order in which they are shot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from reconstruction.capture.folder import Step
+from reconstruction.geometry.projectors import Projector
+from stage_service.config import Exposures, Levels, RigFile
+from stage_service.plan.capture_plan import CapturePlan, Rows
+
+
+def expand(plan: CapturePlan, rig_file: RigFile) -> tuple[Step, ...]:
+    """The plan's steps; it names only what the rig has."""
+    defaults = rig_file.capture
+    exposures, levels = exposures_of(plan, rig_file), levels_of(plan, rig_file)
+    ends = [{"kind": "dark"}, {"kind": "all_on"}] if plan.sentinels else []
+    names = [x.name for x in rig_file.rig.lights] if plan.lights == "all" else plan.lights
+    todo: list[dict[str, Any]] = [*ends]
+    todo += [
+        {"kind": "olat", "light": name, "exposure": exposures.olat * factor}
+        for factor in plan.brackets
+        for name in names
+    ]
+    every = defaults.tracking_every if plan.tracking_every is None else plan.tracking_every
+    for projector in swept(plan, rig_file):
+        rows = rows_of(plan.rows, projector)
+        groups = max(1, len(rows) // every) if every else 0
+        for i, row in enumerate(rows):
+            if every and i % every == 0 and i // every < groups:
+                todo.append({"kind": "tracking"})
+            todo.append({"kind": "scanline", "projector": projector.name, "row": row})
+    todo += ends
+    return tuple(
+        Step(
+            index=i,
+            level=0.0 if fields["kind"] == "dark" else getattr(levels, fields["kind"]),
+            **{"exposure": getattr(exposures, fields["kind"]), **fields},
+        )
+        for i, fields in enumerate(todo)
+    )
+
+
+def exposures_of(plan: CapturePlan, rig_file: RigFile) -> Exposures:
+    """Seconds per kind of step: the plan's, else the rig file's."""
+    return rig_file.capture.exposure.model_copy(update=plan.exposure.model_dump(exclude_none=True))
+
+
+def levels_of(plan: CapturePlan, rig_file: RigFile) -> Levels:
+    """Levels per kind of step: the plan's, else the rig file's."""
+    return rig_file.capture.level.model_copy(update=plan.level.model_dump(exclude_none=True))
+
+
+def swept(plan: CapturePlan, rig_file: RigFile) -> list[Projector]:
+    """The projectors that sweep; "all" are none where nothing controls them."""
+    if plan.projectors == "all":
+        return [] if no_controller(rig_file) else list(rig_file.rig.projectors)
+    return [p for p in rig_file.rig.projectors if p.name in plan.projectors]
+
+
+def no_controller(rig_file: RigFile) -> bool:
+    """Whether the rig file has devices, but none for projectors."""
+    return rig_file.devices is not None and rig_file.devices.projectors is None
+
+
+def rows_of(rows: Rows, projector: Projector) -> range:
+    """The rows that this projector shows."""
+    last = projector.height - 1 if rows.last is None else rows.last
+    return range(rows.first, min(last, projector.height - 1) + 1, rows.step)
