@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, read_mask
-from reconstruction.files.durable import write_whole, writing
+from reconstruction.files.durable import PART, write_json, writing
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.strands import Strands
@@ -99,7 +99,7 @@ class Model:
         return [
             p.relative_to(root)
             for p in sorted(root.rglob("*"))
-            if p.is_file() and not _unfinished(p) and p.resolve().is_relative_to(root)
+            if p.is_file() and not p.name.startswith(PART) and p.resolve().is_relative_to(root)
         ]
 
     def strands(self) -> Strands:
@@ -164,8 +164,8 @@ class Model:
 
     def write_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write arrays as a compressed `.npz` file."""
-        with self.writing(name) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        with self.writing(name) as temporary:
+            np.savez_compressed(temporary, allow_pickle=False, **arrays)
 
     def root_uv(self, strands: Strands) -> Array | None:
         """(u, v) of each strand's root on the scalp's map `(S, 2)`; None where there is no map."""
@@ -180,9 +180,8 @@ class Model:
 
     def write_json(self, name: str, data: Any) -> None:
         """Write JSON; numbers that are not finite are an error, never NaN."""
-        text = json.dumps(data, indent=1, allow_nan=False) + "\n"
         self.path.mkdir(parents=True, exist_ok=True)
-        write_whole(self.file(name), text.encode())
+        write_json(self.file(name), data)
 
     def report(self) -> Report:
         """The report of what was done so far; an empty one where nothing was."""
@@ -201,7 +200,3 @@ class Model:
         if not path.exists():
             raise ModelError(f"{path} is missing: run '{command} {self.path}' first")
         return path
-
-
-def _unfinished(path: Path) -> bool:
-    return path.suffix == ".part" or path.name.startswith(".part-")

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.files.strands import write_strands
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.visual_hull import VoxelGrid
@@ -22,7 +19,7 @@ from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.head.fitted import FittedHead, digitised_points, lay_head, skin_points
-from reconstruction.head.root_map import save_root_map
+from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.line_strands import both, line_strands
@@ -37,6 +34,7 @@ from reconstruction.light_planes import (
 )
 from reconstruction.masks import HairMask, hair_masks, usable_masks
 from reconstruction.methods import METHODS, Method
+from reconstruction.model import Model
 from reconstruction.report.report import Progress, Report, Stage, silent
 from reconstruction.tangents.estimate import Measured, MeasureOptions, measure_tangents
 
@@ -90,14 +88,14 @@ class ReconstructOptions:
 
 def reconstruct(
     capture: Capture,
-    model: Path,
+    model: Model,
     *,
     method: Method = "light_planes",
     options: ReconstructOptions = ReconstructOptions(),
     motion: Motion | None = None,
     progress: Progress = silent,
 ) -> Report:
-    """Reconstruct the strands of `capture` into the folder `model`.
+    """Reconstruct the strands of `capture` into `model`.
 
     `motion` is the subject's where it is known from elsewhere; None solves for it.
 
@@ -108,9 +106,7 @@ def reconstruct(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
-    model = Path(model)
-    (model / "masks").mkdir(parents=True, exist_ok=True)
-    report = Report.load(model / "report.json")
+    report = model.create().report()
     whole = _undistorted(capture, report)
     capture = _without(whole, options.held_out)
     head, fitted = capture.head, _digitised_head(capture, model, options, report)
@@ -119,7 +115,7 @@ def reconstruct(
 
     with report.stage("triangulation") as stage:
         cloud = _points(capture, motion, options, report, stage, progress)
-        cloud.save(model / "points.npz")
+        model.write_points(cloud)
     with report.stage("masks") as stage:
         # a held-out camera's mask says where to compare pictures; nothing here looks at it
         network = None if options.network is None else Network(**options.network)
@@ -127,20 +123,21 @@ def reconstruct(
         if network is not None:
             stage.figures["network"] = network.to_dict()
         for name, mask in every.items():
-            for kind, pixels in (("hair", mask.hair), ("skin", mask.skin)):
-                image = whole.mask_as_shot(name, pixels).astype(np.uint8) * 255
-                cv2.imwrite(str(model / "masks" / f"{name}_{kind}.png"), image)
+            model.write_mask(name, "hair", whole.mask_as_shot(name, mask.hair))
+            model.write_mask(name, "skin", whole.mask_as_shot(name, mask.skin))
         masks = usable_masks(capture, every, stage)
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
         stage.figures["source"] = {k: m.source for k, m in masks.items()}
     if method in ("photometric", "lmvs"):
-        _write(model, _line_strands(capture, masks, head, method, options, report, progress))
-        report.save(model / "report.json")
+        strands = _line_strands(capture, masks, head, method, options, report, progress)
+        model.write_strands(strands)
+        model.write_report(report)
         return report
     if head is None:
         with report.stage("head") as stage:
             skin = skin_points(capture, cloud, masks)
-            fitted = lay_head(skin, options.head_mesh, model, stage, cloud=cloud, seed=options.seed)
+            fitted = lay_head(skin, options.head_mesh, stage, cloud=cloud, seed=options.seed)
+            model.write_head(fitted.mesh)
         head = fitted.mesh
     with report.stage("envelope") as stage:
         envelope, depths = build_envelope(
@@ -162,9 +159,9 @@ def reconstruct(
         field = _field(envelope, measured, scalp, options, stage)
     with report.stage("strands") as stage:
         strands = grow(field, scalp, options, stage, progress, seen)
-        _write(model, strands)
-        save_root_map(model, strands, scalp, fitted.scalp_map if fitted else None, stage)
-    report.save(model / "report.json")
+        model.write_strands(strands)
+        write_root_map(model, strands, scalp, fitted.scalp_map if fitted else None, stage)
+    model.write_report(report)
     return report
 
 
@@ -199,16 +196,11 @@ def _line_strands(
     return strands
 
 
-def _write(model: Path, strands: Strands) -> None:
-    for suffix in ("npz", "hair", "usdc"):
-        write_strands(model / f"strands.{suffix}", strands)
-
-
 def _digitised_head(
-    capture: Capture, model: Path, options: ReconstructOptions, report: Report
+    capture: Capture, model: Model, options: ReconstructOptions, report: Report
 ) -> FittedHead | None:
     """The head under the user's scalp points; they win over `head.obj` where asked for."""
-    (model / "head.obj").unlink(missing_ok=True)
+    model.remove("head.obj")
     report.stages = [s for s in report.stages if s.name != "head"]
     if capture.head is not None and options.scalp_points is None:
         return None
@@ -216,7 +208,9 @@ def _digitised_head(
     if points is None:
         return None
     with report.stage("head") as stage:
-        return lay_head(points, options.head_mesh, model, stage, seed=options.seed)
+        fitted = lay_head(points, options.head_mesh, stage, seed=options.seed)
+        model.write_head(fitted.mesh)
+    return fitted
 
 
 def _undistorted(capture: Capture, report: Report) -> Capture:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import read_obj
 from reconstruction.geometry.rig import Rig
+from reconstruction.model import Model
 from stage_service.acquisition.capture_status import CaptureStatus
 from stage_service.acquisition.captures import CaptureManager, UnknownCapture
 from stage_service.acquisition.control import Caller, Control
@@ -292,13 +293,10 @@ class Stage:
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
-        model = Path(self.queue.get(job_id).model).resolve()
-        files = (
-            p
-            for p in sorted(model.rglob("*"))
-            if p.is_file() and p.suffix != ".part" and p.resolve().is_relative_to(model)
-        )
-        return [Artifact(path=str(p.relative_to(model)), bytes=p.stat().st_size) for p in files]
+        model = Model(self.queue.get(job_id).model)
+        return [
+            Artifact(path=str(p), bytes=(model.path / p).stat().st_size) for p in model.listing()
+        ]
 
     def artifact(self, job_id: str, path: str) -> Path:
         """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""

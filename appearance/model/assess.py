@@ -29,7 +29,7 @@ from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.lights import Light
-from reconstruction.head.fitted import model_head
+from reconstruction.model import Model
 from reconstruction.report.report import Progress, Report, Stage, silent
 
 METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
@@ -90,7 +90,7 @@ def assess(
     strands = read_strands(model / "strands.npz")
     report = Report.load(model / "report.json")
     with report.stage("images") as stage:
-        head = model_head(model, capture)
+        head = Model(model).head(capture)
         scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
         progress("fitting the baselines", 0.0)
         training = _training(capture, model, held_out, options, seed)

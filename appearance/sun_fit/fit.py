@@ -33,7 +33,7 @@ from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
 from reconstruction.arrays import Array, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.files.strands import read_strands
-from reconstruction.head.fitted import model_head
+from reconstruction.model import Model
 from reconstruction.report.report import Progress, Report, Series, Stage, silent
 
 BETA_N = 0.2
@@ -80,7 +80,7 @@ def fit(
         exposure = Exposure.of([o.radiance[o.valid] for o in hair])
         hair, skin = _reached(capture, hair, skin, exposure, stage)
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
-    head = model_head(model, capture)
+    head = Model(model).head(capture)
     scene = build_scene(strands, head, hair=start)
     fitting = SunFit(scene, hair, skin, options, seed, progress)
     with report.stage("roughness") as stage:
@@ -119,7 +119,7 @@ def _observed(
     rng = np.random.default_rng(seed)
     cameras, lights = held_out.training_cameras(capture), held_out.training_lights(capture)
     hair, skin, seen = [], [], 0
-    has_head = model_head(model, capture) is not None
+    has_head = Model(model).head(capture) is not None
     for i, name in enumerate(cameras):
         progress("reading hair pixels", 0.3 * i / len(cameras))
         mask = model_mask(model, name, "hair", capture)

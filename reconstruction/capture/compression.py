@@ -14,9 +14,8 @@ from reconstruction.capture.writer import (
     checksums,
     open_journal,
     sha256,
-    write_json,
 )
-from reconstruction.files.durable import flush, naming_full_disk, require_free
+from reconstruction.files.durable import flush, naming_full_disk, require_free, write_json
 from reconstruction.files.exr import read_exr, write_exr
 from reconstruction.report.report import Progress, silent
 

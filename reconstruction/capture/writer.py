@@ -26,14 +26,17 @@ from numpy.typing import NDArray
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError, FrameRecord, Step
 from reconstruction.files.durable import (
+    PART,
     RESERVE,
     append_whole,
     flush,
     part,
     replace_durably,
     require_free,
+    write_json,
     write_pages,
     write_whole,
+    writing,
 )
 from reconstruction.files.exr import UncompressedExr
 from reconstruction.geometry.mesh import Mesh, write_obj
@@ -100,8 +103,8 @@ class CaptureWriter:
                 raise CaptureError(f"masks/{name}.png: cannot be written")
             write_whole(path / "masks" / f"{name}.png", png.tobytes())
         if head is not None:
-            write_obj(path / "head.obj.part", head)
-            replace_durably(path / "head.obj.part", path / "head.obj")
+            with writing(path / "head.obj") as temporary:
+                write_obj(temporary, head)
         journal = open_journal(path)
         write_json(path / "plan.json", {**plan, "steps": [s.to_dict() for s in steps]})
         flush(path)
@@ -116,7 +119,7 @@ class CaptureWriter:
         journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
-        for left_over in capture.path.glob("frames/*/*.part"):
+        for left_over in capture.path.glob(f"frames/*/{PART}*"):
             left_over.unlink()
         return cls(capture, journal)
 
@@ -343,7 +346,7 @@ def checksums(path: Path) -> dict[str, Any]:
     check the part that the manifest knows.
     """
     small = [path / n for n in ("rig.json", "plan.json", "head.obj")]
-    small += sorted((path / "masks").glob("*.png"))
+    small += sorted((path / "masks").glob("[!.]*.png"))
     journal = path / "journal.jsonl"
     return {
         "files": {str(f.relative_to(path)): sha256(f) for f in small if f.is_file()},
@@ -362,7 +365,3 @@ def _mask(rig: Rig, camera: str, mask: NDArray[Any]) -> NDArray[np.uint8]:
         )
     grey = mask * np.uint8(255) if mask.dtype == bool else mask
     return np.asarray(grey, np.uint8)
-
-
-def write_json(path: Path, data: dict[str, Any]) -> None:
-    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())

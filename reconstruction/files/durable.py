@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
+from typing import Any
+
+PART = ".part-"
+"""What the names of files begin with that are not whole yet."""
 
 PAGE = 4096
 """Bytes; what goes past the page cache starts and ends on a multiple of it."""
@@ -74,32 +79,30 @@ def _write(path: Path, data: memoryview, flags: int) -> None:
         os.close(handle)
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a small file: temporary name, flush, rename. A failed one leaves nothing."""
-    temporary = part(path)
-    try:
-        with naming_full_disk(path, len(data)):
-            temporary.write_bytes(data)
-            replace_durably(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
     """A temporary path to write to; afterwards `path` is whole on the disk.
 
-    Where the block raises, nothing is left of what it wrote. The temporary name keeps the suffix,
-    by which many writers choose their format.
+    Where the block raises, nothing is left of what it wrote.
     """
-    temporary = path.with_name(f".part-{path.name}")
+    temporary = part(path)
     try:
         yield temporary
         replace_durably(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a small file: temporary name, flush, rename. A failed one leaves nothing."""
+    with naming_full_disk(path, len(data)), writing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON; numbers that are not finite are an error, never NaN."""
+    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
 def append_whole(file: FileIO, data: bytes) -> None:
@@ -116,8 +119,8 @@ def append_whole(file: FileIO, data: bytes) -> None:
 
 
 def part(path: Path) -> Path:
-    """The temporary name of a file that is not whole yet."""
-    return path.with_name(path.name + ".part")
+    """The temporary name of a file that is not whole yet; by its suffix writers know the format."""
+    return path.with_name(PART + path.name)
 
 
 def replace_durably(temporary: Path, path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 
 from reconstruction.arrays import AnyFloats, Floats
-from reconstruction.files.durable import PAGE, part, replace_durably
+from reconstruction.files.durable import PAGE, writing
 
 Attributes = Mapping[str, float | str]
 
@@ -52,13 +52,11 @@ def write_exr(
         **(attributes or {}),
     }
     pixels = np.ascontiguousarray(image, dtype=np.float32)
-    temporary = part(path)
     try:
-        OpenEXR.File(header, {"RGB": pixels}).write(str(temporary))
-        replace_durably(temporary, path)
-    except (OSError, RuntimeError) as error:  # the binding's own error has no errno
-        temporary.unlink(missing_ok=True)
-        raise error if isinstance(error, OSError) else OSError(f"{path}: {error}") from error
+        with writing(path) as temporary:
+            OpenEXR.File(header, {"RGB": pixels}).write(str(temporary))
+    except RuntimeError as error:  # the binding's own error has no errno
+        raise OSError(f"{path}: {error}") from error
 
 
 class UncompressedExr:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.files.points import read_points
-from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
+from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.head.fit import HeadFit, HeadFitError, Part, fit_head
 from reconstruction.head.generic import generic_head
 from reconstruction.head.scalp_map import ScalpMap
@@ -117,13 +117,12 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
 def lay_head(
     points: HeadPoints,
     head_mesh: str | Path | None,
-    model: Path,
     stage: Stage,
     *,
     cloud: PointCloud | None = None,
     seed: int = 0,
 ) -> FittedHead:
-    """Fit the generic head, or the user's `head_mesh`, and write `head.obj` into `model`.
+    """Fit the generic head, or the user's `head_mesh`, under `points`.
 
     `head_mesh` is an OBJ with z up and may mark its scalp. Points that leave the turn about z open
     are taken to be of a head that faces −y, as heads do by convention, with a warning. Of a
@@ -162,19 +161,10 @@ def lay_head(
                 f"{share:.0%} of the triangulated points lie over {_INSIDE * 1e3:g} mm inside the "
                 "fitted head: it is too large or displaced; digitised scalp points would settle it"
             )
-    write_obj(model / "head.obj", fit.mesh)
     try:
         return FittedHead(fit.mesh, ScalpMap.of(shape).on(fit.mesh))
     except ValueError:  # it folds, which is said where the map is written
         return FittedHead(fit.mesh, None)
-
-
-def model_head(model: Path, capture: Capture | None) -> Mesh | None:
-    """The head that a model stands on: the one laid under points for it, else the capture's."""
-    fitted = Path(model) / "head.obj"
-    if fitted.is_file():
-        return read_obj(fitted)
-    return capture.head if capture is not None else None
 
 
 def _report(points: HeadPoints, fit: HeadFit, name: str, stage: Stage) -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.head.scalp import Scalp
 from reconstruction.head.scalp_map import ScalpMap
+from reconstruction.model import Model
 from reconstruction.report.report import Stage
 
 
-def save_root_map(
-    model: Path, strands: Strands, scalp: Scalp, flat: ScalpMap | None, stage: Stage
+def write_root_map(
+    model: Model, strands: Strands, scalp: Scalp, flat: ScalpMap | None, stage: Stage
 ) -> None:
     """Write `scalp_map.npz` into `model`: the (u, v) of every root, and the map on the scalp.
 
@@ -24,25 +23,23 @@ def save_root_map(
     `flat` is the map that the head has from its template; without one, the head is taken to be in
     its own frame (z up, face towards −y). A scalp whose map would fold has none: the stage warns.
     """
-    file = model / "scalp_map.npz"
     if flat is None:
         marked = scalp.head.scalp if scalp.marked else scalp.share >= 0.5
         try:
             flat = ScalpMap.of(Mesh(scalp.head.vertices, scalp.head.faces, marked))
         except ValueError as error:
-            file.unlink(missing_ok=True)
+            model.remove("scalp_map.npz")
             stage.warn(f"no scalp_map.npz: {error}")
             return
     uv, distance = flat(strands.roots)
     used, faces = np.unique(flat.head.faces[flat.head.scalp], return_inverse=True)
-    part = file.with_name(file.name + ".part")
-    with part.open("wb") as out:
-        np.savez_compressed(
-            out,
-            roots=uv.astype(np.float32),
-            uv=flat.uv[used].astype(np.float32),
-            vertices=flat.head.vertices[used],
-            faces=faces.reshape(-1, 3),
-        )
-    part.replace(file)
+    model.write_arrays(
+        "scalp_map.npz",
+        {
+            "roots": uv.astype(np.float32),
+            "uv": flat.uv[used].astype(np.float32),
+            "vertices": flat.head.vertices[used],
+            "faces": faces.reshape(-1, 3),
+        },
+    )
     stage.figures["roots_off_the_map_mm"] = float(distance.max(initial=0.0) * 1e3)

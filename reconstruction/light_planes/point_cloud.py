@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import Array, Floats
+from reconstruction.files.durable import writing
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,14 +93,9 @@ class PointCloud:
 
     def save(self, path: str | Path) -> None:
         """Write a compressed `.npz`; the reverse of `load`."""
-        path = Path(path)
-        temporary = path.with_name(path.name + ".part")
         columns = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **columns)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with writing(Path(path)) as temporary:
+            np.savez_compressed(temporary, allow_pickle=False, **columns)
 
     @classmethod
     def load(cls, path: str | Path) -> PointCloud:

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from reconstruction.files.durable import replace_durably
+from reconstruction.files.durable import writing
 from reconstruction.report.report import Report, Series, Stage
 
 INK, QUIET, FAINT = "#22262b", "#6b737c", "#d9dde1"
@@ -237,7 +237,6 @@ def _duration(seconds: float) -> str:
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a PNG, whole or not at all, and return its path."""
     FigureCanvasAgg(figure)
-    temporary = path.with_name(path.name + ".part")
-    figure.savefig(temporary, format="png", dpi=130, facecolor="white")
-    replace_durably(temporary, path)
+    with writing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130, facecolor="white")
     return path

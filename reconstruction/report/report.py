@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from reconstruction.files.durable import write_json
 from reconstruction.report.memory import peak_memory
 
 Progress = Callable[[str, float], None]
@@ -93,10 +94,7 @@ class Report:
 
     def save(self, path: str | Path) -> None:
         """Write the report as JSON; numbers that are not finite are an error, never NaN."""
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
-        temporary = Path(path).with_suffix(".part")
-        temporary.write_text(text + "\n")
-        temporary.replace(path)
+        write_json(Path(path), self.to_dict())
 
     @classmethod
     def load(cls, path: str | Path) -> Report:

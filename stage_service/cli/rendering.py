@@ -20,7 +20,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.files.exr import write_exr
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.cameras import Camera
-from reconstruction.head.fitted import model_head
+from reconstruction.model import Model
 from reconstruction.report.report import Progress
 
 SIZE = 512
@@ -43,7 +43,7 @@ def render_model(args: argparse.Namespace, progress: Progress) -> dict[str, Any]
         camera = capture.rig.camera(args.camera)
     scene = build_scene(
         strands,
-        model_head(args.model, capture),
+        Model(args.model).head(capture),
         hair=appearance.hair,
         skin=appearance.skin,
     )

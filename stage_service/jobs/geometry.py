@@ -31,10 +31,10 @@ def evaluate_geometry(
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
     from reconstruction.files.strands import read_strands
-    from reconstruction.head.fitted import model_head
+    from reconstruction.model import Model
 
     true = read_strands(truth)
-    cameras, head = capture.rig.cameras, model_head(model, capture)
+    cameras, head = capture.rig.cameras, Model(model).head(capture)
     progress("what the cameras see of the true strands", 0.0)
     visibility = Visibility(cameras, true, head)
 

@@ -43,6 +43,7 @@ def compress(context: StepContext) -> Figures:
 
 def reconstruct(context: StepContext) -> Figures:
     """Strands from the capture: `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`."""
+    from reconstruction.model import Model
     from reconstruction.pipeline import ReconstructOptions
     from reconstruction.pipeline import reconstruct as run
 
@@ -55,7 +56,8 @@ def reconstruct(context: StepContext) -> Figures:
     capture = Capture(context.capture)
     left = [name for name in capture.olat_lights() if name not in asked.held_out_lights]
     capture = capture.view(lights=left)
-    run(capture, context.model, method=asked.method, options=options, progress=context.progress)
+    model = Model(context.model)
+    run(capture, model, method=asked.method, options=options, progress=context.progress)
     return {"strands": "strands.npz"}
 
 

@@ -19,6 +19,7 @@ from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.mesh import Mesh, write_obj
 from reconstruction.geometry.strands import Strands
 from reconstruction.light_planes import PointCloud
+from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report.report import Report
 from reconstruction.tangents.estimate import MeasureOptions, light_groups, thinned
@@ -89,7 +90,7 @@ def unswept(shoot: Callable[..., Capture], around: list[Camera]) -> Capture:
 @pytest.fixture(scope="module")
 def model(unswept: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
     folder = tmp_path_factory.mktemp("model")
-    return folder, reconstruct(unswept, folder, options=QUICK)
+    return folder, reconstruct(unswept, Model(folder), options=QUICK)
 
 
 def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera]) -> None:
@@ -134,7 +135,7 @@ def test_lenses_that_bend_lines_give_the_same_strands(
     lenses = [replace(c, distortion=[-3.5, 6.0, 0.03, -0.03]) for c in around]
     capture = shoot(cameras=lenses, projectors=[], lights=LIGHTS, extra=hair)
     write_obj(capture.path / "head.obj", ball(HEAD))
-    report = reconstruct(capture, tmp_path, options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=QUICK)
     assert set(report["lenses"].figures["pixels_kept"]) == {c.name for c in around}
     runs_down(read_strands(tmp_path / "strands.npz"))
     litres = [r["envelope"].figures["envelope_litres"] for r in (report, model[1])]
@@ -167,7 +168,7 @@ def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
 def test_same_seed_same_strands(
     unswept: Capture, model: tuple[Path, Report], tmp_path: Path
 ) -> None:
-    reconstruct(unswept, tmp_path, options=QUICK)
+    reconstruct(unswept, Model(tmp_path), options=QUICK)
     first, second = (read_strands(p / "strands.npz") for p in (model[0], tmp_path))
     np.testing.assert_array_equal(first.points, second.points)
 
@@ -180,7 +181,7 @@ def test_a_sweep_is_triangulated(
     cameras = [stage_camera(n, a, 10.0, size=96) for n, a in (("left", -40), ("right", 35))]
     capture = shoot(cameras=cameras, lights=LIGHTS, extra=hair)
     write_obj(capture.path / "head.obj", ball(HEAD))
-    report = reconstruct(capture, tmp_path, options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=QUICK)
     assert not report["triangulation"].left_out
     assert report["motion"].seconds > 0
     points = PointCloud.load(tmp_path / "points.npz").points
@@ -198,7 +199,7 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     write_obj(capture.path / "scalp.obj", Mesh(upper, np.zeros((0, 3))))
     write_obj(tmp_path / "larger.obj", ball(1.08 * HEAD))
     options = replace(QUICK, head_mesh=str(tmp_path / "larger.obj"))
-    report = reconstruct(capture, tmp_path / "model", options=options)
+    report = reconstruct(capture, Model(tmp_path / "model"), options=options)
     assert report["head"].figures["used_share"] > 0.9
     assert report["head"].figures["rms_mm"] < 0.5
     assert any("taken to face" in w for w in report["head"].warnings)
@@ -208,7 +209,7 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
         assert data["roots"].shape == (len(strands), 2)
     # once it has a head of its own, none is laid
     write_obj(capture.path / "head.obj", ball(HEAD))
-    report = reconstruct(Capture(capture.path), tmp_path / "model", options=QUICK)
+    report = reconstruct(Capture(capture.path), Model(tmp_path / "model"), options=QUICK)
     assert "head" not in [s.name for s in report.stages]
     assert not (tmp_path / "model" / "head.obj").exists()
 
@@ -218,7 +219,7 @@ def test_no_sweep_is_said(
 ) -> None:
     capture = shoot(cameras=around[:3], sweep=False, lights=LIGHTS, extra=hair)
     write_obj(capture.path / "head.obj", ball(HEAD))
-    report = reconstruct(capture, tmp_path, options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=QUICK)
     assert [x.why for x in report["triangulation"].left_out] == ["no sweep was shot"]
 
 
@@ -227,17 +228,17 @@ def test_what_cannot_be_done_without_is_named(
 ) -> None:
     bare = shoot(cameras=around[:2], projectors=[])
     with pytest.raises(CaptureError, match=r"no head\.obj"):
-        reconstruct(bare, tmp_path, options=QUICK)
+        reconstruct(bare, Model(tmp_path), options=QUICK)
     write_obj(bare.path / "head.obj", ball(HEAD))
     with pytest.raises(CaptureError, match="no OLAT frames"):
-        reconstruct(Capture(bare.path), tmp_path, options=QUICK)
+        reconstruct(Capture(bare.path), Model(tmp_path), options=QUICK)
     few = ReconstructOptions(held_out=("c0", "c72", "c144", "c216"))
     with pytest.raises(CaptureError, match="1 cameras are left, at least 2"):
-        reconstruct(unswept, tmp_path, options=few)
+        reconstruct(unswept, Model(tmp_path), options=few)
     with pytest.raises(KeyError, match="no camera 'c9'"):
-        reconstruct(unswept, tmp_path, options=ReconstructOptions(held_out=("c9",)))
+        reconstruct(unswept, Model(tmp_path), options=ReconstructOptions(held_out=("c9",)))
     with pytest.raises(ValueError, match="unknown method 'guess'"):
-        reconstruct(unswept, tmp_path, method="guess")  # type: ignore[arg-type]
+        reconstruct(unswept, Model(tmp_path), method="guess")  # type: ignore[arg-type]
 
 
 def test_light_groups_are_neighbours() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.files.durable import replace_durably
+from reconstruction.files.durable import writing
 from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.geometry.strands import Strands
 
@@ -46,12 +46,11 @@ def write_abc(path: Path, strands: Strands) -> None:
         AbcGeom.CurvePeriodicity.kNonPeriodic,
         AbcGeom.OFloatGeomParamSample(widths, scope),
     )
-    temporary = path.with_name(path.name + ".part")
     try:
-        archive = Abc.OArchive(str(temporary))
-        curves = AbcGeom.OCurves(archive.getTop(), "hair")
-        curves.getSchema().set(sample)
-        del curves, archive  # the file is complete when the last of these is gone
+        with writing(path) as temporary:
+            archive = Abc.OArchive(str(temporary))
+            curves = AbcGeom.OCurves(archive.getTop(), "hair")
+            curves.getSchema().set(sample)
+            del curves, archive  # the file is complete when the last of these is gone
     except RuntimeError as error:
         raise StrandFileError(f"{path}: cannot be written ({error})") from error
-    replace_durably(temporary, path)

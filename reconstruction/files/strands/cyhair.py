@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.files.durable import replace_durably
+from reconstruction.files.durable import writing
 from reconstruction.files.strands.errors import StrandFileError, require_finite, strands_of
 from reconstruction.geometry.strands import Strands
 
@@ -108,11 +108,9 @@ def write_hair(path: Path, strands: Strands) -> None:
         *(0.5, 0.5, 0.5),
         INFORMATION,
     )
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
+    with writing(path) as temporary, temporary.open("wb") as file:
         file.write(header)
         file.write(segments.astype("<u2").tobytes())
         file.write(strands.points.astype("<f4").tobytes())
         if vary:
             file.write(width.astype("<f4").tobytes())
-    replace_durably(temporary, path)

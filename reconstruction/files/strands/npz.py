@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from reconstruction.files.durable import replace_durably
+from reconstruction.files.durable import writing
 from reconstruction.files.strands.errors import StrandFileError, strands_of
 from reconstruction.geometry.strands import Strands
 
@@ -39,11 +39,9 @@ def read_npz(path: Path) -> Strands:
 
 def write_npz(path: Path, strands: Strands) -> None:
     """Write `points`, `offsets` and `radius`, uncompressed."""
-    temporary = path.with_name(path.name + ".part")
     radius = np.asarray(strands.radius, np.float32)
-    with temporary.open("wb") as file:
-        np.savez(file, points=strands.points, offsets=strands.offsets, radius=radius)
-    replace_durably(temporary, path)
+    with writing(path) as temporary:
+        np.savez(temporary, points=strands.points, offsets=strands.offsets, radius=radius)
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str, kinds: str) -> NDArray[Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.files.durable import replace_durably
+from reconstruction.files.durable import writing
 from reconstruction.files.strands.errors import StrandFileError, strands_of
 from reconstruction.geometry.strands import Strands
 
@@ -101,12 +101,11 @@ def write_usd(path: Path, strands: Strands) -> None:
         low, high = strands.points.min(axis=0) - reach, strands.points.max(axis=0) + reach
         corners = [Gf.Vec3f(*map(float, corner)) for corner in (low, high)]
         curves.CreateExtentAttr(Vt.Vec3fArray(corners))
-    temporary = path.with_name(path.stem + ".part" + path.suffix)
     try:
-        stage.GetRootLayer().Export(str(temporary))
+        with writing(path) as temporary:
+            stage.GetRootLayer().Export(str(temporary))
     except Tf.ErrorException as error:
         raise StrandFileError(f"{path}: cannot be written ({_first_line(error)})") from error
-    replace_durably(temporary, path)
 
 
 def open_curves(path: Path) -> tuple[Any, Any]:

@@ -31,6 +31,7 @@ from reconstruction.images.orientation import texture
 from reconstruction.light_codes.pipeline import look_at_hair
 from reconstruction.masks import hair_masks
 from reconstruction.methods import Method
+from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report.plots import plot_geometry, plot_report
 from reconstruction.report.report import Progress, Report, Series, silent
@@ -155,7 +156,7 @@ def run_patch(
         begin = time.perf_counter(), time.process_time()
         report = reconstruct(
             some,
-            model,
+            Model(model),
             method=method,
             options=options,
             progress=lambda what, share, k=k, n=name: progress(  # type: ignore[misc]
@@ -232,7 +233,9 @@ def run_imported(
     results: dict[str, Any] = {"rows": {}, "left_out": {}}
     for method in METHODS:
         try:
-            reconstruct(capture, out / method, method=method, options=options, progress=progress)
+            reconstruct(
+                capture, Model(out / method), method=method, options=options, progress=progress
+            )
         except CaptureError as error:
             results["left_out"][method] = str(error)
             continue

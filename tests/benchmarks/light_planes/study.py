@@ -35,6 +35,7 @@ from reconstruction.light_planes import (
     triangulate,
 )
 from reconstruction.masks import HairMask
+from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report.plots import plot_report
 from reconstruction.report.report import Progress, Report, Stage, silent
@@ -203,7 +204,7 @@ def _ours(
     motion: Motion | None = None,
 ) -> tuple[dict[str, Any], Report]:
     begin = time.perf_counter()
-    report = reconstruct(capture, model, options=options, motion=motion, progress=progress)
+    report = reconstruct(capture, Model(model), options=options, motion=motion, progress=progress)
     seconds = time.perf_counter() - begin
     scores = truth.score(read_strands(model / "strands.npz"))
     return {**scores, "seconds": seconds}, report

@@ -268,11 +268,11 @@ def test_what_a_crash_leaves_between_journal_and_removal_is_told_and_taken_away(
     before = old.read_bytes()
     compress(path)
     old.write_bytes(before)
-    (path / "frames/00002/cam_1.zip.exr.part").write_bytes(b"half")
+    (path / "frames/00002/.part-cam_1.zip.exr").write_bytes(b"half")
     (problem,) = verify(path)
     assert problem.startswith("2 files among the frames are in no line of the journal")
     assert problem.endswith("the first is frames/00001/cam_0.exr.")
-    (path / "frames/00002/cam_1.zip.exr.part").unlink()
+    (path / "frames/00002/.part-cam_1.zip.exr").unlink()
     compress(path)
     assert not old.exists()
     assert verify(path) == []
@@ -298,7 +298,7 @@ def test_a_capture_has_one_writer(tmp_path):
 def test_stored_frames_count_only_once_they_are_committed(tmp_path):
     writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
     records = [writer.store_frame(STEPS[i], c, image(STEPS[i], c)) for i, c in EVERY[:4]]
-    assert not list((tmp_path / "c").glob("frames/*/*.exr"))
+    assert not list((tmp_path / "c").glob("frames/*/cam_?.exr"))
     writer.commit(records[:3])
     assert verify(tmp_path / "c")[1:] == [
         "3 planned frames were never shot; the first is step 1 (olat), cam_1."
@@ -328,7 +328,7 @@ def test_a_killed_writer_costs_the_frame_under_way(tmp_path):
         "manifest.json is missing: the capture was not finished.",
         "3 planned frames were never shot; the first is step 1 (olat), cam_1.",
         "1 files among the frames are in no line of the journal, left by a write or a compression "
-        "that was interrupted; the first is frames/00001/cam_1.exr.part.",
+        "that was interrupted; the first is frames/00001/.part-cam_1.exr.",
     ]
     again = CaptureWriter.reopen(path)
     write(again, *EVERY[3:])
@@ -339,8 +339,8 @@ def test_a_killed_writer_costs_the_frame_under_way(tmp_path):
 def test_a_frame_that_finds_the_disk_full_is_an_error_and_no_frame(tmp_path):
     writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
     write(writer, EVERY[0])
-    (tmp_path / "c/frames/00000/cam_1.exr.part").symlink_to("/dev/full")
-    with pytest.raises(DiskFull, match=r"bytes are needed.* are free.*cam_1\.exr\.part") as error:
+    (tmp_path / "c/frames/00000/.part-cam_1.exr").symlink_to("/dev/full")
+    with pytest.raises(DiskFull, match=r"bytes are needed.* are free.*part-cam_1\.exr") as error:
         write(writer, EVERY[1])
     assert error.value.errno == errno.ENOSPC
     manifest = writer.finish("failed", {"error": str(error.value)})

@@ -19,6 +19,7 @@ from reconstruction.geometry.visual_hull import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank
 from reconstruction.light_codes.options import LightCodeOptions
 from reconstruction.light_codes.search import SearchOptions
+from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 
 QUICK = ReconstructOptions(
@@ -36,7 +37,7 @@ def shot(fibres: Any, tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def run(capture: Capture, model: Path, method: str = "photometric") -> Any:
-    return reconstruct(capture, model, method=method, options=QUICK)  # type: ignore[arg-type]
+    return reconstruct(capture, Model(model), method=method, options=QUICK)  # type: ignore[arg-type]
 
 
 def test_photometric_finds_the_fibres_and_reports_what_it_saw(

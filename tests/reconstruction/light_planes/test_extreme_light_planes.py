@@ -26,6 +26,7 @@ from reconstruction.growth.field import solve_field
 from reconstruction.growth.from_roots import grow_from_roots
 from reconstruction.head.scalp import NoScalp
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, triangulate
+from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report.report import Report, Stage
 from reconstruction.tangents.estimate import MeasureOptions
@@ -107,7 +108,7 @@ def paint_masks(capture: Capture, pixels: Callable[[Camera], np.ndarray]) -> Non
 
 
 def test_a_sweep_that_lights_nothing_is_done_without(stage: Shoot, tmp_path: Path) -> None:
-    report = reconstruct(stage(brightness=0.0), tmp_path, options=QUICK)
+    report = reconstruct(stage(brightness=0.0), Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
     assert any("no lit pixel" in w for w in report["triangulation"].warnings)
 
@@ -118,17 +119,17 @@ def test_a_capture_without_any_light_is_an_error(stage: Shoot, tmp_path: Path) -
         for camera in capture.rig.cameras:
             capture.records.pop((step.index, camera.name))
     with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
-        reconstruct(capture, tmp_path, options=QUICK)
+        reconstruct(capture, Model(tmp_path), options=QUICK)
 
 
 def test_black_single_lights_are_an_error(stage: Shoot, tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="no hair pixel has a direction"):
-        reconstruct(stage(extra=black), tmp_path, options=QUICK)
+        reconstruct(stage(extra=black), Model(tmp_path), options=QUICK)
 
 
 def test_one_camera_is_an_error(stage: Shoot, cameras: list[Camera], tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="1 cameras are left, at least 2 are needed"):
-        reconstruct(stage(cameras=cameras[:1]), tmp_path, options=QUICK)
+        reconstruct(stage(cameras=cameras[:1]), Model(tmp_path), options=QUICK)
 
 
 def test_rays_within_their_planes_leave_the_masks_alone(
@@ -139,14 +140,14 @@ def test_rays_within_their_planes_leave_the_masks_alone(
 ) -> None:
     cameras = [stage_camera(f"e{e}", 0.0, e, size=64) for e in (0.0, 40.0, 75.0)]
     capture = stage(cameras=cameras, projectors=[stage_projector("proj", 0.0, 90.0)])
-    report = reconstruct(capture, tmp_path, options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=QUICK)
     assert report["triangulation"].figures["points"] == 0
     assert report["triangulation"].figures["stripes"] > 0
     finite(tmp_path, report)
 
 
 def test_stripes_that_are_all_saturated_are_survived(stage: Shoot, tmp_path: Path) -> None:
-    report = reconstruct(stage(full_scale=0.02), tmp_path, options=QUICK)
+    report = reconstruct(stage(full_scale=0.02), Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
 
 
@@ -154,13 +155,13 @@ def test_empty_masks_are_an_error(stage: Shoot, tmp_path: Path) -> None:
     capture = stage()
     paint_masks(capture, lambda c: np.zeros((c.height, c.width), bool))
     with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
-        reconstruct(capture, tmp_path, options=QUICK)
+        reconstruct(capture, Model(tmp_path), options=QUICK)
 
 
 def test_a_subject_away_from_its_head_is_an_error(stage: Shoot, tmp_path: Path) -> None:
     """Head and cameras in different frames: nothing of the hair is where strands can begin."""
     with pytest.raises((CaptureError, NoScalp), match=r"head|scalp"):
-        reconstruct(stage(ball(HEAD, (2.0, 0, 0))), tmp_path, options=QUICK)
+        reconstruct(stage(ball(HEAD, (2.0, 0, 0))), Model(tmp_path), options=QUICK)
 
 
 def test_a_subject_that_no_camera_sees_is_an_error(
@@ -168,7 +169,7 @@ def test_a_subject_that_no_camera_sees_is_an_error(
 ) -> None:
     away = [replace(c, t=np.add(c.t, [0.6, 0, 0])) for c in cameras]
     with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
-        reconstruct(stage(cameras=away), tmp_path, options=QUICK)
+        reconstruct(stage(cameras=away), Model(tmp_path), options=QUICK)
 
 
 def test_a_scalp_without_hair_is_an_error(stage: Shoot, tmp_path: Path) -> None:
@@ -176,7 +177,7 @@ def test_a_scalp_without_hair_is_an_error(stage: Shoot, tmp_path: Path) -> None:
     capture = stage(ball(RADIUS))
     paint_masks(capture, lambda c: np.zeros((c.height, c.width), bool))
     with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
-        reconstruct(capture, tmp_path, options=QUICK)
+        reconstruct(capture, Model(tmp_path), options=QUICK)
 
 
 def test_a_bald_head_with_a_tuft_has_strands_there_alone(stage: Shoot, tmp_path: Path) -> None:
@@ -188,7 +189,7 @@ def test_a_bald_head_with_a_tuft_has_strands_there_alone(stage: Shoot, tmp_path:
         return np.hypot(x - u, y - v) < 8
 
     paint_masks(capture, top)
-    report = reconstruct(capture, tmp_path, options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
     tips = read_strands(tmp_path / "strands.npz").points
     assert np.median(tips[:, 2]) > 0.05
@@ -206,7 +207,7 @@ def test_a_single_strand_is_a_result(stage: Shoot, tmp_path: Path) -> None:
         return mask
 
     paint_masks(capture, line)
-    report = reconstruct(capture, tmp_path, options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
 
 

@@ -230,7 +230,7 @@ def test_a_full_disk_fails_the_capture(rig_file, world, tmp_path):
     step, camera = run._writer.missing()[-1]
     folder = tmp_path / f"c/frames/{step.index:05d}"
     folder.mkdir()
-    (folder / f"{camera}.exr.part").symlink_to("/dev/full")
+    (folder / f".part-{camera}.exr").symlink_to("/dev/full")
     assert run.run() == "failed"
     assert "No space left" in str(run.error)
     assert is_dark(world)
