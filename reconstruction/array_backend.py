@@ -1,63 +1,18 @@
-"""One place that finds libLLVM, chooses Dr.Jit's back end, and says what to install."""
+"""One place that chooses Dr.Jit's back end and hands it NumPy's arrays."""
 
 from __future__ import annotations
 
-import ctypes
 import os
-import re
-from pathlib import Path
 from typing import Any
 
+from reconstruction.libllvm import BackendError, find_libllvm
+
+# isort: split
+import drjit
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-OLDEST_LLVM = 16
 _PACKET = 256  # bytes: no vector of any back end is longer
-_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/lib")
-
-
-class BackendError(RuntimeError):
-    """No back end can run here; the message says what to install."""
-
-
-def find_libllvm() -> str:
-    """Path of the newest libLLVM of version 16 or newer.
-
-    `DRJIT_LIBLLVM_PATH` wins when it is set. Dr.Jit 1.5 aborts the process on LLVM 15, so an older
-    library is an error here, before it is imported. Raises `BackendError`.
-    """
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    candidates = [Path(named)] if named else _installed()
-    found = sorted(((_version(p), str(p)) for p in candidates), reverse=True)
-    for version, path in found:
-        if version >= OLDEST_LLVM and _loads(path):
-            return path
-    seen = f"found only {', '.join(f'{p} (LLVM {v})' for v, p in found)}" if found else "found none"
-    raise BackendError(
-        f"hairstage needs libLLVM {OLDEST_LLVM} or newer and {seen}: "
-        "run 'apt-get install libllvm19' (or set DRJIT_LIBLLVM_PATH to the library)"
-    )
-
-
-def _installed() -> list[Path]:
-    pattern = re.compile(r"libLLVM(-\d+)?\.so(\.\d+)*$")
-    folders = [p for f in _FOLDERS for p in (Path(f), *Path(f).glob("*-linux-gnu*"))]
-    folders += [p for f in _FOLDERS for p in Path(f).glob("llvm-*/lib")]
-    files = (p for folder in folders if folder.is_dir() for p in folder.iterdir())
-    return list({p.resolve() for p in files if pattern.match(p.name)})
-
-
-def _version(path: Path) -> int:
-    match = re.search(r"libLLVM[-.](?:so\.)?(\d+)", path.resolve().name)
-    return int(match.group(1)) if match else 0
-
-
-def _loads(path: str) -> bool:
-    try:
-        ctypes.CDLL(path)
-    except OSError:
-        return False
-    return True
 
 
 def chosen_variant(variant: str | None = None) -> str:
@@ -75,8 +30,6 @@ def chosen_variant(variant: str | None = None) -> str:
 def array_types(variant: str | None = None) -> Any:
     """Dr.Jit's module of array types for the variant: `drjit.llvm` or `drjit.cuda`."""
     chosen = chosen_variant(variant)
-    import drjit
-
     if chosen.startswith("cuda"):
         return drjit.cuda
     if chosen.startswith("llvm"):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
+
 
 def register() -> None:
     """Make `extended_hair` known to Mitsuba, in the current variant and in those set later.
 
     Only Mitsuba itself is imported before a variant with RGB arrays is set.
     """
-    import mitsuba as mi
 
     def on_variant(old: str | None, new: str | None) -> None:
         if new in ("llvm_ad_rgb", "cuda_ad_rgb"):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+
 from appearance.sun_fit.longitudinal import LEAST_COLOUR
 
 EUMELANIN = (0.419, 0.697, 1.37)
@@ -30,8 +32,6 @@ def of_colour(colour: Any, beta_n: Any) -> Any:
     (log C / P(beta_n))² with Chiang's polynomial P (2016, eq. 9). C is clamped to [1e-6, 1]: above
     1 the square would alias to albedos below.
     """
-    import drjit as dr
-
     b = beta_n
     bracket = 5.969 - 0.215 * b + 2.532 * b**2 - 10.73 * b**3 + 5.574 * b**4 + 0.245 * b**5
     return (dr.log(dr.clip(colour, LEAST_COLOUR, 1.0)) / bracket) ** 2

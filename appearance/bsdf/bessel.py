@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.polynomial.chebyshev import chebinterpolate
 from scipy.special import i0e
@@ -28,8 +29,6 @@ def _coefficients(degree: int) -> tuple[float, ...]:
 
 def scaled_i0(x: Any) -> Any:
     """exp(-x) I0(x) for x >= 0, float32 or float64; relative error below 1e-6 or 1e-12."""
-    import drjit as dr
-
     single = dr.is_array_v(x) and dr.itemsize_v(x) == 4
     t = 1 - 2 * _CENTRE / (x + _CENTRE)
     b1: Any = 0.0
@@ -41,6 +40,4 @@ def scaled_i0(x: Any) -> Any:
 
 def i0(x: Any) -> Any:
     """I0(x) for x >= 0, until exp(x) overflows."""
-    import drjit as dr
-
     return dr.exp(x) * scaled_i0(x)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+
 SERIES_BELOW = 0.01
 """Squared angle below which sine and cosine are taken from their series."""
 
@@ -13,8 +15,6 @@ def rodrigues(axis_angle: Any, v: Any) -> Any:
 
     v + (sin a / a) w × v + ((1 - cos a)/a²) w × (w × v), both factors functions of a² alone.
     """
-    import drjit as dr
-
     squared = dr.squared_norm(axis_angle)
     small = squared < SERIES_BELOW
     angle = dr.sqrt(dr.select(small, 1, squared))
@@ -38,8 +38,6 @@ def axis_in_frame(a: Any, b: Any, reference_x: Any, reference_z: Any) -> tuple[A
     frame (of any length but 0), the second is the fibre's direction +y times the first. The part
     along the fibre, which would only shift h, is 0.
     """
-    import drjit as dr
-
     scale = dr.rsqrt(reference_x * reference_x + reference_z * reference_z + 1e-30)
     x, z = reference_x * scale, reference_z * scale
     return a * x + b * z, 0, a * z - b * x

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from math import pi, sqrt
 from typing import Any
 
+import drjit as dr
+
 from appearance.bsdf.bessel import scaled_i0
 
 LOBES = 4
@@ -83,24 +85,18 @@ def across(w: Any) -> tuple[Any, Any, Any]:
 
     Along the fibre itself, where there is no azimuth, the part is (0, 0).
     """
-    import drjit as dr
-
     cosine = dr.sqrt(w.x * w.x + w.z * w.z + _TINY * _TINY)
     return cosine, w.x / cosine, w.z / cosine
 
 
 def azimuth(w: Any) -> Any:
     """gamma of the direction `w`; 0 along the fibre."""
-    import drjit as dr
-
     z = dr.select((w.x == 0) & (w.z == 0), 1, w.z)
     return dr.atan2(-w.x, z)
 
 
 def tilted(sine: Any, cosine: Any, tilt: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Sines and cosines of the inclination that each lobe sees, folded into [-pi/2, pi/2]."""
-    import drjit as dr
-
     s1, c1 = dr.sin(tilt), dr.cos(tilt)
     s2, c2 = 2 * s1 * c1, c1 * c1 - s1 * s1
     s4, c4 = 2 * s2 * c2, c2 * c2 - s2 * s2
@@ -111,15 +107,11 @@ def tilted(sine: Any, cosine: Any, tilt: Any) -> tuple[tuple[Any, ...], tuple[An
 
 def one_minus_exp(x: Any) -> Any:
     """1 - exp(-x) for x >= 0, without cancellation."""
-    import drjit as dr
-
     return dr.tanh(0.5 * x) * (1 + dr.exp(-x))
 
 
 def m_p(sine_i: Any, cosine_i: Any, sine_o: Any, cosine_o: Any, v: Any) -> Any:
     """M_p, from sines and cosines of the inclinations."""
-    import drjit as dr
-
     chord = (cosine_i - cosine_o) ** 2 + (sine_i + sine_o) ** 2
     r = dr.rcp(v)
     return scaled_i0(cosine_i * cosine_o * r) * dr.exp(-0.5 * chord * r) * r / one_minus_exp(2 * r)
@@ -127,8 +119,6 @@ def m_p(sine_i: Any, cosine_i: Any, sine_o: Any, cosine_o: Any, v: Any) -> Any:
 
 def n_p(x: Any, s: Any) -> Any:
     """N_p of R, TT and TRT at the azimuth `x` from the lobe's middle, of any period."""
-    import drjit as dr
-
     x = x - 2 * pi * dr.round(x * (0.5 / pi))
     z = dr.exp(-dr.abs(x) / s)
     return z / (s * (1 + z) ** 2 * dr.tanh(0.5 * pi / s))
@@ -136,8 +126,6 @@ def n_p(x: Any, s: Any) -> Any:
 
 def fresnel(mu: Any, eta: Any) -> tuple[Any, Any]:
     """F and 1 - F at the cosine `mu` >= 0 to the surface's normal, `eta` > 1."""
-    import drjit as dr
-
     q = (eta - 1) * (eta + 1)
     w = dr.sqrt(q + mu * mu)
     n = eta * eta
@@ -150,8 +138,6 @@ def fresnel(mu: Any, eta: Any) -> tuple[Any, Any]:
 
 def refraction(cosine: Any, sin_gamma: Any, cos_gamma: Any, eta: Any) -> tuple[Any, Any]:
     """gamma_t inside the fibre, and the length of one crossing in fibre radii."""
-    import drjit as dr
-
     q = (eta - 1) * (eta + 1)
     deep = dr.sqrt(q + (cosine * cos_gamma) ** 2)
     gamma_t = dr.atan2(sin_gamma * cosine, deep)
@@ -160,8 +146,6 @@ def refraction(cosine: Any, sin_gamma: Any, cos_gamma: Any, eta: Any) -> tuple[A
 
 def attenuations(f: Any, through: Any, depth: Any) -> tuple[Any, ...]:
     """A_p of the four lobes from F, 1 - F and the optical `depth` sigma_a times length."""
-    import drjit as dr
-
     t = dr.exp(-depth)
     tt = through * through * t
     trt = tt * f * t
@@ -171,8 +155,6 @@ def attenuations(f: Any, through: Any, depth: Any) -> tuple[Any, ...]:
 
 def known(fibre: Fibre, wi: Any) -> Known:
     """Everything that does not depend on the direction to evaluate."""
-    import drjit as dr
-
     cosine, x, z = across(wi)
     gamma = azimuth(wi)
     sines, cosines = tilted(wi.y, cosine, fibre.tilt)
@@ -261,8 +243,6 @@ def choose(choice: Sequence[Any], u: Any) -> tuple[list[Any], Any]:
 
     The lobe is given as three masks: past R, past TT, past TRT.
     """
-    import drjit as dr
-
     past, left = [], [choice[3]]
     for share in choice[2:0:-1]:
         left.insert(0, left[0] + share)
@@ -279,8 +259,6 @@ def choose(choice: Sequence[Any], u: Any) -> tuple[list[Any], Any]:
 
 def pick(past: Sequence[Any], values: Sequence[Any]) -> Any:
     """The one of four `values` that `choose` chose."""
-    import drjit as dr
-
     picked = values[0]
     for beyond, value in zip(past, values[1:], strict=True):
         picked = dr.select(beyond, value, picked)
@@ -289,8 +267,6 @@ def pick(past: Sequence[Any], values: Sequence[Any]) -> Any:
 
 def logistic_sample(u: Any, s: Any) -> Any:
     """Azimuth from a lobe's middle, in [-pi, pi], with the density `n_p`."""
-    import drjit as dr
-
     u = dr.clip(u, _LEAST_UNIFORM, 1 - 2 * _LEAST_UNIFORM)
     tail = dr.exp(-pi / s)
     tail = tail / (1 + tail)
@@ -304,16 +280,12 @@ def fisher_sample(v: Any, u: Any) -> tuple[Any, Any]:
     d'Eon 2013: cos = 1 + v log(u + (1 - u) exp(-2/v)). Formed as it stands, the narrow lobes fall
     on the few float32 numbers below 1.
     """
-    import drjit as dr
-
     u = dr.maximum(u, _LEAST_UNIFORM)
     below = dr.clip(-v * dr.log(u + (1 - u) * dr.exp(-2 / v)), 0, 2)
     return below, dr.sqrt(below * (2 - below))
 
 
 def _draw(k: Known, m: tuple[Any, Any, Any], turn: Any, last: Any, u: tuple[Any, Any, Any]) -> Any:
-    import drjit as dr
-
     sine, cosine, v = m
     below, spread = fisher_sample(v, u[1])
     s3, c3 = dr.sin(2 * pi * u[2]), dr.cos(2 * pi * u[2])

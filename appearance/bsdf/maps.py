@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -115,8 +116,6 @@ class MappedStrands:
     @classmethod
     def of(cls, scene: HairScene, strands: Strands, root_uv: ArrayLike) -> MappedStrands:
         """`strands` must be those that `scene` was built from."""
-        import mitsuba as mi
-
         from appearance.bsdf.strand_coordinates import strand_parameters
 
         shape = mi.traverse(scene.hair_shape)
@@ -131,8 +130,6 @@ class MappedStrands:
 
     def painted(self, maps: HairMaps) -> HairScene:
         """The scene with the maps on its hair; geometry is shared."""
-        import mitsuba as mi
-
         bsdf = mi.load_dict(
             {
                 "type": "extended_hair",
@@ -149,8 +146,6 @@ class MappedStrands:
 
     def repainted(self, scene: HairScene, maps: HairMaps) -> HairScene:
         """`scene`, which `painted` made, with other maps on the same BSDF: `scene` changes too."""
-        import mitsuba as mi
-
         values = mi.traverse(scene.hair_bsdf)
         values["sigma_a"] = mi.TensorXf(for_kernels(maps.sigma_a))
         values["rotation"] = mi.TensorXf(for_kernels(maps.rotation))

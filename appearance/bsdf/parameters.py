@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.absorption import of_colour, of_melanin
@@ -72,9 +74,6 @@ class HairParameters:
 
     def fibre(self, place: Place) -> Fibre:
         """The fibre at a hit."""
-        import drjit as dr
-        import mitsuba as mi
-
         beta_n = place.scalar(self.values["azimuthal_roughness"])
         if "color" in self.values:
             sigma_a = of_colour(self.values["color"], beta_n)
@@ -92,9 +91,6 @@ class HairParameters:
 
     def frame(self, place: Place) -> ShadingFrame:
         """The fibre's frame at a hit: its own direction, and the corrective of its cell."""
-        import drjit as dr
-        import mitsuba as mi
-
         tangent = place.tangent if self._many_segments() else None
         if "rotation" not in self.values:
             return ShadingFrame(tangent, None)
@@ -112,9 +108,6 @@ class HairParameters:
         return indices is not None and len(indices) > MITSUBAS_SEGMENTS
 
     def _look_up(self, name: str, kind: Any, place: Place) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         value = self.values[name]
         if not dr.is_tensor_v(value):
             return value
@@ -140,9 +133,6 @@ class Place:
     @cached_property
     def along(self) -> Any:
         """0 at the root to 1 at the tip, in segments."""
-        import drjit as dr
-        import mitsuba as mi
-
         first = self._gather("UInt32", "first_segment", self.strand)
         end = self._gather("UInt32", "first_segment", self.strand + 1)
         inside, _ = self._in_segment
@@ -152,17 +142,12 @@ class Place:
     @cached_property
     def tangent(self) -> tuple[Any, Any]:
         """The fibre's direction at the hit, in the plane of the shading frame's x and y."""
-        import drjit as dr
-        import mitsuba as mi
-
         along = self.si.to_local(mi.Vector3f(self._in_segment[1]))
         length = dr.rsqrt(along.x * along.x + along.y * along.y + 1e-30)
         return along.x * length, along.y * length
 
     @cached_property
     def _in_segment(self) -> tuple[Any, Any]:
-        import mitsuba as mi
-
         return place_in_segment(
             mi.Vector3f(self.si.p),
             self.strands["control_points"],
@@ -177,18 +162,12 @@ class Place:
 
     def scalar(self, value: Any) -> Any:
         """The element of a constant or per-strand `Float`."""
-        import drjit as dr
-        import mitsuba as mi
-
         if dr.width(value) == 1:
             return value
         return dr.gather(mi.Float, value, self.strand, self.active)
 
     def cell(self, table: Any, kind: Any) -> Any:
         """The value of a table at the hit: nearest on the scalp, linear along the strand."""
-        import drjit as dr
-        import mitsuba as mi
-
         if table.ndim == 2:
             return dr.gather(kind, table.array, self.strand, self.active)
         layers, columns, rows, _ = table.shape
@@ -205,15 +184,10 @@ class Place:
         return dr.lerp(low, high, height - mi.Float(below))
 
     def _gather(self, kind: str, name: str, index: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         return dr.gather(getattr(mi, kind), self.strands[name], index, self.active)
 
 
 def _absorption(props: Any) -> dict[str, Any]:
-    import mitsuba as mi
-
     ways = [n for n in ("sigma_a", "color") if n in props]
     if ways and (len(ways) > 1 or any(n in props for n in PIGMENTS)):
         raise ValueError("extended_hair: give one of sigma_a, color, or the two pigments")
@@ -237,9 +211,6 @@ def _scalar(props: Any, name: str, default: float, low: float, high: float) -> A
 
 def _checked(name: str, value: Any, low: float, high: float) -> Any:
     """`value` as an opaque `Float`, after a check of its range."""
-    import drjit as dr
-    import mitsuba as mi
-
     numbers = np.atleast_1d(np.asarray(getattr(value, "array", value), np.float32))
     in_range = (numbers >= np.float32(low)) & (numbers <= np.float32(high))
     if not (in_range & np.isfinite(numbers)).all():
@@ -265,24 +236,17 @@ def _tensor(name: str, value: Any, channels: int, low: float, high: float) -> An
 
 
 def _index(props: Any, name: str, default: float) -> float:
-    import mitsuba as mi
-
     value = props.get(name, default)
     return float(mi.lookup_ior(props, name, default) if isinstance(value, str) else value)
 
 
 def _cells(value: Any) -> int:
     """Number of entries of a constant, a per-strand array or a table."""
-    import drjit as dr
-
     return int(np.prod(value.shape[:-1])) if dr.is_tensor_v(value) else int(dr.width(value))
 
 
 def _constant(table: Any) -> list[Any] | None:
     """The channels of a table that is the same everywhere; None where it varies."""
-    import drjit as dr
-    import mitsuba as mi
-
     if not dr.is_tensor_v(table) or dr.grad_enabled(table):
         return None
     channels = table.shape[-1]

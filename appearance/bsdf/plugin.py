@@ -25,14 +25,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from appearance.bsdf.lobes import evaluate, sample
 from appearance.bsdf.parameters import HairParameters, Place
 
 
 def plugin() -> Any:
     """The plugin's class for the current variant; its base is another one in each."""
-    import drjit as dr
-    import mitsuba as mi
 
     class ExtendedHair(mi.BSDF):
         def __init__(self, props: Any) -> None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -43,8 +45,6 @@ def strand_parameters(
     with the head; without it, the frames follow the world's x axis. Raises `ValueError` on shapes
     that do not fit.
     """
-    import mitsuba as mi
-
     points = np.asarray(control_points, float).reshape(-1, 4)
     first_point = np.asarray(segments, np.int64)
     counts = np.asarray(segments_of_strand, np.int64)
@@ -142,9 +142,6 @@ def place_in_segment(p: Any, control_points: Any, first: Any, active: Any) -> tu
     `first` is the segment's first control point, in `control_points` (x, y, z, radius, …). From the
     projection on the chord, two steps of Gauss-Newton.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     c = [dr.gather(mi.Point4f, control_points, first + i, active) for i in range(4)]
     # relative to p: far from the origin, sums of coordinates would round a tangent away
     a, b, d, e = (mi.Vector3f(q.x, q.y, q.z) - p for q in c)
@@ -167,6 +164,4 @@ def place_in_segment(p: Any, control_points: Any, first: Any, active: Any) -> tu
 
 
 def _projected(p: Any, direction: Any) -> Any:
-    import drjit as dr
-
     return dr.dot(p, direction) / dr.maximum(dr.squared_norm(direction), 1e-30)

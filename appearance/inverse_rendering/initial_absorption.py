@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -58,9 +60,6 @@ def cell_colours(
 
 def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> Ints:
     """Cells that rays through the pixels meet first `(P, 8)`, as flat indices; -1 where none."""
-    import drjit as dr
-    import mitsuba as mi
-
     from appearance.bsdf.parameters import Place
 
     count = len(o.pixels) * _RAYS

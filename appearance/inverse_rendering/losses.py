@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from scipy.ndimage import correlate1d
 
@@ -89,8 +90,6 @@ def smoothness(values: dict[str, Any], lambda_sigma: float, lambda_r: float) -> 
     Cells whose strands no ray meets follow their neighbours along the strand. A Dr.Jit number, or
     0 for a single layer.
     """
-    import drjit as dr
-
     total: Any = 0.0
     for name, weight in (("hair.sigma_a", lambda_sigma), ("hair.rotation", lambda_r)):
         table = values[name]

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands
@@ -90,9 +92,6 @@ class Problem:
         `error` is about what `error` says, for the root of squares.
         Threads add up a gradient in no fixed order: a `repeatable` one takes a single thread.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         o = self.views[batch.view]
         few = np.sort(rng.permutation(len(o.pixels))[: effort.pixels])
         leaves = {k: mi.TensorXf(for_kernels(v)) for k, v in raw.items()}
@@ -240,9 +239,6 @@ class Problem:
         lights: Ints,
     ) -> dict[str, Any]:
         """The lamps of a batch as functions of the leaves; the op's lamps are already moved."""
-        import drjit as dr
-        import mitsuba as mi
-
         out: dict[str, Any] = {}
         known = op.parameters()
         rows = (lights[:, None] * 3 + np.arange(3)).ravel()
@@ -265,8 +261,6 @@ class Problem:
 @contextmanager
 def _threads(count: int | None) -> Iterator[None]:
     """Dr.Jit with `count` threads (None: as it is); no kernel runs while that changes."""
-    import drjit as dr
-
     before = dr.thread_count()
     dr.sync_thread()
     dr.set_thread_count(count or before)

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps
@@ -93,9 +95,6 @@ def raw_of(maps: HairMaps, lamps: Lamps, profile_of: Ints) -> Raw:
 
 def hair_values(raw: Mapping[str, Any]) -> dict[str, Any]:
     """The BSDF's parameters by their names in `DifferentiableOlat`, from Dr.Jit tensors."""
-    import drjit as dr
-    import mitsuba as mi
-
     values: dict[str, Any] = {
         "hair.sigma_a": (_log_sigmoid(raw["sigma_a"]) * (1 / BRACKET)) ** 2,
         "hair.rotation": MOST_TURN * dr.tanh(raw["rotation"] * (1 / MOST_TURN)),
@@ -129,8 +128,6 @@ def _logit_of_colour(log_colour: Array) -> Array:
 
 def _log_sigmoid(x: Any) -> Any:
     """log(1/(1 + exp(-x))), accurate for large x too."""
-    import drjit as dr
-
     # 1 + e loses e below 1e-7; its series does not
     e = dr.exp(-dr.abs(x))
     log1p = dr.select(e < 1e-3, e * (1 - 0.5 * e), dr.log(1 + e))

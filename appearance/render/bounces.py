@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.coverage import covered_pixels
@@ -72,9 +74,6 @@ def bounce_limit(
 
 def _by_depth(scene: HairScene, camera: Camera, index: Ints, spp: int, seed: int) -> Array:
     """Light of a white sky by the number of the path's vertices from 1, `(256 + 1, P, 3)`."""
-    import drjit as dr
-    import mitsuba as mi
-
     film = dr.zeros(mi.Float, (_LONGEST + 1) * 3 * len(index))
     slots = opaque_index(len(index))
 

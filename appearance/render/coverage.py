@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.paths import Surface, wave
@@ -12,9 +14,6 @@ from reconstruction.geometry.cameras import Camera
 
 def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, Floats]:
     """Share of each pixel that shows `"hair"` and `"head"`: two images `(H, W)` in [0, 1]."""
-    import drjit as dr
-    import mitsuba as mi
-
     if spp < 1:
         raise ValueError(f"spp must be positive, got {spp}")
     size = camera.width * camera.height

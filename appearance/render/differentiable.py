@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -88,9 +90,6 @@ class DifferentiableOlat:
         turned about its centre, an axis-angle in the world's frame, 0 now (no effect on lamps
         without an orientation).
         """
-        import drjit as dr
-        import mitsuba as mi
-
         values: dict[str, Any] = {
             "skin": mi.Color3f(*self.scene.skin),
             "lamps.position": mi.TensorXf(for_kernels([x.position for x in self.lights])),
@@ -114,8 +113,6 @@ class DifferentiableOlat:
         otherwise see its own noise. Same seeds, same picture to the byte; gradients are summed in
         no fixed order and repeat to rounding. Raises `ValueError` for unknown names.
         """
-        import drjit as dr
-
         values = self.parameters()
         if unknown := set(parameters) - set(values):
             raise ValueError(f"unknown parameters {sorted(unknown)}; known are {sorted(values)}")
@@ -126,8 +123,6 @@ class DifferentiableOlat:
 
     def _hair(self) -> Any:
         """The parameters of the hair's BSDF, as Mitsuba finds them."""
-        import mitsuba as mi
-
         return mi.traverse(self.scene.hair_bsdf) if self.scene.hair_bsdf is not None else {}
 
     @contextmanager
@@ -157,9 +152,6 @@ class DifferentiableOlat:
 
     def picture(self, values: Mapping[str, Any], seed: int) -> Any:
         """The radiance for detached `values`."""
-        import drjit as dr
-        import mitsuba as mi
-
         film = dr.zeros(mi.Float, 3 * len(self.lights) * len(self.index))
         with self._applied(_scaled(values)) as (surface, bank):
 
@@ -174,9 +166,6 @@ class DifferentiableOlat:
         self, values: Mapping[str, Any], wanted: Sequence[str], weight: Any, seed: int
     ) -> dict[str, Any]:
         """Derivatives of the sum of `weight (L, P, 3)` times the radiance, for the `wanted`."""
-        import drjit as dr
-        import mitsuba as mi
-
         leaves = _scaled(values)
         for name in wanted:
             dr.enable_grad(leaves[name])
@@ -201,14 +190,11 @@ class DifferentiableOlat:
 
 
 def _array(index: Ints) -> Any:
-    import mitsuba as mi
-
     return mi.UInt32(for_kernels(index, np.uint32))
 
 
 def _operation() -> Any:
     """The custom operation of Dr.Jit that ties the picture to its gradients."""
-    import drjit as dr
 
     class Radiance(dr.CustomOp):
         def eval(
@@ -235,8 +221,6 @@ def _operation() -> Any:
 
 def _scaled(values: Mapping[str, Any]) -> dict[str, Any]:
     """Copies of `values` in scene units, read from memory by kernels."""
-    import drjit as dr
-
     out = {}
     for name, value in values.items():
         out[name] = type(value)(dr.detach(value)) * _UNITS.get(name, 1.0)
@@ -254,8 +238,6 @@ class _Painted(Surface):
 
     def sample(self, si: Any, u1: Any, u2: Any, active: Any) -> tuple[Any, Any]:
         """A local direction, of the guide where there is one, and its weight."""
-        import drjit as dr
-
         if self.guide is None:
             return super().sample(si, u1, u2, active)
         wo, weight = self.guide.sample(si, u1, u2, active)
@@ -265,8 +247,6 @@ class _Painted(Surface):
         return wo, dr.select(possible, here, 0)
 
     def _diffuse(self, hair: Any) -> Any:
-        import drjit as dr
-
         return self.skin if self.fibres is None else dr.select(hair, self.fibres, self.skin)
 
 
@@ -288,9 +268,6 @@ class _Walk:
 
     def along(self, total: Any, rng: Any) -> Any:
         """Walk all paths, starting from the sum `total`; returns the sum."""
-        import drjit as dr
-        import mitsuba as mi
-
         si = self.surface.interact(self.paths.rays, mi.Bool(True))
         max_depth = self.owner.max_depth
 
@@ -313,9 +290,6 @@ class _Walk:
 
     def _lamps(self, si: Any, beta: Any, total: Any, rng: Any, active: Any) -> Any:
         """The light of all lamps at a vertex."""
-        import drjit as dr
-        import mitsuba as mi
-
         count, slots = self.bank.count, opaque_index(len(self.owner.index))
         resume: Any = dr.resume_grad  # untyped
 
@@ -352,8 +326,6 @@ class _Walk:
 
     def _bounce(self, si: Any, ray: Any, total: Any, active: Any) -> None:
         """What is still to come was multiplied by the BSDF at this vertex."""
-        import drjit as dr
-
         resume: Any = dr.resume_grad  # untyped
         with resume():
             value = self.surface.eval(si, si.to_local(ray.d), active)

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.paths import opaque, opaque_index
@@ -43,9 +45,6 @@ class Dome:
 
         Raises `ValueError` if the subject reaches out of it, or a lamp is directed.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         if directed := [x.name for x in lights if x.profile is not None or x.size is not None]:
             raise ValueError(
                 f"{', '.join(directed[:3])}: the smooth basis knows lamps that shine alike in all "
@@ -84,9 +83,6 @@ class Dome:
 
     def splat(self, slots: int) -> Splat:
         """Empty coefficients of `slots` pixels, to be filled as paths leave the subject."""
-        import drjit as dr
-        import mitsuba as mi
-
         return Splat(self, slots, dr.zeros(mi.Float, 2 * self.terms * 3 * slots))
 
 
@@ -100,8 +96,6 @@ class Splat:
 
     def __call__(self, ray: Any, paths: Paths) -> None:
         """Add the paths whose `ray` leaves the subject after two vertices or more."""
-        import drjit as dr
-
         active = paths.active & (paths.depth > 1)
         (radius,) = opaque(self.dome.radius)
         along = dr.dot(ray.o, ray.d)

@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.coverage import covered_pixels
@@ -39,9 +41,6 @@ def render_environment(
     or the map with `background`. Each vertex of a path asks one direction, drawn in proportion to
     the map's brightness. Raises `ValueError` for maps that are negative or not finite.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     if spp < 1 or max_depth < 1:
         raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
     sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)
@@ -66,8 +65,6 @@ def render_environment(
 
 
 def _add(film: Any, slot: Any, value: Any, active: Any) -> None:
-    import drjit as dr
-
     for channel in range(3):
         put = slot * 3 + channel
         dr.scatter_add(film, value[channel], put, active, mode=dr.ReduceMode.NoConflicts)
@@ -85,8 +82,6 @@ class Sky:
 
     @classmethod
     def of(cls, envmap: Floats, rotation_deg: float) -> Sky:
-        import mitsuba as mi
-
         height, width = envmap.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         weight = envmap.astype(float).sum(-1) * (edges[:-1] - edges[1:])[:, None]
@@ -104,9 +99,6 @@ class Sky:
 
     def radiance(self, direction: Any) -> Any:
         """`Color3f` that arrives from `direction`."""
-        import drjit as dr
-        import mitsuba as mi
-
         u = 0.5 + self.turn - dr.atan2(direction.y, direction.x) * dr.inv_two_pi
         u = u - dr.floor(u)
         v = dr.safe_acos(direction.z) * dr.inv_pi
@@ -116,9 +108,6 @@ class Sky:
 
     def sample(self, rng: Any, active: Any) -> tuple[Any, Any]:
         """A direction, and its radiance divided by the density of the draw."""
-        import drjit as dr
-        import mitsuba as mi
-
         texel, chance = self.distribution.sample_pmf(rng.next_float32(), active)
         row = texel // self.width
         u = (mi.Float(texel - row * self.width) + rng.next_float32()) / mi.Float(self.width)
@@ -142,8 +131,6 @@ class _Gather:
     sky: Sky
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        import drjit as dr
-
         towards, light = self.sky.sample(paths.rng, paths.active)
         answer = self.surface.eval(si, si.to_local(towards), paths.active)
         value = paths.throughput * light * answer

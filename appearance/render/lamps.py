@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -42,8 +44,6 @@ class LampBank:
     @classmethod
     def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> LampBank:
         """The bank of `lights`, their intensities times `weights`, which broadcast to `(L, 3)`."""
-        import mitsuba as mi
-
         position, intensity = light_arrays(lights)
         intensity = (intensity * np.asarray(weights, float)).astype(np.float32)
         aims = [np.eye(3) if x.orientation is None else x.orientation for x in lights]
@@ -72,9 +72,6 @@ class LampBank:
         lamp's irradiance across the ray: spheres are sampled uniformly in the solid angle that they
         fill, rectangles uniformly in area. Point lamps draw no random numbers.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         centre = dr.gather(mi.Point3f, self.positions, light, active)
         intensity: Any = dr.gather(mi.Color3f, self.intensities, light, active)
         target = centre
@@ -120,9 +117,6 @@ def _point_on_sphere(centre: Any, radius: Any, p: Any, u: Any, v: Any) -> tuple[
     2 I/(d² (1 + cos a)) is that of a point lamp for r = 0. All is written so that r = 0 is no
     special case, nor its derivative.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     to_centre = centre - p
     squared = dr.squared_norm(to_centre)
     distance = dr.sqrt(squared)
@@ -168,9 +162,6 @@ class ProfileTable:
 
     def at(self, direction: Any) -> Any:
         """The profile's value `Float` towards `direction` in the lamp's frame."""
-        import drjit as dr
-        import mitsuba as mi
-
         polar = opaque_matrix(self.frame) @ direction
         squared = polar.x * polar.x + polar.y * polar.y
         on_axis = squared == 0  # where the angles have no derivative
@@ -196,9 +187,6 @@ _SLACK_DEG = 1e-4  # a direction on a table's last node is in it, however it was
 
 def _interval(nodes: Any, count: int, x: Any) -> tuple[Any, Any, Any]:
     """Left node of the interval that holds `x`, the share of the way through it, and if it does."""
-    import drjit as dr
-    import mitsuba as mi
-
     here = dr.detach(x)
     search: Any = dr.binary_search  # untyped
     beyond = search(1, count - 1, lambda k: dr.gather(mi.Float, nodes, k) <= here)
@@ -211,6 +199,4 @@ def _interval(nodes: Any, count: int, x: Any) -> tuple[Any, Any, Any]:
 
 
 def _floats(values: ArrayLike) -> Any:
-    import mitsuba as mi
-
     return mi.Float(for_kernels(np.ravel(values)))

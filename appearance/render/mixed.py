@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -122,9 +124,6 @@ def _render(
     index: Ints,
     how: tuple[int, int, int],
 ) -> Floats:
-    import drjit as dr
-    import mitsuba as mi
-
     spp, max_depth, seed = how
     film = dr.zeros(mi.Float, 3 * len(index))
     surface = Surface(scene)
@@ -147,9 +146,6 @@ class _Gather:
     skies: Sequence[tuple[Sky, Array]]
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         throughput, rng, active = paths.throughput, paths.rng, paths.active
         if self.bank is not None:
             light = self.choice.sample(rng.next_float32(), active)
@@ -167,8 +163,6 @@ class _Gather:
             self._add(value, si.spawn_ray(direction), paths)
 
     def _add(self, value: Any, ray: Any, paths: Paths) -> None:
-        import drjit as dr
-
         lit = paths.active & (dr.max(dr.abs(value)) > 0)
         lit &= ~self.surface.scene.mi_scene.ray_test(ray, lit)
         for channel in range(3):

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -213,9 +215,6 @@ def _render_tile(
     seed: tuple[int, int],
 ) -> Floats:
     """Mean over `spp` paths a pixel: `(L, P, 3)`."""
-    import drjit as dr
-    import mitsuba as mi
-
     lights = plan.lights
     film = dr.zeros(mi.Float, 3 * len(lights) * len(index))
     surface = Surface(scene)
@@ -242,8 +241,6 @@ class _Bank:
 
     @classmethod
     def of(cls, lights: Sequence[Light], dim: Floats) -> _Bank:
-        import mitsuba as mi
-
         return cls(LampBank.of(lights), mi.Float(dim))
 
 
@@ -258,9 +255,6 @@ class _Gather:
     plan: _Plan
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         total, first = self.bank.lamps.count, paths.depth == 0
         active = paths.active if self.plan.dome is None else paths.active & first
         count = dr.select(first, *(opaque_index(n) for n in self.plan.counts))
@@ -281,9 +275,6 @@ class _Gather:
         dr.while_loop((mi.UInt32(0), paths.rng), more, body, label="lights of a vertex")
 
     def _add(self, si: Any, paths: Paths, weight: Any, light: Any, rng: Any, active: Any) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         target, intensity = self.bank.lamps.sample(light, si.p, rng, active)
         value, lit = light_from(
             self.surface,

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,9 +23,6 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
     this is the one place that takes off the half pixel to `Camera`'s convention, where that
     pixel's centre is (0, 0).
     """
-    import drjit as dr
-    import mitsuba as mi
-
     k = opaque([camera.K[0, 0], camera.K[0, 1], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]])
     y = (v - 0.5 - k[4]) / k[3]
     x = (u - 0.5 - k[2] - k[1] * y) / k[0]
@@ -39,24 +38,16 @@ def opaque(values: ArrayLike) -> list[Any]:
     A literal would become part of the kernel, and every camera, pose or light bank would be
     compiled anew: seconds instead of milliseconds.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     return [dr.opaque(mi.Float, float(v)) for v in np.asarray(values, float).ravel()]
 
 
 def opaque_index(value: int) -> Any:
     """`value` as a Dr.Jit integer that kernels read from memory."""
-    import drjit as dr
-    import mitsuba as mi
-
     return dr.opaque(mi.UInt32, value)
 
 
 def opaque_matrix(matrix: Array) -> Any:
     """`matrix (3, 3)` that kernels read from memory."""
-    import mitsuba as mi
-
     return mi.Matrix3f(*opaque(matrix))
 
 
@@ -72,8 +63,6 @@ class Surface:
 
     def is_hair(self, si: Any) -> Any:
         """Whether `si` lies on a fibre."""
-        import mitsuba as mi
-
         if self.scene.hair_shape is None:
             return mi.Bool(False)
         if self.scene.head_shape is None:
@@ -82,9 +71,6 @@ class Surface:
 
     def eval(self, si: Any, wo: Any, active: Any) -> Any:
         """BSDF times cosine `Color3f` towards the local direction `wo`."""
-        import drjit as dr
-        import mitsuba as mi
-
         hair = self.is_hair(si)
         value = self._diffuse(hair) * self._cosine(si, wo, hair) * dr.inv_pi
         if self.scene.hair_bsdf is not None:
@@ -94,9 +80,6 @@ class Surface:
 
     def sample(self, si: Any, u1: Any, u2: Any, active: Any) -> tuple[Any, Any]:
         """A local direction and its weight (BSDF times cosine over density)."""
-        import drjit as dr
-        import mitsuba as mi
-
         hair = self.is_hair(si)
         wo = mi.warp.square_to_cosine_hemisphere(u2)
         inside = ~hair & (si.wi.z < 0)
@@ -109,17 +92,12 @@ class Surface:
         return wo, dr.select(active, weight, 0)
 
     def _diffuse(self, hair: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         skin = mi.Color3f(*self.scene.skin)
         albedo = getattr(self.scene.hair, "albedo", None)
         return skin if albedo is None else dr.select(hair, mi.Color3f(*albedo), skin)
 
     def _cosine(self, si: Any, wo: Any, hair: Any) -> Any:
         """|cos| where both directions are on one side; fibres have an outer side only."""
-        import drjit as dr
-
         seen = (si.wi.z * wo.z > 0) & (~hair | (wo.z > 0))
         return dr.select(seen, dr.abs(wo.z), 0)
 
@@ -140,8 +118,6 @@ def light_from(
     `chance` in [0, 1)) and then counts as `dim`: the mean stays, and shadow rays, which cost ten
     times what the BSDF does, go where the light is.
     """
-    import drjit as dr
-
     towards = target - si.p
     squared = dr.squared_norm(towards)
     wo = si.to_local(towards * dr.rsqrt(squared))
@@ -162,9 +138,6 @@ def continue_path(
     Roulette starts at vertex `rr_depth`; survival is the largest channel of the throughput, at
     most 0.95, and survivors are weighted by its inverse, so that the estimate stays unbiased.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
     wo, weight = surface.sample(si, u1, u2, active)
     throughput = throughput * weight
@@ -193,9 +166,6 @@ def _size(camera: Camera) -> int:
 
 def stream(size: int, *seeds: int) -> Any:
     """Random streams of `size` lanes that depend on all of `seeds`."""
-    import drjit as dr
-    import mitsuba as mi
-
     state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
     generator: Any = mi.PCG32  # the stubs call it a plain object
     return generator(size, dr.opaque(mi.UInt64, int(state[0])))
@@ -213,9 +183,6 @@ def jittered(camera: Camera, pixel: Any, sample: Any, spp: int, rng: Any) -> Any
     Samples beyond the largest square grid fall anywhere in the pixel. A box filter, as the sensor
     integrates, or `camera.filter_sigma`'s Gaussian, onto which the grid is stretched.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n = opaque_index(int(spp**0.5))
     on_grid = sample < n * n
     cell_y = sample // n
@@ -246,9 +213,6 @@ def wave(
     camera: Camera, pixels: Any, slots: int, first: int, count: int, spp: int, *seeds: int
 ) -> Wave:
     """Samples `first` to `first + count` of `spp` of each of the `slots` Dr.Jit `pixels`."""
-    import drjit as dr
-    import mitsuba as mi
-
     size = opaque_index(slots)
     lane = dr.arange(mi.UInt32, count * slots)
     sample = lane // size
@@ -272,9 +236,6 @@ def each_sample(
     floats, and the same bytes on every run need the same order. `trace` is called once, with
     symbolic variables.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     slot = dr.arange(mi.UInt32, slots)
     size, end = opaque_index(slots), opaque_index(spp)
     state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -167,9 +169,6 @@ def _render(
     seed: tuple[int, int],
 ) -> dict[str, Floats]:
     """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
-    import drjit as dr
-    import mitsuba as mi
-
     n = len(index)
     surface, slots = Surface(scene), opaque_index(n)
     gathers = [
@@ -208,8 +207,6 @@ class _Gather:
     dim: float
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        import mitsuba as mi
-
         if not self.rows:
             return
         p = self.projector
@@ -232,9 +229,6 @@ class _Gather:
 
     def _splat(self, value: Any, v: Any, reach: float, slot: Any, seen: Any) -> None:
         """Add `value` to the rows near `v`, weighted as `Projector.row_weight` does."""
-        import drjit as dr
-        import mitsuba as mi
-
         (slope,) = opaque(1 / (np.sqrt(2) * self.projector.line_sigma))
         start, stop = (dr.opaque(mi.Int32, e) for e in (self.rows.start, self.rows.stop))
         lowest = mi.Int32(dr.ceil(v - reach))

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.paths import Surface, jittered, opaque, opaque_index
@@ -73,9 +75,6 @@ def follow(
     every run and no two lanes write to one slot. Lanes do not wait for each other's longest path:
     that saves a fifth to a third of the time.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     slot = dr.arange(mi.UInt32, len(pixels))
     pixel = mi.UInt32(for_kernels(pixels, np.uint32))
     size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(reach.max_depth)

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import sys
 
-from reconstruction.array_backend import BackendError, chosen_variant, find_libllvm
+import drjit as dr
+import mitsuba as mi
+
+from reconstruction.array_backend import chosen_variant
+from reconstruction.libllvm import BackendError, find_libllvm
 
 __all__ = ["BackendError", "ensure_backend", "find_libllvm"]
 
 
-def ensure_backend(variant: str | None = None) -> str:
-    """Set Mitsuba's variant once and return it.
+def ensure_backend(variant: str | None = None, *, threads: int | None = None) -> str:
+    """Set Mitsuba's variant once and return it; `threads` is how many Dr.Jit runs on, from now.
 
     `variant` or `HAIRSTAGE_VARIANT` overrides the choice; otherwise LLVM, which runs on every CPU.
     Raises `BackendError` when libLLVM is too old or absent.
     """
     chosen = chosen_variant(variant)
-    import mitsuba as mi
-
     if mi.variant() != chosen:
         mi.set_variant(chosen)
+    if threads is not None:
+        dr.set_thread_count(threads)
     return chosen
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -60,8 +61,6 @@ class HairScene:
         For comparisons with Mitsuba: the shapes are shared with this scene and keep the materials
         of the latest call. The head gets a two-sided `diffuse`.
         """
-        import mitsuba as mi
-
         shapes: dict[str, Any] = {}
         if self.hair_shape is not None:
             bsdf = self.hair_bsdf
@@ -94,8 +93,6 @@ def build_scene(
     `ValueError` for albedos out of range.
     """
     ensure_backend()
-    import mitsuba as mi
-
     albedo = _albedo(skin)
     parts: dict[str, Any] = {"type": "scene"}
     hair_shape = _curves(strands) if len(strands) else None
@@ -127,8 +124,6 @@ def mitsuba_hair(hair: HairAppearance, bsdf: str = "extended_hair") -> dict[str,
 def _hair_bsdf(hair: HairAppearance | DiffuseHair, bsdf: str = "extended_hair") -> Any | None:
     if isinstance(hair, DiffuseHair):
         return None
-    import mitsuba as mi
-
     return mi.load_dict(mitsuba_hair(hair, bsdf))
 
 
@@ -149,8 +144,6 @@ def _curves(strands: Strands) -> Any:
     The plugin reads its curves from a text file only: it gets one short curve, and the real
     arrays replace that one through its parameters.
     """
-    import mitsuba as mi
-
     points, segments = _guarded(*spline_control_points(strands))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "curve.txt"
@@ -180,8 +173,6 @@ def _guarded(points: Array, segments: Ints) -> tuple[Array, Ints]:
 
 
 def _mesh(head: Mesh) -> Any:
-    import mitsuba as mi
-
     mesh = mi.Mesh("head", len(head.vertices), len(head.faces))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(for_kernels((head.vertices * SCALE).ravel()))

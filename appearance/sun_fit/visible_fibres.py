@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -43,9 +45,6 @@ def visible_fibres(
     scene: HairScene, camera: Camera, pixels: ArrayLike, *, samples: int = 16, seed: int = 0
 ) -> VisibleFibres:
     """Trace `samples` jittered rays through each of `pixels (P,)` (flat indices) of `camera`."""
-    import drjit as dr
-    import mitsuba as mi
-
     index = pixel_indices(camera, pixels)
     if samples < 1:
         raise ValueError(f"samples must be positive, got {samples}")

@@ -86,10 +86,7 @@ def reproducible(
     Dr.Jit adds floating-point numbers to the film in the order in which its threads come by; with
     one thread that order is fixed. Several such processes use several cores.
     """
-    ensure_backend()
-    import drjit
-
-    drjit.set_thread_count(1)
+    ensure_backend(threads=1)
     return MitsubaResponder(rig, subject, drift, quality, seed)
 
 

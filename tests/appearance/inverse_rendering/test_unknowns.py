@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -43,9 +45,6 @@ def test_black_white_sharp_and_rough_hair_survive_the_way_there_and_back(sigma_a
 @pytest.mark.parametrize("sigma_a", [(8.0, 12.0, 20.0), (1e-4, 5e-4, 2e-3)])
 def test_derivatives_are_finite_also_at_no_rotation_and_at_both_ends_of_absorption(sigma_a):
     ensure_backend()
-    import drjit as dr
-    import mitsuba as mi
-
     raw = raw_of(
         HairMaps.of(HairAppearance(sigma_a, 0.02, 0.9), (3, 2, 2)), Lamps.calibrated(2), NONE
     )
@@ -64,8 +63,6 @@ def test_derivatives_are_finite_also_at_no_rotation_and_at_both_ends_of_absorpti
 
 def test_smoothness_is_a_mean_over_layers_cells_and_channels():
     ensure_backend()
-    import drjit as dr
-    import mitsuba as mi
 
     def value(columns):
         sigma_a = np.zeros((3, columns, 2, 3), np.float32)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -68,8 +70,6 @@ def test_a_brush_colours_its_wisp_and_nothing_else(fitted):
 
 
 def test_dyed_and_smoother_hair_is_so_in_every_light(fitted, small):
-    import mitsuba as mi
-
     darker = recoloured(fitted.maps, np.ones((1, 1)), (5.0, 5.0, 5.0))
     lamps = small.lamps()[:1]
     pictures = [
@@ -103,8 +103,6 @@ def test_maps_are_exported_as_layers_that_read_back(fitted, tmp_path):
 
 
 def test_stock_mitsuba_opens_the_scene_and_sees_about_our_picture(fitted, tmp_path):
-    import mitsuba as mi
-
     scene = mi.load_file(str(export_mitsuba(fitted, tmp_path, CAMERA, spp=64)))
     path = mi.load_dict({"type": "path", "max_depth": 16, "hide_emitters": True})
     stock = np.array(mi.render(scene, integrator=path, seed=0))[..., :3]
@@ -130,9 +128,6 @@ def test_usd_has_the_maps_as_attributes(fitted, tmp_path):
 
 
 def test_values_at_points_are_those_that_the_bsdf_looks_up(fitted):
-    import drjit as dr
-    import mitsuba as mi
-
     scene = fitted.scene()
     table = mi.TensorXf(fitted.maps.sigma_a.astype(np.float32))
     strands = fitted.strands

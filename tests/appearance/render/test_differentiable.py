@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -41,8 +42,6 @@ class Objective:
 
     def __init__(self, op, seed=0):
         ensure_backend()
-        import mitsuba as mi
-
         self.op, self.seed = op, seed
         shape = (len(op.lights), len(op.index), 3)
         self.weight = np.random.default_rng(3).uniform(0.5, 1.5, shape) / len(op.index)
@@ -72,8 +71,6 @@ class Objective:
 
 def extended(scene, tables=False):
     """`scene` with our hair BSDF, constant or with volumes of absorption and correctives."""
-    import mitsuba as mi
-
     from appearance.bsdf.strand_coordinates import strand_parameters
 
     parameters = {
@@ -235,8 +232,6 @@ def test_seeds_decide_the_picture_and_the_paths_of_the_gradient(tufted, small):
 
 def test_a_loss_flows_on_through_other_operations(tufted, small):
     """Parameters of parameters, and a loss that is not linear; nothing else gets a gradient."""
-    import mitsuba as mi
-
     scene, camera = tufted
     op = DifferentiableOlat(scene, camera, small.lamps()[:1], [66, 67, 78], spp=16, max_depth=3)
     log_sigma = mi.Color3f(np.log([0.1, 0.2, 0.45]))

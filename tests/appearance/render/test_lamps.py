@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -39,8 +40,6 @@ BEAM = LampProfile(
 def irradiance(light, point, normal, samples=1 << 16):
     """Mean irradiance `(3,)` at `point` on a surface with `normal`, by sampling the lamp."""
     ensure_backend()
-    import mitsuba as mi
-
     bank = LampBank.of([light])
     generator = mi.PCG32(samples, 1)
     p = mi.Point3f((np.asarray(point, float) * SCALE).tolist())
@@ -64,8 +63,6 @@ def test_a_sphere_shines_like_a_point_on_what_faces_it():
 
 def test_the_shadow_ray_ends_on_the_sphere():
     ensure_backend()
-    import mitsuba as mi
-
     light = Light("l", np.array([0.1, 0.2, 0.3]), np.ones(3), radius=0.04)
     bank = LampBank.of([light])
     p = mi.Point3f(-0.1 * SCALE, 0, 0)
@@ -107,8 +104,6 @@ def test_a_panel_is_the_sum_of_its_points(profile):
 def test_profiles_are_those_of_the_rig():
     """`LampBank` and `Light.intensity_towards` are two writings of one thing."""
     ensure_backend()
-    import mitsuba as mi
-
     rng = np.random.default_rng(0)
     kinds = [
         BEAM,

@@ -5,11 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
-from appearance.scene.backend import BackendError, ensure_backend, find_libllvm
+from appearance.scene.backend import ensure_backend
 from reconstruction.array_backend import for_kernels
+from reconstruction.libllvm import BackendError, find_libllvm
 
 
 def test_an_old_libllvm_is_refused_with_what_to_install(tmp_path, monkeypatch):
@@ -51,11 +53,17 @@ def test_the_message_comes_before_the_crash(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("package", ["appearance", "reconstruction.light_codes.search"])
+def test_the_library_is_chosen_before_dr_jit_loads_one(package):
+    code = f"import sys, {package}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = done.stdout.split()
+    assert modules.index("reconstruction.libllvm") < modules.index("drjit")
+
+
 def test_a_usable_library_is_found_and_the_variant_is_set():
     assert Path(find_libllvm()).is_file()
     chosen = ensure_backend()
-    import mitsuba as mi
-
     assert mi.variant() == chosen == ensure_backend()
 
 

@@ -1,5 +1,7 @@
 """Scenes: curves through the strands' points, materials, and conventions."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -103,9 +105,6 @@ def test_other_materials_share_the_geometry(small):
 
 
 def test_another_hair_material_runs_in_the_same_kernel(small):
-    import drjit as dr
-    import mitsuba as mi
-
     scene = build_scene(small.no_hair, None, hair=HAIR)
     scenes = [
         scene.with_hair(HairAppearance((s, 1.0, 2.0), 0.1 + s, 0.2)) for s in np.arange(8) / 9
