@@ -12,7 +12,7 @@ from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
 from reconstruction.growth.from_roots import Coverage, fill_gaps, grow_from_roots
 from reconstruction.growth.hair_envelope import build_envelope
@@ -22,8 +22,8 @@ from reconstruction.head.fitted import FittedHead, digitised_points, lay_head, s
 from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.images.segmentation import Network
+from reconstruction.light_codes.light_code_options import LightCodeOptions
 from reconstruction.light_codes.line_strands import both, line_strands
-from reconstruction.light_codes.options import LightCodeOptions
 from reconstruction.light_planes import (
     Motion,
     MotionOptions,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.calibration_error import CalibrationError
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.lamps import LOOSE, Lamp
+from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.least_squares import minimise
+from reconstruction.calibration.solve_lights import LOOSE, Lamp
 from reconstruction.geometry.lights import Light
 
 MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better

@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.calibration.cameras import CameraSolution, calibrate_cameras
-from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.lamps import Lamp, mirrored_lamps
-from reconstruction.calibration.projectors import (
+from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.shading import refine_centres, shaded_lamp, with_intensity
+from reconstruction.calibration.solve_cameras import CameraSolution, calibrate_cameras
+from reconstruction.calibration.solve_lights import Lamp, mirrored_lamps
+from reconstruction.calibration.solve_projectors import (
     UNDETERMINED,
     Rows,
     calibrate_projector,
     projector_intensities,
     rows_on_board,
 )
-from reconstruction.calibration.shading import refine_centres, shaded_lamp, with_intensity
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from reconstruction.arrays import Array, Ints
-from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.frames import lamp_response
-from reconstruction.calibration.lamps import Glint
+from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.light_response import lamp_response
 from reconstruction.calibration.shading import Shading
+from reconstruction.calibration.solve_lights import Glint
 from reconstruction.calibration.spheres import find_highlight, find_outline, sphere_centre
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera

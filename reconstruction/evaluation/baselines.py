@@ -16,10 +16,11 @@ from scipy import ndimage
 from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import inside_mesh, mesh_depth, mesh_silhouette
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid, mesh_silhouette, trim_edges, visual_hull
-from reconstruction.growth.envelope import carve, inside_mesh, mesh_depth
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import solve_field
+from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 
 SPACING = np.sqrt(2) * 1e-3
 """Metres between neighbouring lines: no point between them is over 1 mm from the nearest."""
@@ -50,7 +51,7 @@ def control_hull(
     hull = visual_hull(used, both, spacing=spacing)
     hull = replace(hull, inside=hull.inside & ~inside_mesh(hull, head))
     first = {c.name: np.where(masks[c.name], 0.0, mesh_depth(c, head)) for c in used}
-    return carve(hull, used, first)
+    return space_carve(hull, used, first)
 
 
 def hull_vertical(hull: VoxelGrid, *, spacing: float = SPACING) -> Strands:

@@ -10,9 +10,9 @@ from scipy import ndimage
 from reconstruction.arrays import AnyFloats, Array, Ints
 from reconstruction.evaluation.oriented_points import OrientedPoints
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid
-from reconstruction.growth.envelope import inside_mesh
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.scalp_map import sphere_center
 
 SCALP = ("front", "top", "sides", "back", "nape")

@@ -9,8 +9,8 @@ import numpy as np
 from reconstruction.arrays import AnyFloats, Bools, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.strands import Resampling, Strands
-from reconstruction.growth.envelope import surface_samples
 
 NARROWEST, WIDEST = 5e-4, 1e-3
 """Limits, in metres, of the width that a strand hides with."""

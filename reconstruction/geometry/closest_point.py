@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.growth.envelope import surface_samples
+from reconstruction.geometry.mesh_queries import surface_samples
 
 _CANDIDATES = 6
 

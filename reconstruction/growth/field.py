@@ -11,7 +11,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.laplace import conjugate_gradients, explicit_diffusion, grid_laplacian
 from reconstruction.report.report import Series
 

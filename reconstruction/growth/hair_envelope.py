@@ -11,8 +11,9 @@ from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid, visual_hull
-from reconstruction.growth.envelope import carve, depth_map, inside_mesh, mesh_depth
+from reconstruction.geometry.mesh_queries import depth_map, inside_mesh, mesh_depth
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.images.visual_hull import space_carve, visual_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Stage
@@ -55,7 +56,7 @@ def build_envelope(
         first = np.where(mask.hair, depth, np.where(np.isfinite(bare), bare, 0.0))
         surfaces[camera.name], depths[camera.name] = first, depth
         hairs.append(own[_on(mask.hair, camera, own)])
-    carved = carve(hull, cameras, surfaces, margin)
+    carved = space_carve(hull, cameras, surfaces, margin)
     held = hull.inside & _holding(hull, np.concatenate(hairs))
     inside = (carved.inside | held) & ~inside_mesh(hull, head)
     envelope = replace(carved, inside=inside)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.growth.envelope import surface_samples
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import MOTIONS, Pose, Surface, find_pose, similarity, tukey
 from reconstruction.head.shape import ShapeOptions, bend

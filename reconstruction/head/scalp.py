@@ -8,8 +8,8 @@ import numpy as np
 
 from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid
-from reconstruction.growth.envelope import surface_samples
+from reconstruction.geometry.mesh_queries import surface_samples
+from reconstruction.geometry.voxels import VoxelGrid
 
 _LIFTS = np.arange(1, 7) * 2e-3
 """Metres above the skin at which hair is looked for: the envelope may stay clear of the head."""

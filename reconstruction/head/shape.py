@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.growth.envelope import surface_samples
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.pose import Surface, tukey
 
 _NEAR = 8

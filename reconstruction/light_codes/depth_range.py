@@ -10,8 +10,9 @@ from scipy import ndimage
 from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid, visual_hull
-from reconstruction.growth.envelope import inside_mesh
+from reconstruction.geometry.mesh_queries import inside_mesh
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.images.visual_hull import visual_hull
 
 
 def hair_volume(

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from reconstruction.light_codes.views import View
+from reconstruction.light_codes.code_views import View
 
 _UNIT = 32767.0  # a line's two numbers are kept as 16-bit fractions
 

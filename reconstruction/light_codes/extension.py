@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.arrays import Array, Ints
-from reconstruction.light_codes.views import View
+from reconstruction.light_codes.code_views import View
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.orientation import LogGaborBank, orientations
 from reconstruction.images.silhouettes import background_noise, dark_frame
+from reconstruction.light_codes.code_views import View, furthest_light, light_beside, line_vectors
 from reconstruction.light_codes.codes import along_lines, code_map
-from reconstruction.light_codes.views import View, furthest_light, light_beside, line_vectors
 from reconstruction.report.report import Progress, Stage, silent
 
 

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.growth.envelope import surface_samples
-from reconstruction.light_codes.options import DEFAULTS, LightCodeOptions
-from reconstruction.light_codes.pipeline import measure_segments, string_together
+from reconstruction.geometry.mesh_queries import surface_samples
+from reconstruction.light_codes.light_code_options import DEFAULTS, LightCodeOptions
+from reconstruction.light_codes.measure_segments import measure_segments, string_together
 from reconstruction.light_codes.segments import Segments
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Progress, Report, silent

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reconstruction.array_backend import array_types, for_kernels
 from reconstruction.arrays import Bools, Floats, Ints
+from reconstruction.light_codes.code_views import View, nearest_views
 from reconstruction.light_codes.codes import unpack
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import (
@@ -19,7 +20,6 @@ from reconstruction.light_codes.objective import (
     agreement,
     line_through,
 )
-from reconstruction.light_codes.views import View, nearest_views
 
 FEW_SAMPLES = 3
 """Points of a segment in the first stage. Sun's compares lightcodes alone there, which change too

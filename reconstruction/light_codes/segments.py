@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Ints
+from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.search import DepthMap
-from reconstruction.light_codes.views import View
 
 
 @dataclass(frozen=True, eq=False)

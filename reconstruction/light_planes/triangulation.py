@@ -11,10 +11,10 @@ from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.projectors import Projector
 from reconstruction.images.silhouettes import NoSilhouette, silhouette
-from reconstruction.light_planes.conditioning import row_pitch
 from reconstruction.light_planes.consensus import flatten, support, supported
 from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.peaks import CLEAN, PeakOptions, Peaks, find_peaks
+from reconstruction.light_planes.plane_conditioning import row_pitch
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Progress, Stage, silent
 

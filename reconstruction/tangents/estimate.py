@@ -10,11 +10,10 @@ import numpy as np
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.lights import Light
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank, texture
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Progress, Stage, silent
-from reconstruction.tangents.conditioning import condition_lines
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
     decide,
@@ -25,6 +24,7 @@ from reconstruction.tangents.line_evidence import (
     seen_by,
 )
 from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
+from reconstruction.tangents.tangent_conditioning import condition_lines
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def _board(args: argparse.Namespace) -> Any:
 
 def run_rig(args: argparse.Namespace, output: Output) -> int:
     """Calibrate a stage."""
-    from reconstruction.calibration.compare import compare_rigs
+    from reconstruction.calibration.rig_comparison import compare_rigs
     from reconstruction.calibration.solve import Targets, calibrate
     from reconstruction.capture.folder import Capture
     from reconstruction.geometry.rig import Rig

@@ -27,7 +27,7 @@ def add(commands: Commands) -> None:
 
 def run_check(args: argparse.Namespace, output: Output) -> int:
     """Check a rig file."""
-    from reconstruction.light_planes.conditioning import condition
+    from reconstruction.light_planes.plane_conditioning import condition
     from stage_service.config import load_rig_file
     from stage_service.plan.capture_plan import CapturePlan
     from stage_service.plan.resolved import resolve

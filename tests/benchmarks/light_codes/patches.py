@@ -24,11 +24,11 @@ from reconstruction.evaluation.baselines import control_hull, hull_smooth_field,
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.files.strands import read_strands
+from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid
-from reconstruction.growth.envelope import mesh_depth
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import texture
-from reconstruction.light_codes.pipeline import look_at_hair
+from reconstruction.light_codes.measure_segments import look_at_hair
 from reconstruction.masks import hair_masks
 from reconstruction.methods import Method
 from reconstruction.model import Model

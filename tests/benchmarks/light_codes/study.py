@@ -14,13 +14,13 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank
+from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.depth_range import depth_range
-from reconstruction.light_codes.options import LightCodeOptions
+from reconstruction.light_codes.light_code_options import LightCodeOptions
 from reconstruction.light_codes.search import DepthMap, DepthSearch, SearchOptions
 from reconstruction.light_codes.segments import to_segments
-from reconstruction.light_codes.views import View
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "depth step, mm": {str(1e3 * s): {"step": s} for s in (1e-3, 5e-4, 2.5e-4, 1.25e-4)},

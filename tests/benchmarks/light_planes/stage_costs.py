@@ -11,7 +11,7 @@ import numpy as np
 
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
 from reconstruction.growth.from_roots import grow_from_roots
 from reconstruction.head.scalp import Scalp, sample_roots

@@ -13,7 +13,7 @@ from benchmarks.light_planes.motion_errors import PAPER_PIXELS, motion_errors, t
 from benchmarks.light_planes.stage_costs import Growth, extrapolated, measure_growth, regridded
 
 from reconstruction.capture.folder import Capture
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.light_planes import Motion
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from benchmarks.light_codes import study
 
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank
-from reconstruction.light_codes.options import LightCodeOptions
+from reconstruction.light_codes.light_code_options import LightCodeOptions
 
 
 def test_opencvs_loop_gives_what_our_bank_gives() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.solve import calibrate
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.rig import Rig

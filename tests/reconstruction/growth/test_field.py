@@ -10,14 +10,8 @@ from hypothesis.extra import numpy as hnp
 
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid
-from reconstruction.growth.envelope import (
-    carve,
-    depth_map,
-    inside_mesh,
-    mesh_depth,
-    surface_samples,
-)
+from reconstruction.geometry.mesh_queries import depth_map, inside_mesh, mesh_depth, surface_samples
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import FieldOptions, gather, principal, solve_field, to_tensors
 from reconstruction.growth.laplace import (
     Multigrid,
@@ -26,6 +20,7 @@ from reconstruction.growth.laplace import (
     explicit_diffusion,
     grid_laplacian,
 )
+from reconstruction.images.visual_hull import space_carve
 
 
 def box(*shape: int, spacing: float = 1e-3) -> VoxelGrid:
@@ -248,14 +243,14 @@ def test_surface_samples_are_on_the_surface_and_dense() -> None:
 def test_carving_empties_what_a_camera_saw_through() -> None:
     camera = Camera.look_at("c", 40, 40, (0, -1.0, 0), (0, 0, 0), 20.0)
     grid = VoxelGrid(np.full(3, -0.05), 5e-3, np.ones((21, 21, 21), bool))
-    carved = carve(grid, [camera], {"c": np.full((40, 40), 1.0)}, margin=1e-3)
+    carved = space_carve(grid, [camera], {"c": np.full((40, 40), 1.0)}, margin=1e-3)
     y = carved.centers()[:, 1]
     assert y.min() == pytest.approx(0)
     assert len(y) == 21 * 21 * 11
-    assert not carve(grid, [camera], {"c": np.full((40, 40), np.inf)}).inside.any()
-    assert carve(grid, [camera], {"c": np.zeros((40, 40))}).inside.all()
+    assert not space_carve(grid, [camera], {"c": np.full((40, 40), np.inf)}).inside.any()
+    assert space_carve(grid, [camera], {"c": np.zeros((40, 40))}).inside.all()
     with pytest.raises(ValueError, match="first_surface must be"):
-        carve(grid, [camera], {"c": np.zeros((4, 4))})
+        space_carve(grid, [camera], {"c": np.zeros((4, 4))})
 
 
 def test_depth_maps() -> None:

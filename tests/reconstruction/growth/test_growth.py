@@ -9,7 +9,7 @@ import pytest
 from benchmarks.light_planes.growth_study import METHODS, compare_growth
 
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field, to_tensors
 from reconstruction.growth.from_roots import (
     Coverage,

@@ -13,8 +13,8 @@ from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.strands import Strands
-from reconstruction.growth.envelope import surface_samples
 from reconstruction.head.fit import HeadFitError
 from reconstruction.head.fitted import (
     FEWEST_SKIN,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruction.geometry.closest_point import ClosestPoint, closest_on_triangles
 from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.growth.envelope import surface_samples
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.fit import HeadFit, HeadFitError, fit_head, mark_scalp
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import similarity

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.scalp import NoScalp, find_scalp, sample_roots
 
 

@@ -20,8 +20,8 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
+from reconstruction.light_codes.code_views import View, light_beside, line_vectors
 from reconstruction.light_codes.codes import code_map
-from reconstruction.light_codes.views import View, light_beside, line_vectors
 
 RADIUS = 0.03
 Bools = NDArray[np.bool_]

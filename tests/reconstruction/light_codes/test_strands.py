@@ -10,7 +10,7 @@ import pytest
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.strands import Strands, smoothed
 from reconstruction.light_codes.extension import ExtensionOptions, extend, fewest_views
-from reconstruction.light_codes.pipeline import string_together
+from reconstruction.light_codes.measure_segments import string_together
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import count_supports, thinned_lines, to_segments
 from reconstruction.report.report import Report

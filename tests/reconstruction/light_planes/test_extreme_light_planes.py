@@ -21,7 +21,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.mesh import Mesh, write_obj
 from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import solve_field
 from reconstruction.growth.from_roots import grow_from_roots
 from reconstruction.head.scalp import NoScalp

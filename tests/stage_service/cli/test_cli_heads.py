@@ -10,7 +10,7 @@ import pytest
 
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
-from reconstruction.growth.envelope import surface_samples
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.generic import generic_head
 from stage_service.cli import main
 

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.calibration.cameras import calibrate_cameras
-from reconstruction.calibration.compare import compare_rigs
-from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.rig_comparison import compare_rigs
+from reconstruction.calibration.solve_cameras import calibrate_cameras
 from reconstruction.geometry.cameras import Camera, facing
 from reconstruction.geometry.rig import Rig
 from simulators.subject.props import BoardProp, board_pose

@@ -15,8 +15,10 @@ from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import mesh_silhouette
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid, mesh_silhouette, trim_edges, visual_hull
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.images.visual_hull import trim_edges, visual_hull
 
 
 def ball(radius: float, center: tuple[float, float, float] = (0, 0, 0)) -> Mesh:

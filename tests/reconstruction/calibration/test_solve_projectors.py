@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from reconstruction.calibration.boards import Board
-from reconstruction.calibration.cameras import CameraSolution
-from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.projectors import (
+from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.solve_cameras import CameraSolution
+from reconstruction.calibration.solve_projectors import (
     Rows,
     calibrate_projector,
     projector_intensities,

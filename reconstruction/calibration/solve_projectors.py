@@ -17,10 +17,10 @@ from scipy.optimize import nnls
 
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.boards import Board
-from reconstruction.calibration.cameras import CameraSolution
-from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.frames import dark_response
+from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.least_squares import Linearised, Solution, minimise, numeric
+from reconstruction.calibration.light_response import dark_response
+from reconstruction.calibration.solve_cameras import CameraSolution
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.projectors import Projector

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruction.calibration.errors import CalibrationError
-from reconstruction.calibration.lamps import Glint, mirrored_lamps
+from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.shading import Shading, refine_centres, shaded_lamp
+from reconstruction.calibration.solve_lights import Glint, mirrored_lamps
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
 from reconstruction.calibration.spheres import find_highlight, mirrored
 from reconstruction.capture.folder import Capture

@@ -16,7 +16,7 @@ import numpy as np
 
 from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.calibration.errors import CalibrationError
+from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.least_squares import Solution, minimise
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rigid_motion import Rigid, align_devices

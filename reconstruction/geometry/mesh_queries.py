@@ -1,9 +1,6 @@
-"""Where hair can be: the visual hull, carved by what the cameras saw, outside the head."""
+"""What a mesh or points are to voxels and cameras: samples, inside, depth and silhouette."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +9,7 @@ from numpy.typing import NDArray
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 
 
 def surface_samples(mesh: Mesh, spacing: float) -> tuple[Array, Array, Ints]:
@@ -95,37 +92,6 @@ def _crossings(
     return before, total
 
 
-def carve(
-    hull: VoxelGrid,
-    cameras: Sequence[Camera],
-    first_surface: Mapping[str, AnyFloats],
-    margin: float = 0.0,
-) -> VoxelGrid:
-    """The hull without the voxels that some camera saw through (space carving).
-
-    `first_surface[name] (H, W)` is the depth along that camera's z, metres, of the first thing
-    each pixel sees: infinite where the pixel sees nothing at all, 0 where nothing is known. Voxels
-    more than `margin` metres in front of it are empty; voxels off an image are not judged by it.
-    """
-    index = np.argwhere(hull.inside)
-    for camera in cameras:
-        if camera.name not in first_surface:
-            continue
-        first = first_surface[camera.name]
-        if first.shape != (camera.height, camera.width):
-            raise ValueError(
-                f"{camera.name}: first_surface must be {(camera.height, camera.width)}, "
-                f"got {first.shape}"
-            )
-        pixels, depth = camera.project(hull.centers(index))
-        seen = (depth > 0) & camera.inside(pixels)
-        x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
-        index = index[~seen | (depth >= first[y, x] - margin)]
-    inside = np.zeros_like(hull.inside)
-    inside[tuple(index.T)] = True
-    return replace(hull, inside=inside)
-
-
 def depth_map(camera: Camera, points: AnyFloats) -> Array:
     """Depth `(H, W)` along z, metres: the median of the points on a pixel, 0 where there are none.
 
@@ -172,3 +138,15 @@ def mesh_depth(camera: Camera, mesh: Mesh) -> Array:
     low, high = corners[face].min(axis=1), corners[face].max(axis=1)
     out[y, x] = np.clip(along, low, high)  # an edge's pixel may lie just beside its face
     return out
+
+
+def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bools:
+    """The pixels `(H, W)` that a mesh covers or its outline touches, as far as it is in front."""
+    pixels, depth = camera.project(mesh.vertices)
+    faces = mesh.faces[(depth[mesh.faces] > 1e-6).all(axis=1)]
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    shift = 8  # fillConvexPoly takes fixed-point coordinates with this many fractional bits
+    corners = np.rint(np.clip(pixels, -1e5, 1e5) * 2**shift).astype(np.int32)
+    for triangle in corners[faces]:
+        cv2.fillConvexPoly(image, triangle, 1, lineType=cv2.LINE_8, shift=shift)
+    return image.astype(bool)

@@ -11,11 +11,11 @@ import pytest
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.masks import HairMask
-from reconstruction.tangents.conditioning import condition_lines
 from reconstruction.tangents.estimate import MeasureOptions, measure_tangents
 from reconstruction.tangents.line_evidence import LineEvidence
+from reconstruction.tangents.tangent_conditioning import condition_lines
 
 UP = np.array([0.0, 0.0, 1.0])
 BINS = 36

@@ -3,68 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reconstruction.arrays import Array, Bools, Ints
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.voxels import VoxelGrid
 
 BLOCK = 8
 """Voxels along the edge of the blocks that are carved as a whole before single voxels are."""
 
 MOST_VOXELS = 400_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class VoxelGrid:
-    """A boolean volume.
-
-    `origin (3,)` is the centre of voxel (0, 0, 0) in metres, `spacing` the edge of the cubic voxels
-    in metres, `inside (nx, ny, nz) bool` marks the voxels that belong to the volume.
-    """
-
-    origin: Array
-    spacing: float
-    inside: Bools
-
-    def __post_init__(self) -> None:
-        origin = np.array(self.origin, dtype=np.float64)
-        inside = np.ascontiguousarray(self.inside, dtype=bool)
-        if origin.shape != (3,) or not np.isfinite(origin).all():
-            raise ValueError(f"a voxel grid's origin must be 3 finite numbers, got {self.origin}")
-        if not self.spacing > 0 or inside.ndim != 3:
-            raise ValueError(
-                f"a voxel grid needs spacing > 0 and three axes, got {self.spacing}, {inside.shape}"
-            )
-        object.__setattr__(self, "origin", origin)
-        object.__setattr__(self, "inside", inside)
-
-    def centers(self, index: ArrayLike | None = None) -> Array:
-        """World positions `(M, 3)` of voxel indices `(M, 3)`; of all inside voxels by default."""
-        ijk = np.argwhere(self.inside) if index is None else np.asarray(index)
-        return np.asarray(self.origin + self.spacing * ijk)
-
-    def index(self, points: ArrayLike) -> Ints:
-        """Indices `(..., 3)` of the voxels around `points (..., 3)`; they may lie off the grid."""
-        q = (np.asarray(points, float) - self.origin) / self.spacing
-        return np.floor(q + 0.5).astype(np.int64)
-
-    def contains(self, points: ArrayLike) -> Bools:
-        """Whether `points (..., 3)` lie in an inside voxel; off the grid counts as outside."""
-        ijk = self.index(points)
-        on: Bools = np.asarray(((ijk >= 0) & (ijk < self.inside.shape)).all(axis=-1))
-        i, j, k = np.moveaxis(np.where(on[..., None], ijk, 0), -1, 0)
-        found: Bools = self.inside[i, j, k] if self.inside.size else np.zeros(on.shape, bool)
-        return np.asarray(on & found)
-
-    @property
-    def volume(self) -> float:
-        """Cubic metres inside."""
-        return float(self.inside.sum()) * self.spacing**3
 
 
 def visual_hull(
@@ -256,18 +208,6 @@ def _common_center(views: list[_View]) -> Array:
     return np.asarray(np.linalg.solve(A, b))
 
 
-def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bools:
-    """The pixels `(H, W)` that a mesh covers or its outline touches, as far as it is in front."""
-    pixels, depth = camera.project(mesh.vertices)
-    faces = mesh.faces[(depth[mesh.faces] > 1e-6).all(axis=1)]
-    image = np.zeros((camera.height, camera.width), np.uint8)
-    shift = 8  # fillConvexPoly takes fixed-point coordinates with this many fractional bits
-    corners = np.rint(np.clip(pixels, -1e5, 1e5) * 2**shift).astype(np.int32)
-    for triangle in corners[faces]:
-        cv2.fillConvexPoly(image, triangle, 1, lineType=cv2.LINE_8, shift=shift)
-    return image.astype(bool)
-
-
 def trim_edges(mask: Bools, hair: Bools) -> Bools:
     """`mask (H, W)` without the pixels on the image's edges that `hair (H, W)` does not hold.
 
@@ -278,3 +218,34 @@ def trim_edges(mask: Bools, hair: Bools) -> Bools:
     for side in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
         out[side] &= hair[side]
     return out
+
+
+def space_carve(
+    hull: VoxelGrid,
+    cameras: Sequence[Camera],
+    first_surface: Mapping[str, AnyFloats],
+    margin: float = 0.0,
+) -> VoxelGrid:
+    """The hull without the voxels that some camera saw through (space carving).
+
+    `first_surface[name] (H, W)` is the depth along that camera's z, metres, of the first thing
+    each pixel sees: infinite where the pixel sees nothing at all, 0 where nothing is known. Voxels
+    more than `margin` metres in front of it are empty; voxels off an image are not judged by it.
+    """
+    index = np.argwhere(hull.inside)
+    for camera in cameras:
+        if camera.name not in first_surface:
+            continue
+        first = first_surface[camera.name]
+        if first.shape != (camera.height, camera.width):
+            raise ValueError(
+                f"{camera.name}: first_surface must be {(camera.height, camera.width)}, "
+                f"got {first.shape}"
+            )
+        pixels, depth = camera.project(hull.centers(index))
+        seen = (depth > 0) & camera.inside(pixels)
+        x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+        index = index[~seen | (depth >= first[y, x] - margin)]
+    inside = np.zeros_like(hull.inside)
+    inside[tuple(index.T)] = True
+    return replace(hull, inside=inside)

@@ -10,13 +10,14 @@ import numpy as np
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.surface_strands import surface_strands
+from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.depth_range import depth_range, hair_volume
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.from_capture import views_of
+from reconstruction.light_codes.light_code_options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.lmvs import LmvsSearch
-from reconstruction.light_codes.options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import (
     Segments,
@@ -24,7 +25,6 @@ from reconstruction.light_codes.segments import (
     thinned_lines,
     to_segments,
 )
-from reconstruction.light_codes.views import View
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured

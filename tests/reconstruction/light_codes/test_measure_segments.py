@@ -15,9 +15,9 @@ from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.visual_hull import VoxelGrid
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank
-from reconstruction.light_codes.options import LightCodeOptions
+from reconstruction.light_codes.light_code_options import LightCodeOptions
 from reconstruction.light_codes.search import SearchOptions
 from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
