@@ -23,7 +23,7 @@ from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.light_code_options import LightCodeOptions
-from reconstruction.light_codes.line_strands import both, line_strands
+from reconstruction.light_codes.line_strands import line_strands, merge
 from reconstruction.light_planes import (
     Motion,
     MotionOptions,
@@ -153,7 +153,7 @@ def reconstruct(
             capture, masks, head, report, options=options.light_codes, progress=progress
         )
         seen += more
-        measured = both(measured, segments, options.light_codes.field_weight)
+        measured = merge(measured, segments, options.light_codes.field_weight)
     with report.stage("field") as stage:
         scalp = find_scalp(head, envelope)
         field = _field(envelope, measured, scalp, options, stage)

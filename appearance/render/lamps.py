@@ -16,7 +16,7 @@ from appearance.render.paths import opaque, opaque_index, opaque_matrix
 from appearance.scene.hair_scene import SCALE, light_arrays
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
-from reconstruction.geometry.light_profiles import POLAR_FRAMES, LampProfile
+from reconstruction.geometry.light_profiles import POLAR_FRAMES, LightProfile
 from reconstruction.geometry.lights import Light
 
 
@@ -135,7 +135,7 @@ def _point_on_sphere(centre: Any, radius: Any, p: Any, u: Any, v: Any) -> tuple[
 
 @dataclass(frozen=True)
 class ProfileTable:
-    """A `LampProfile` on the device; `at` is its `at`."""
+    """A `LightProfile` on the device; `at` is its `at`."""
 
     longitudes: Any
     colatitudes: Any
@@ -146,7 +146,7 @@ class ProfileTable:
     spare: Any
 
     @classmethod
-    def of(cls, profile: LampProfile) -> ProfileTable:
+    def of(cls, profile: LightProfile) -> ProfileTable:
         """The table of `profile`."""
         longitude = profile.longitude_deg
         start, spare = opaque([longitude[0], 0.5 * (360 - (longitude[-1] - longitude[0]))])

@@ -117,8 +117,8 @@ def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
         nv = (n * v).sum(axis=1)
         strength = share * np.exp(p[3]) / squared**1.5
         model = strength * nv
-        slope = strength[:, None] * (n - (3 * nv / squared)[:, None] * v)
-        return (model - value) / error, np.column_stack([slope, model]) / error[:, None]
+        gradient = strength[:, None] * (n - (3 * nv / squared)[:, None] * v)
+        return (model - value) / error, np.column_stack([gradient, model]) / error[:, None]
 
     begin = np.log(max(float(form[use] @ value / (form[use] @ form[use])), 1e-12))
     solution = minimise(function, np.append(start.position, begin))

@@ -103,8 +103,8 @@ def mirrored_lamps(
             for axis in range(3):
                 step = np.zeros_like(x)
                 step[offset + axis : offset + size : 3] = h
-                slope = (residual(x + step) - residual(x - step)) / (2 * h)
-                entries.append((slope, row, np.repeat(offset + 3 * owner + axis, 2)))
+                derivative = (residual(x + step) - residual(x - step)) / (2 * h)
+                entries.append((derivative, row, np.repeat(offset + 3 * owner + axis, 2)))
         rest = [W @ (x[3 * k : 3 * k + 3] - p) for k, p, W in priors]
         for i, (k, _, W) in enumerate(priors):
             rows, columns = np.indices((3, 3)).reshape(2, -1)

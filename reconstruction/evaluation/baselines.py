@@ -1,6 +1,6 @@
 """Strands that no method made: what any reconstruction has to beat.
 
-A table of precision and recall says little beside an empty page. These two controls know the masks
+A table of precision and recall says little beside an empty page. These two baselines know the masks
 and the head and nothing else, and fill the hull so densely that a true point in it always has a
 line within 1 mm: what they lose, they lose by direction and by the hull's excess over the hair.
 """
@@ -30,7 +30,7 @@ RADIUS = 3.5e-4
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def control_hull(
+def baseline_hull(
     cameras: Sequence[Camera],
     masks: Mapping[str, Bools],
     head: Mesh | None = None,

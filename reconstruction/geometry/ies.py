@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from reconstruction.arrays import Array
-from reconstruction.geometry.light_profiles import LampProfile, Photometry, Unit
+from reconstruction.geometry.light_profiles import LightProfile, Photometry, Unit
 
 VERSIONS = {
     "IESNA91": 1991,
@@ -46,7 +46,7 @@ class IesFile:
     opening_m: tuple[float, float, float]
     watts: float
     tilt: Array | None
-    profile: LampProfile
+    profile: LightProfile
 
 
 def read_ies(
@@ -253,7 +253,7 @@ def _angles(numbers: _Numbers, photometry: Photometry, sizes: list[int]) -> tupl
 
 def _type_c(
     name: str, vertical: Array, horizontal: Array, values: Array, unit: Unit
-) -> LampProfile:
+) -> LightProfile:
     """All round, by the symmetry that the range of the horizontal angles stands for."""
     h, v = horizontal, values
     if (h[0], h[-1]) == (90, 270):
@@ -266,7 +266,7 @@ def _type_c(
         h, v = np.append(h, 360 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
     if h[-1] - h[0] < 360:
         h, v = np.append(h, 360), np.append(v, v[:1], axis=0)
-    return LampProfile(name, h, vertical, v, "C", unit)
+    return LightProfile(name, h, vertical, v, "C", unit)
 
 
 def _type_a_or_b(
@@ -276,11 +276,11 @@ def _type_a_or_b(
     values: Array,
     photometry: Photometry,
     unit: Unit,
-) -> LampProfile:
+) -> LightProfile:
     """Both sides of the vertical plane where only one is given; dark beyond the table."""
     if horizontal[0] == 0:
         horizontal = np.append(-horizontal[:0:-1], horizontal)
         values = np.append(values[:0:-1], values, axis=0)
     if photometry == "A":
-        return LampProfile(name, horizontal, vertical + 90, values, photometry, unit)
-    return LampProfile(name, vertical, horizontal + 90, values.T, photometry, unit)
+        return LightProfile(name, horizontal, vertical + 90, values, photometry, unit)
+    return LightProfile(name, vertical, horizontal + 90, values.T, photometry, unit)

@@ -1,4 +1,4 @@
-"""How a lamp's intensity depends on direction: a table on the sphere."""
+"""How a light's intensity depends on direction: a table on the sphere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ POLAR_FRAMES: dict[str, Array] = {
 }
 """Rows: where longitude is 0 and 90 degrees on the equator, and the pole where colatitude is 0.
 
-In the lamp's frame: x right, y down, z along its aim, as seen from behind the lamp. C: the pole is
+In the light's frame: x right, y down, z along its aim, as seen from behind it. C: the pole is
 the aim, longitudes run counter-clockwise from the right. A (headlamps): longitudes run about the
 vertical axis from the aim to the right, and colatitude - 90 degrees is the elevation. B
 (floodlights): longitudes run about the lateral axis from the aim upwards, and colatitude - 90
@@ -29,7 +29,7 @@ degrees is the angle to the right.
 
 
 @dataclass(frozen=True, eq=False)
-class LampProfile:
+class LightProfile:
     """Intensity over direction: `values (N, M)` at `longitude_deg (N,)` and `colatitude_deg (M,)`.
 
     Both angles ascend, longitudes over at most one turn; what spans the whole turn is periodic.
@@ -85,7 +85,7 @@ class LampProfile:
         )
 
     def at(self, directions: ArrayLike) -> Array:
-        """Values `(...)` towards `directions (..., 3)` of any length in the lamp's frame."""
+        """Values `(...)` towards `directions (..., 3)` of any length in the light's frame."""
         longitude, colatitude = self.angles_deg(directions)
         i, a, lit_i = _interval(self.longitude_deg, longitude)
         j, b, lit_j = _interval(self.colatitude_deg, colatitude)

@@ -1,4 +1,4 @@
-"""The stage's lamps: points, small spheres, rectangles, with or without a profile."""
+"""The stage's lights: points, small spheres, rectangles, with or without a profile."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import Array
-from reconstruction.geometry.light_profiles import LampProfile
+from reconstruction.geometry.light_profiles import LightProfile
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A lamp at `position (3,)` in metres; an isotropic point unless more is said.
+    """A light at `position (3,)` in metres; an isotropic point unless more is said.
 
     `intensity (3,)` is the radiant intensity at full level, W/sr per linear RGB channel; with a
     `profile` it is multiplied by the profile's value: W/sr where that is relative to its peak, a
     dimensionless colour where it is in W/sr, W/sr per candela where it is in candela.
-    `beside` names the camera that the lamp is mounted beside, if any.
+    `beside` names the camera that the light is mounted beside, if any.
 
-    `orientation (3, 3)` turns the world into the lamp's frame, as for cameras: rows right, down and
-    forward, the lamp's aim. `radius` in metres makes it a sphere that is equally bright all over,
+    `orientation (3, 3)` turns the world into the light's frame, as for cameras: rows right, down,
+    forward, the light's aim. `radius` in metres makes it a sphere that is equally bright all over,
     `size (2,)` (width, height) a rectangle across its aim that shines forward only, with the
     intensity a cosine of the angle to the aim unless a profile says otherwise.
     """
@@ -32,7 +32,7 @@ class Light:
     intensity: Array
     beside: str | None = None
     orientation: Array | None = None
-    profile: LampProfile | None = None
+    profile: LightProfile | None = None
     radius: float = 0.0
     size: tuple[float, float] | None = None
 
@@ -60,7 +60,7 @@ class Light:
                 raise ValueError(f"{self.name}: orientation must be a rotation (3, 3), got {R}")
             object.__setattr__(self, "orientation", R)
         elif self.profile is not None or self.size is not None:
-            raise ValueError(f"{self.name}: a lamp with a profile or a size needs an aim")
+            raise ValueError(f"{self.name}: a light with a profile or a size needs an aim")
 
     def intensity_towards(self, points: ArrayLike) -> Array:
         """Radiant intensity `(..., 3)` towards world `points (..., 3)`, W/sr, from its centre."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from reconstruction.geometry.cameras import Camera, Pinhole, facing
 from reconstruction.geometry.ies import read_ies
-from reconstruction.geometry.light_profiles import LampProfile
+from reconstruction.geometry.light_profiles import LightProfile
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.projectors import Projector
 
@@ -44,7 +44,7 @@ class Rig:
                 raise RigError(f"rig {self.name}: two profiles are called {profile.name!r}")
 
     @property
-    def profiles(self) -> dict[str, LampProfile]:
+    def profiles(self) -> dict[str, LightProfile]:
         """The profiles of the lights, by name."""
         return {x.profile.name: x.profile for x in self.lights if x.profile is not None}
 
@@ -162,14 +162,14 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
     return out
 
 
-def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LampProfile]:
-    """`[profiles.NAME]`: an IES `file` with a `unit`, or the table of `LampProfile.to_dict`."""
+def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LightProfile]:
+    """`[profiles.NAME]`: an IES `file` with a `unit`, or the table of `LightProfile.to_dict`."""
     out = {}
     for name, table in data.get("profiles", {}).items():
         where = f"[profiles.{name}]"
         try:
             if "file" not in table:
-                out[name] = LampProfile.from_dict({**table, "name": name})
+                out[name] = LightProfile.from_dict({**table, "name": name})
                 continue
             if unknown := set(table) - {"file", "unit", "tilt_deg"}:
                 raise RigError(f"unknown fields {sorted(unknown)}")
@@ -191,8 +191,8 @@ _LIGHT_FIELDS = {
 }
 
 
-def _light(table: dict[str, Any], where: str, profiles: dict[str, LampProfile]) -> Light:
-    """A lamp; `aim` (a direction) and `roll_deg` stand for `orientation`."""
+def _light(table: dict[str, Any], where: str, profiles: dict[str, LightProfile]) -> Light:
+    """A light; `aim` (a direction) and `roll_deg` stand for `orientation`."""
     if unknown := set(table) - _LIGHT_FIELDS:
         raise RigError(
             f"{where}: unknown fields {sorted(unknown)}; known are {sorted(_LIGHT_FIELDS)}"
@@ -221,11 +221,11 @@ def _light(table: dict[str, Any], where: str, profiles: dict[str, LampProfile]) 
 
 
 def _lights(
-    data: dict[str, Any], cameras: tuple[Camera, ...], profiles: dict[str, LampProfile]
+    data: dict[str, Any], cameras: tuple[Camera, ...], profiles: dict[str, LightProfile]
 ) -> list[Light]:
-    """Explicit `[[lights]]`, then the `[dome]`: the nearest dome lamp moves beside each camera.
+    """Explicit `[[lights]]`, then the `[dome]`: the nearest dome light moves beside each camera.
 
-    The dome's lamps are all alike and aim at the origin.
+    The dome's lights are all alike and aim at the origin.
     """
     lights = [
         _light(table, f"[[lights]] number {i + 1}", profiles)
@@ -249,7 +249,7 @@ def _lights(
             beside[nearest] = camera.name
             positions[nearest] = camera.center - offset * camera.R[1]
     shared = {f: dome[f] for f in ("profile", "size", "roll_deg") if f in dome}
-    if "lamp_radius" in dome:  # the dome's own `radius` is how far out the lamps stand
+    if "lamp_radius" in dome:  # the dome's own `radius` is how far out the lights stand
         shared["radius"] = dome["lamp_radius"]
     if "profile" in shared or "size" in shared:
         aims = [{"aim": -p} for p in positions]

@@ -1,4 +1,4 @@
-"""Signed distances to simple solids, and their rounded unions: what procedural shapes are made of.
+"""Signed distances to simple bodies, and their rounded unions: what procedural shapes are made of.
 
 Distances are in metres, negative inside; points are `(..., 3)`, results `(...)`.
 """

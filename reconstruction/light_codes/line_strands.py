@@ -13,7 +13,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.light_codes.light_code_options import DEFAULTS, LightCodeOptions
-from reconstruction.light_codes.measure_segments import measure_segments, string_together
+from reconstruction.light_codes.measure_segments import connect_segments, measure_segments
 from reconstruction.light_codes.segments import Segments
 from reconstruction.masks import HairMask
 from reconstruction.report.report import Progress, Report, silent
@@ -46,10 +46,10 @@ def line_strands(
         bounds=bounds,
         progress=progress,
     )
-    return _roots_first(string_together(views, segments, report, options), head), segments
+    return _roots_first(connect_segments(views, segments, report, options), head), segments
 
 
-def both(measured: Measured, segments: Segments, weight: float) -> Measured:
+def merge(measured: Measured, segments: Segments, weight: float) -> Measured:
     """The measurements of both methods; segments count by their confidence times `weight`."""
     return Measured(
         np.concatenate([measured.points, segments.points]),

@@ -30,7 +30,7 @@ from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
 
 
-def look_at_hair(
+def build_views(
     capture: Capture,
     masks: Mapping[str, HairMask],
     head: Mesh | None,
@@ -77,7 +77,7 @@ def measure_segments(
     Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
     there are no two views of hair, or no segment is left.
     """
-    views, volume = look_at_hair(
+    views, volume = build_views(
         capture, masks, head, report, options=options, bounds=bounds, progress=progress
     )
     center = volume.centers().mean(axis=0)
@@ -131,7 +131,7 @@ def measure_segments(
     return views, kept
 
 
-def string_together(
+def connect_segments(
     views: list[View],
     segments: Segments,
     report: Report,

@@ -116,7 +116,7 @@ def fit_stripes(window: Array, projector: Projector, noise: float) -> tuple[Arra
     centres = np.linspace(-1.25, 1.25, 51)
     n = len(window)
     best = np.full(n, -np.inf)
-    centre, extra, slope, light = (np.zeros(n) for _ in range(4))
+    centre, extra, gradient, light = (np.zeros(n) for _ in range(4))
     flat = window - window.mean(axis=1, keepdims=True)
     energy = np.maximum(np.linalg.norm(flat, axis=1), np.finfo(float).tiny)
     for width in (0.0, 0.5, 0.9, 1.4):
@@ -135,12 +135,12 @@ def fit_stripes(window: Array, projector: Projector, noise: float) -> tuple[Arra
         extra = np.where(better, width, extra)
         height = mid * energy / length[i]
         light = np.where(better, height, light)
-        gradient = np.linalg.norm(np.gradient(profile, centres, axis=0), axis=1)
-        slope = np.where(better, height * gradient[i], slope)
+        by_centre = np.linalg.norm(np.gradient(profile, centres, axis=0), axis=1)
+        gradient = np.where(better, height * by_centre[i], gradient)
     # a residual that noise does not explain is a profile that was not quite right
     misfit = energy * np.sqrt(np.maximum(1 - best**2, 0) / (WINDOW - 3))
     error = np.maximum(noise, 0.5 * misfit)
-    random = np.where(slope > error, error / np.where(slope > 0, slope, 1.0), 1.0)
+    random = np.where(gradient > error, error / np.where(gradient > 0, gradient, 1.0), 1.0)
     deviation = np.sqrt(random**2 + (0.25 * extra) ** 2 + CLEAN**2)
     return centre, np.minimum(deviation, 1.0), np.clip(best, 0, 1), np.maximum(light, 0)
 

@@ -98,13 +98,13 @@ def numeric(residual: Callable[[Pose], Array], pose: Pose) -> Array:
     return np.stack(columns, axis=1)
 
 
-def flow(slope: Array, camera: Camera, points: Array, depth: Array) -> Array:
-    """Derivatives `(N, 6)` of a picture with `slope (N, 2)` at `points (N, 3)` by a rigid step."""
+def flow(gradient: Array, camera: Camera, points: Array, depth: Array) -> Array:
+    """How a picture of `gradient (N, 2)` at `points (N, 3)` changes `(N, 6)` by a rigid step."""
     local = points @ camera.R.T + camera.t
     z = np.where(depth > 0, depth, 1.0)
     x, y = local[:, 0] / z, local[:, 1] / z
-    a = slope[:, 0] * camera.K[0, 0]
-    b = slope[:, 0] * camera.K[0, 1] + slope[:, 1] * camera.K[1, 1]
+    a = gradient[:, 0] * camera.K[0, 0]
+    b = gradient[:, 0] * camera.K[0, 1] + gradient[:, 1] * camera.K[1, 1]
     by_point = np.stack([a / z, b / z, -(a * x + b * y) / z], axis=1) @ camera.R
     # d(w x p) . g = w . (p x g)
     return np.concatenate([np.cross(points, by_point) / LEVER, by_point], axis=1)

@@ -258,10 +258,10 @@ def align(
             now = sample(picture, u, v)
             gain = float(now @ value) / max(float(value @ value), np.finfo(float).tiny)
             scale = 1.0 / max(float(np.sqrt(np.mean(value**2))), np.finfo(float).tiny)
-            slope = np.stack([sample(gx, u, v), sample(gy, u, v)], axis=1) * scale
+            gradient = np.stack([sample(gx, u, v), sample(gy, u, v)], axis=1) * scale
             inside = view.camera.inside(pixels) & (depth > 0)
             errors.append((now - gain * value) * scale * inside)
-            rows.append(flow(slope, view.camera, moved, depth) * inside[:, None])
+            rows.append(flow(gradient, view.camera, moved, depth) * inside[:, None])
         return np.concatenate(errors), np.concatenate(rows)
 
     return gauss_newton(system, weakest, 10, start)

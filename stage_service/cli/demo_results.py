@@ -38,8 +38,8 @@ def gather(
         held_out_cameras=job["options"]["held_out_cameras"],
         progress=progress,
     )
-    controls = geometry.pop("controls")
-    plot_geometry({"ours": geometry, **controls}, model / "plots" / "geometry.png")
+    baselines = geometry.pop("baselines")
+    plot_geometry({"ours": geometry, **baselines}, model / "plots" / "geometry.png")
     results = json.loads((model / "results.json").read_text())
     return {
         "capture": {
@@ -49,7 +49,7 @@ def gather(
         "job": job["id"],
         "stages": results["stages"],
         "geometry": geometry,
-        "controls": controls,
+        "baselines": baselines,
         "images": {k: v for k, v in results["images"].items() if k in GROUPS},
         "appearance": _appearance(model, out / "truth" / "appearance.json"),
         "files": {
@@ -92,7 +92,7 @@ def figures_table(results: dict[str, Any], out: Path) -> Any:
 
     from stage_service.cli.evaluate import geometry_table
 
-    geometry = geometry_table({"ours": results["geometry"], **results["controls"]})
+    geometry = geometry_table({"ours": results["geometry"], **results["baselines"]})
     images = Table("pictures (PSNR dB / SSIM)", "held-out lights", "held-out camera")
     for name in results["images"][GROUPS[0]]:
         scores = [results["images"][group][name] for group in GROUPS]

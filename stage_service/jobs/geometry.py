@@ -1,4 +1,4 @@
-"""Reconstructed strands against true ones, beside the controls that use no method."""
+"""Reconstructed strands against true ones, beside the baselines that use no method."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def evaluate_geometry(
     seed: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Score `model`'s strands and both hull controls against the strand file `truth`.
+    """Score `model`'s strands and both hull baselines against the strand file `truth`.
 
-    Returns `{visible, all}` of ours and `controls.{hull_vertical, hull_smooth_field}` with the same
-    two. The true strands stand where the subject stood during the OLAT pass. The controls get the
+    Returns `{visible, all}` of ours, and `baselines.{hull_vertical, hull_smooth_field}` of the same
+    two. The true strands stand where the subject stood during the OLAT pass. The baselines get the
     masks that the reconstruction had: those of the cameras that are not held out.
     """
     from appearance.observations import model_mask
-    from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical
+    from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
     from reconstruction.files.strands import read_strands
@@ -45,12 +45,12 @@ def evaluate_geometry(
 
     progress("our strands against the true ones", 0.2)
     figures = score(read_strands(model / "strands.npz"))
-    progress("control: the hull filled with vertical lines", 0.3)
+    progress("baseline: the hull filled with vertical lines", 0.3)
     used = [c for c in cameras if c.name not in held_out_cameras]
     masks = {c.name: model_mask(model, c.name, "hair", capture) for c in used}
-    hull = control_hull(used, masks, head)
-    controls = {"hull_vertical": score(hull_vertical(hull))}
-    progress("control: the hull filled with the smooth field of its surface", 0.6)
-    controls["hull_smooth_field"] = score(hull_smooth_field(hull, head))
+    hull = baseline_hull(used, masks, head)
+    baselines = {"hull_vertical": score(hull_vertical(hull))}
+    progress("baseline: the hull filled with the smooth field of its surface", 0.6)
+    baselines["hull_smooth_field"] = score(hull_smooth_field(hull, head))
     progress("judged", 1.0)
-    return {**figures, "controls": controls}
+    return {**figures, "baselines": baselines}

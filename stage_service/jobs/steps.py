@@ -115,7 +115,7 @@ def assess(context: StepContext) -> Figures:
 
 
 def evaluate(context: StepContext) -> Figures:
-    """Strands against true ones, beside the two controls that use no method."""
+    """Strands against true ones, beside the two baselines that use no method."""
     if context.options.truth is None:
         return {"left_out": "no true strands were given"}
     from stage_service.jobs.geometry import evaluate_geometry
@@ -145,8 +145,8 @@ def results(context: StepContext) -> Figures:
         figures["stage1"] = done["stage1"]
     if "visible" in done.get("evaluate", {}):
         figures["geometry"] = {k: done["evaluate"][k] for k in ("visible", "all")}
-        figures["controls"] = done["evaluate"]["controls"]
-        ours = {"ours": figures["geometry"], **figures["controls"]}
+        figures["baselines"] = done["evaluate"]["baselines"]
+        ours = {"ours": figures["geometry"], **figures["baselines"]}
         plot_geometry(ours, plots / "geometry.png")
     part = context.model / "results.part"
     part.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")

@@ -36,7 +36,7 @@ def main() -> int:
         "of agreement. "
         "acquisition: steps and bytes a second beside what wires and disk allow. "
         "photometric: line stereo with and without lightcodes, and fused, on patches of two heads. "
-        "lightplanes: strands of three subjects, still and drifting, beside controls without a "
+        "lightplanes: strands of three subjects, still and drifting, beside baselines without a "
         f"method; two of them, Sintel and a ponytail, come from ${_DATA}. "
         "all: every one of them. Leaves OUT/<name>.json and OUT/<name>.png.",
     )

@@ -45,12 +45,12 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
     assert json.loads(done.stdout) == results
     assert results["seconds"] > 1
     thresholds = {"1mm_10deg", "2mm_20deg", "3mm_30deg"}
-    for figures in (results["geometry"], *results["controls"].values()):
+    for figures in (results["geometry"], *results["baselines"].values()):
         for over in ("visible", "all"):
             assert set(figures[over]) == thresholds
             for scores in figures[over].values():
                 assert all(0 <= scores[k] <= 1 for k in ("precision", "recall", "f"))
-    assert set(results["controls"]) == {"hull_vertical", "hull_smooth_field"}
+    assert set(results["baselines"]) == {"hull_vertical", "hull_smooth_field"}
     for group in ("held_out_lights", "held_out_camera"):
         for method in ("ours", "mean_colour", "diffuse", "three_nearest"):
             assert results["images"][group][method]["psnr"] > 0

@@ -16,7 +16,7 @@ from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import build_scene
 from reconstruction.geometry.cameras import Camera, facing
-from reconstruction.geometry.light_profiles import LampProfile
+from reconstruction.geometry.light_profiles import LightProfile
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh
 
@@ -138,7 +138,7 @@ def test_gradients_of_materials_are_differences_of_the_same_paths(tufted, small,
             assert gradient[index] == pytest.approx(expected, abs=1e-3 * scale + 1e-5), name
 
 
-BEAM = LampProfile(
+BEAM = LightProfile(
     "beam",
     np.array([0.0, 90, 180, 270, 360]),
     np.array([0.0, 30, 120]),

@@ -16,12 +16,12 @@ from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import SCALE, build_scene
 from reconstruction.geometry.cameras import Camera, facing
-from reconstruction.geometry.light_profiles import LampProfile
+from reconstruction.geometry.light_profiles import LightProfile
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
-BEAM = LampProfile(
+BEAM = LightProfile(
     "beam",
     np.array([0.0, 70, 180, 290, 360]),
     np.array([0.0, 20, 45, 100]),
@@ -107,10 +107,10 @@ def test_profiles_are_those_of_the_rig():
     rng = np.random.default_rng(0)
     kinds = [
         BEAM,
-        LampProfile(
+        LightProfile(
             "a", np.array([-60.0, 0, 90]), np.array([0.0, 70, 180]), rng.uniform(size=(3, 3)), "A"
         ),
-        LampProfile(
+        LightProfile(
             "b", np.array([-90.0, 0, 90]), np.array([0.0, 70, 180]), rng.uniform(size=(3, 3)), "B"
         ),
         None,

@@ -20,7 +20,7 @@ from benchmarks.pictures import picture_strands
 from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.import_folder import import_folder
-from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical
+from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.files.strands import read_strands
@@ -28,7 +28,7 @@ from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import texture
-from reconstruction.light_codes.measure_segments import look_at_hair
+from reconstruction.light_codes.measure_segments import build_views
 from reconstruction.masks import hair_masks
 from reconstruction.methods import Method
 from reconstruction.model import Model
@@ -135,7 +135,7 @@ def run_patch(
     samples: int = 10_000,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """All methods and both controls in a ball about `center (3,)` of `radius` metres.
+    """All methods and both baselines in a ball about `center (3,)` of `radius` metres.
 
     `thinner` also runs `photometric` with fewer cameras and with fewer lights, and `study`. Models
     are left in `OUT/<method>`, figures in `OUT/patch.json` as they come.
@@ -175,9 +175,9 @@ def run_patch(
         progress("error against run time", len(runs) / (len(runs) + 1))
         results["study"], results["filters"] = study(capture, truth.strands, options, out)
         _save(out / "patch.json", results)
-    progress("controls", len(runs) / (len(runs) + 1))
+    progress("baselines", len(runs) / (len(runs) + 1))
     ball = (center, radius + options.grid)
-    for name, strands in controls(capture, out / "photometric", options.grid, ball).items():
+    for name, strands in baselines(capture, out / "photometric", options.grid, ball).items():
         results["rows"][name] = truth.score(strands)
     _save(out / "patch.json", results)
     plot_geometry(results["rows"], out / "patch.png")
@@ -200,7 +200,7 @@ def study(
     """
     codes = options.light_codes
     masks = hair_masks(capture, None, capture.head)
-    views, volume = look_at_hair(capture, masks, capture.head, Report(), options=codes)
+    views, volume = build_views(capture, masks, capture.head, Report(), options=codes)
     found = study_depths(views, volume, truth, codes, range(1, len(views), 8))
     report = Report()
     for name, variants in found.items():
@@ -250,10 +250,10 @@ def run_imported(
     return results
 
 
-def controls(
+def baselines(
     capture: Capture, model: Path, spacing: float, ball: tuple[ArrayLike, float]
 ) -> dict[str, Strands]:
-    """The controls that use no method, in the masks that the reconstruction had.
+    """The baselines that use no method, in the masks that the reconstruction had.
 
     Only in the `ball`, its centre and radius: cameras that see a patch bound no hull elsewhere.
     """
@@ -265,7 +265,7 @@ def controls(
             raise FileNotFoundError(f"{file}: no mask that the reconstruction had")
         masks[camera.name] = np.asarray(image > 127)
     hull = within_ball(
-        control_hull(capture.rig.cameras, masks, capture.head, spacing=spacing), *ball
+        baseline_hull(capture.rig.cameras, masks, capture.head, spacing=spacing), *ball
     )
     return {
         "hull_vertical": hull_vertical(hull),

@@ -17,7 +17,7 @@ from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangu
 from benchmarks.pictures import picture_model, picture_motion
 from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.capture.folder import Capture
-from reconstruction.evaluation.baselines import control_hull, hull_smooth_field, hull_vertical
+from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.files.strands import read_strands
@@ -95,7 +95,7 @@ def subject(
     studies: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """One subject, still and drifting, and the controls; leaves models and `OUT/result.json`.
+    """One subject, still and drifting, and the baselines; leaves models and `OUT/result.json`.
 
     `studies` adds what one subject is enough for: the motion's worth in strands, error against run
     time of motion, field and growth, and how stages grow.
@@ -110,8 +110,8 @@ def subject(
         PointCloud.load(out / "still" / "points.npz"),
         read_strands(out / "still" / "strands.npz"),
     )
-    for name, control in _controls(capture, out / "still").items():
-        rows[name] = truth.score(control)
+    for name, baseline in _baselines(capture, out / "still").items():
+        rows[name] = truth.score(baseline)
     result: dict[str, Any] = {
         "scores": rows,
         "shares": _shares(report),
@@ -210,10 +210,10 @@ def _ours(
     return {**scores, "seconds": seconds}, report
 
 
-def _controls(capture: Capture, model: Path) -> dict[str, Strands]:
-    """The controls that use no method, in the masks that the reconstruction had."""
+def _baselines(capture: Capture, model: Path) -> dict[str, Strands]:
+    """The baselines that use no method, in the masks that the reconstruction had."""
     masks = {c.name: _mask(model, c.name).hair for c in capture.rig.cameras}
-    hull = control_hull(capture.rig.cameras, masks, capture.head)
+    hull = baseline_hull(capture.rig.cameras, masks, capture.head)
     return {
         "hull_vertical": hull_vertical(hull),
         "hull_smooth_field": hull_smooth_field(hull, capture.head),

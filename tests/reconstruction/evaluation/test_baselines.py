@@ -1,4 +1,4 @@
-"""The visual hull, and the two controls that fill it."""
+"""The visual hull, and the two baselines that fill it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from reconstruction.evaluation.baselines import (
     SPACING,
-    control_hull,
+    baseline_hull,
     hull_smooth_field,
     hull_vertical,
 )
@@ -105,7 +105,7 @@ def test_hull_errors(cameras: list[Camera]) -> None:
         visual_hull(cameras, masks, spacing=2e-3)
 
 
-def test_control_hull_leaves_out_the_head_and_what_is_before_its_face(
+def test_baseline_hull_leaves_out_the_head_and_what_is_before_its_face(
     cameras: list[Camera],
 ) -> None:
     """Hair is a ball behind the head: before the face, pixels show no hair and are carved."""
@@ -115,7 +115,7 @@ def test_control_hull_leaves_out_the_head_and_what_is_before_its_face(
         nearer = c.project(np.zeros(3))[1] < c.project(np.array([0, 0.05, 0.02]))[1]
         behind = mesh_silhouette(c, head) if nearer else np.zeros((c.height, c.width), bool)
         masks[c.name] = mesh_silhouette(c, hair) & ~behind
-    hull = control_hull(cameras, masks, head, spacing=3e-3)
+    hull = baseline_hull(cameras, masks, head, spacing=3e-3)
     assert not hull.contains(ball(0.055).vertices).any()
     assert not hull.contains(np.array([0, -0.064, 0])).any()
     assert hull.contains(np.array([0, 0.1, 0.03])).all()

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reconstruction.geometry.ies import METRES_PER_FOOT, IesError, read_ies
-from reconstruction.geometry.light_profiles import LampProfile
+from reconstruction.geometry.light_profiles import LightProfile
 from reconstruction.geometry.rig import Rig, RigError
 
 VERTICAL = (0.0, 30.0, 60.0, 90.0)
@@ -116,7 +116,7 @@ def test_symmetry_is_expanded_and_nodes_are_exact(tmp_path, horizontal, fold):
 
 @given(h=st.floats(-720, 720), v=st.floats(0.01, 179.99))
 def test_longitudes_are_periodic(h: float, v: float) -> None:
-    profile = LampProfile(
+    profile = LightProfile(
         "p", np.array([90.0, 200, 300, 450]), np.array([0.0, 90, 180]), np.ones((4, 3))
     )
     assert profile.at(towards(h, v)) == pytest.approx(1)

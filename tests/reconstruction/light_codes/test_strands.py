@@ -10,7 +10,7 @@ import pytest
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.strands import Strands, smoothed
 from reconstruction.light_codes.extension import ExtensionOptions, extend, fewest_views
-from reconstruction.light_codes.measure_segments import string_together
+from reconstruction.light_codes.measure_segments import connect_segments
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import count_supports, thinned_lines, to_segments
 from reconstruction.report.report import Report
@@ -78,7 +78,7 @@ def test_segments_that_three_views_find_alike_lie_on_fibres(fibres: Any, segment
 
 def test_fibres_come_back_as_strands(fibres: Any, segments: Any) -> None:
     good = segments.subset(segments.supports >= 3)
-    found = string_together(fibres.views, good, Report())
+    found = connect_segments(fibres.views, good, Report())
     figures = compare_strands(Strands.from_list(found, 2e-4), fibres.strands, samples=None)["all"]
     assert figures["1mm_10deg"]["f"] > 0.75
     assert figures["2mm_20deg"]["f"] > 0.9
