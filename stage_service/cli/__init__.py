@@ -1,24 +1,34 @@
-"""The command line: `hairstage COMMAND`. Commands import what they need when they run."""
+"""The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`
+and `reconstruct`, `fit`, `render` in `models.py`. They import what they need when they run."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from importlib.metadata import version
 
 from stage_service.cli import (
     bench,
     calibrate,
-    captures,
-    demo_command,
+    capture,
+    demo,
     evaluate,
-    heads,
+    head,
+    jobs,
+    lease,
     models,
-    processes,
-    remote,
-    rigs,
+    rig,
+    serve,
+    simulate,
+    verify,
+    worker,
 )
-from stage_service.cli.output import EXIT_CODES
-from stage_service.cli.runner import run_command
+from stage_service.cli.support import EXIT_CODES, run_command
+
+COMMANDS = (
+    *(demo, serve, worker, simulate, capture, lease, jobs),
+    *(verify, models, evaluate, bench, rig, calibrate, head),
+)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -30,20 +40,10 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=f"exit codes:\n{codes}\n\nResults go to stdout, progress to stderr.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"hairstage {version('hairstage')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for group in (
-        demo_command,
-        processes,
-        remote,
-        captures,
-        models,
-        evaluate,
-        bench,
-        rigs,
-        calibrate,
-        heads,
-    ):
-        group.add(commands)
+    for command in COMMANDS:
+        command.add(commands)
     return parser
 
 

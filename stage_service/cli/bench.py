@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from stage_service.cli.output import FAILED, CommandError, Commands, Output
+from stage_service.cli.support import FAILED, CommandError, Commands, Output
 
 BENCHMARKS = (
     "acquisition",
@@ -23,7 +23,11 @@ BENCHMARKS = (
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    bench = commands.add_parser("bench", help="measure error against run time (in a checkout)")
+    bench = commands.add_parser(
+        "bench",
+        help="measure error against run time (in a checkout)",
+        description="Run a benchmark of the checkout; what follows NAME is its own.",
+    )
     bench.add_argument("name", choices=BENCHMARKS)
     bench.add_argument("arguments", nargs=argparse.REMAINDER)
     bench.set_defaults(run=run_bench, json=False)
@@ -33,7 +37,11 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
     """Run `python -m benchmarks` of the checkout that this package lies in."""
     tests = Path(__file__).resolve().parents[2] / "tests"
     if not (tests / "benchmarks").is_dir():
-        raise CommandError("benchmarks are in the repository's checkout, not in the wheel", FAILED)
+        raise CommandError(
+            "benchmarks are not installed: they are in tests/benchmarks of the repository; run "
+            "'make bench', or 'hairstage bench NAME' of an editable installation, in a checkout",
+            FAILED,
+        )
     path = os.pathsep.join([str(tests), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "benchmarks", args.name, *args.arguments]
     return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode

@@ -1,4 +1,5 @@
-"""The demo's course: three processes, one capture, one job, one table."""
+"""`hairstage demo`: the whole product once, with a simulated rig: three processes, one capture,
+one job, one table."""
 
 from __future__ import annotations
 
@@ -7,22 +8,58 @@ import json
 import shutil
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from reconstruction.geometry.rig import Rig
-from stage_service.cli.children import Children, own_command, simulator_command
-from stage_service.cli.client import Service
-from stage_service.cli.demo_results import figures_table, gather
-from stage_service.cli.output import BAD_INPUT, FAILED, CommandError, Output, progress_bar
-from stage_service.cli.processes import exit_on_sigterm
+from stage_service.cli.support import (
+    FAILED,
+    BadInput,
+    CommandError,
+    Commands,
+    Output,
+    add_command,
+    progress_bar,
+)
+from stage_service.cli.support.processes import add_subject, exit_on_sigterm
+
+if TYPE_CHECKING:
+    from reconstruction.geometry.rig import Rig
+    from stage_service.cli.support.children import Children
+    from stage_service.cli.support.client import ServiceClient
 
 MARK = ".hairstage-demo"
 EVERY_NTH_LIGHT = 28
 """One of so many lights is held out: a dozen of 331. Of few lights, four are."""
 
+FILES = ("strands.npz", "strands.hair", "strands.usdc", "appearance.json", "report.json")
 
-def demo(args: argparse.Namespace, output: Output) -> int:
-    """Run the whole product once; returns the exit code."""
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    demo = add_command(
+        commands,
+        "demo",
+        run_demo,
+        "capture, reconstruct, fit and relight a simulated subject",
+        "Start a simulated rig, the service and a worker; make one capture through the REST API, "
+        "follow its job, which judges the result against the truth, and print the figures. "
+        "Everything is left in OUT; an earlier demo's results there are replaced.",
+    )
+    add_subject(demo)
+    demo.add_argument(
+        "--out", type=Path, default=Path("runs/demo"), help="folder, made where there is none"
+    )
+    demo.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
+    demo.add_argument("--hold-out-camera", metavar="CAMERA", help="default: the rig's last camera")
+
+
+def run_demo(args: argparse.Namespace, output: Output) -> int:
+    """Run the demo."""
+    from reconstruction.array_backend import chosen_variant
+    from reconstruction.geometry.rig import Rig
+    from stage_service.cli.support.children import Children
+    from stage_service.cli.support.client import ServiceClient
+    from stage_service.cli.support.tables import figures_table
+
     exit_on_sigterm()
     begin = time.perf_counter()
     out: Path = args.out
@@ -32,26 +69,37 @@ def demo(args: argparse.Namespace, output: Output) -> int:
         value = getattr(args, field)
         if "." in value or "/" in value:
             if not Path(value).is_file():
-                raise CommandError(f"--{field}: there is no file {value}", BAD_INPUT, "BadInput")
+                raise BadInput(f"--{field}: there is no file {value}")
             setattr(args, field, str(Path(value).resolve()))
+    chosen_variant()  # what is missing is told before anything is started
     _prepare(out)
 
     with Children(out / "logs") as children:
         output.note(f"starting simulated rig, service and worker; their logs: {out / 'logs'}")
-        with Service(_start(children, args)) as service:
+        with ServiceClient(_start(children, args)) as service:
             capture = _capture(children, service, args, held_out, output)
             job = _job(children, service, capture["job"], out)
         memory = children.peak_memory_gb()
 
-    with progress_bar("evaluate") as progress:
-        results = gather(out, capture, job, progress)
+    model = out / "model"
     results = {
         "seconds": time.perf_counter() - begin,
         "subject": args.subject,
+        "seed": args.seed,
         "rig": rig.name,
         "held_out": held_out,
         "peak_memory_gb": memory,
-        **results,
+        "capture": {
+            key: capture[key]
+            for key in ("id", "seconds", "frames_planned", "frames_written", "frames_missing")
+        },
+        "job": job["id"],
+        **json.loads((model / "results.json").read_text()),
+        "files": {
+            "capture": "capture",
+            "model": [f"model/{name}" for name in FILES],
+            "pictures": sorted(f"model/{path.name}" for path in model.glob("*.png")),
+        },
     }
     (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
     output.result(results, figures_table(results, out))
@@ -60,7 +108,7 @@ def demo(args: argparse.Namespace, output: Output) -> int:
 
 def _capture(
     children: Children,
-    service: Service,
+    service: ServiceClient,
     args: argparse.Namespace,
     held_out: dict[str, list[str]],
     output: Output,
@@ -71,11 +119,11 @@ def _capture(
         f"the capture takes {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB and, on real "
         f"devices, {cost['seconds']:.0f} s; a simulated rig renders each frame"
     )
-    options = {**held_out, "environment": args.environment, "seed": args.seed}
+    truth = (args.out / "truth").resolve()
+    options = {**held_out, "environment": args.environment, "seed": args.seed, "truth": str(truth)}
     body: dict[str, Any] = {"plan": {}, "pipeline": {"name": "light_planes", "options": options}}
-    head: Path = args.out / "truth" / "head.obj"
-    if head.is_file():
-        body["head"] = str(head.resolve())
+    if (truth / "head.obj").is_file():
+        body["head"] = str(truth / "head.obj")
     capture = service.post("/captures", body)
     with progress_bar("capture") as progress:
         capture = service.follow_capture(capture["id"], progress, children.check)
@@ -85,7 +133,7 @@ def _capture(
     return capture
 
 
-def _job(children: Children, service: Service, job_id: str, out: Path) -> dict[str, Any]:
+def _job(children: Children, service: ServiceClient, job_id: str, out: Path) -> dict[str, Any]:
     """Follow the job to its end."""
     with progress_bar("job") as progress:
         job = service.follow_job(job_id, progress, children.check)
@@ -101,14 +149,13 @@ def _job(children: Children, service: Service, job_id: str, out: Path) -> dict[s
 
 def _start(children: Children, args: argparse.Namespace) -> str:
     """Start the three processes as a user would; returns the URL when all are ready."""
+    from stage_service.cli.support.children import SimulatedRig, own_command
+
     out: Path = args.out
-    state = out / "simulated"
-    simulators = children.start(
-        "simulators",
-        simulator_command(args, state, out / "truth", "--ports", "auto"),
-        answers=True,
+    simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed).command(
+        *("--state", out / "simulated", "--truth", out / "truth", "--ports", "auto")
     )
-    devices = children.first_line("simulators", simulators, 300)["devices"]
+    devices = children.ready("simulators", simulated, 300)["devices"]
     serve = own_command(
         *("serve", "--json", "--rig", args.rig, "--devices", devices),
         *("--root", out, "--port", "0"),
@@ -132,10 +179,8 @@ def _prepare(out: Path) -> None:
     """Make `out` an empty folder; what an earlier demo left there goes, anything else stays."""
     if out.is_dir() and any(out.iterdir()):
         if not (out / MARK).is_file():
-            raise CommandError(
-                f"{out} holds something that no demo wrote: choose another folder with --out",
-                BAD_INPUT,
-                "BadInput",
+            raise BadInput(
+                f"{out} holds something that no demo wrote: choose another folder with --out"
             )
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)

@@ -1,25 +1,19 @@
-"""`evaluate geometry` and `evaluate images`: results against the truth."""
+"""`hairstage evaluate`: results against the truth."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from stage_service.cli.output import (
-    BAD_INPUT,
-    CommandError,
+from stage_service.cli.support import (
+    BadInput,
     Commands,
     Output,
     add_command,
     add_group,
     progress_bar,
 )
-
-_THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
-_HEADS = [t.replace("mm_", " mm/").replace("deg", "°") for t in _THRESHOLDS]
 
 
 def add(commands: Commands) -> None:
@@ -54,6 +48,17 @@ def add(commands: Commands) -> None:
     images.add_argument("true", type=Path, help="picture or folder")
     images.add_argument("--mask", type=Path, help="grey picture, half and above counts")
 
+    table = add_command(
+        group,
+        "table",
+        run_table,
+        "the README's table of figures, as Markdown",
+        "Print a row for each results.json of 'hairstage demo': F of the strands at 1 mm/10° over "
+        "visible points beside the baselines, PSNR / SSIM of held-out lights and camera, fitted "
+        "and true roughness, and what the job warned of.",
+    )
+    table.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="results.json")
+
 
 def run_geometry(args: argparse.Namespace, output: Output) -> int:
     """Compare strands."""
@@ -61,10 +66,11 @@ def run_geometry(args: argparse.Namespace, output: Output) -> int:
     from reconstruction.evaluation.assessment import assess_strands
     from reconstruction.files.strands import read_strands
     from reconstruction.geometry.mesh import read_obj
+    from stage_service.cli.support.tables import assessment_text
 
     pred, true = read_strands(args.pred), read_strands(args.true)
     if not len(true):
-        raise CommandError(f"{args.true}: no strands to compare with", BAD_INPUT, "BadInput")
+        raise BadInput(f"{args.true}: no strands to compare with")
     capture = Capture(args.capture) if args.capture is not None else None
     head = capture.head if capture is not None else None
     with progress_bar("evaluate") as progress:
@@ -97,9 +103,7 @@ def run_images(args: argparse.Namespace, output: Output) -> int:
 
     pairs = pair_up(args.pred, args.true)
     if not pairs:
-        raise CommandError(
-            f"{args.pred} and {args.true} have no file name in common", BAD_INPUT, "BadInput"
-        )
+        raise BadInput(f"{args.pred} and {args.true} have no file name in common")
     images = {name: compare_pictures(a, b, args.mask) for name, a, b in pairs}
     mean = {
         key: sum(figures[key] for figures in images.values()) / len(images)
@@ -110,70 +114,16 @@ def run_images(args: argparse.Namespace, output: Output) -> int:
     return 0
 
 
-def geometry_table(rows: dict[str, dict[str, Any]]) -> Any:
-    """A table of precision, recall and F in per cent, a row for each name in `rows`."""
-    from rich.table import Table
+def run_table(args: argparse.Namespace, output: Output) -> int:
+    """Print the table of several demos."""
+    from stage_service.cli.support.tables import markdown_table
 
-    table = Table(
-        "strands", "over", *_HEADS, title="Strands against the true ones: precision / recall / F, %"
-    )
-    for name, figures in rows.items():
-        for over in ("visible", "all"):
-            if over in figures:
-                table.add_row(name, over, *_cells(figures[over]))
-    return table
-
-
-def _cells(scores: dict[str, dict[str, float]]) -> list[str]:
-    return [
-        " / ".join(f"{100 * scores[t][k]:.1f}" for k in ("precision", "recall", "f"))
-        for t in _THRESHOLDS
-    ]
-
-
-def assessment_text(figures: dict[str, Any]) -> Any:
-    """Tables of what `assess_strands` found."""
-    from rich.console import Group
-    from rich.table import Table
-
-    regions = Table("part of the hair", *_HEADS, title="Precision / recall / F by part, %")
-    for kind in figures["regions"].values():
-        for name, scores in kind.items():
-            regions.add_row(name, *_cells(scores))
-    more = Table("", "predicted", "true", title="Strands")
-    for name, value in _STRAND_ROWS:
-        cells = [value(figures, which) for which in ("pred", "true")]
-        if any(cells):
-            more.add_row(name, *cells)
-    table = geometry_table({"as lines": figures, "root to tip": figures["directed"]})
-    return Group(table, regions, more)
-
-
-def _spread(figures: dict[str, Any], *path: str) -> str:
-    """Mean and 5 to 95 % of a spread, or nothing where it is missing."""
-    for key in path:
-        figures = figures.get(key, {})
-    if "mean" not in figures:
-        return ""
-    return f"{figures['mean']:.3g} ({figures['p5']:.3g} to {figures['p95']:.3g})"
-
-
-def _share(figures: dict[str, Any], *path: str) -> str:
-    for key in path[:-1]:
-        figures = figures.get(key, {})
-    return f"{100 * figures[path[-1]]:.1f}" if path[-1] in figures else ""
-
-
-_ONE = {"pred": "on_one", "true": "by_one"}
-_STRAND_ROWS: list[tuple[str, Callable[[dict[str, Any], str], str]]] = [
-    ("strands", lambda f, w: f"{f['lengths'][w]['strands']:,}"),
-    ("length, mm: mean (5 to 95 %)", lambda f, w: _spread(f, "lengths", w)),
-    ("to the nearest point, mm", lambda f, w: _spread(f, "errors", w, "distance_mm")),
-    ("angle to it, degrees", lambda f, w: _spread(f, "errors", w, "angle_deg")),
-    ("nearest point runs the other way, %", lambda f, w: _share(f, "errors", w, "reversed")),
-    ("most of it on one strand, share", lambda f, w: _spread(f, "connectivity", w, _ONE[w])),
-    ("strands that lie along it", lambda f, w: _spread(f, "connectivity", w, "covering")),
-    ("fewest that cover what any does", lambda f, w: _spread(f, "connectivity", w, "fragments")),
-    ("reach the scalp, %", lambda f, w: _share(f, "roots", w, "rooted")),
-    ("with their tip, %", lambda f, w: _share(f, "roots", w, "upside_down")),
-]
+    rows = {}
+    for path in args.results:
+        results = json.loads(path.read_text())
+        absent = {"geometry", "baselines", "images", "appearance"} - set(results)
+        if absent:
+            raise BadInput(f"{path} has no {', '.join(sorted(absent))}: not a demo's results.json")
+        rows[f"{results['subject']}, seed {results['seed']}"] = results
+    output.result({"rows": rows}, markdown_table(rows))
+    return 0

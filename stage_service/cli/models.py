@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction.methods import METHODS
-from stage_service.cli.output import (
-    BAD_INPUT,
-    CommandError,
+from stage_service.cli.support import (
+    BadInput,
     Commands,
     Output,
     add_command,
@@ -138,7 +137,7 @@ def _json(text: str | None) -> dict[str, Any]:
     try:
         value = json.loads(text or "{}")
     except json.JSONDecodeError as error:
-        raise CommandError(f"--options is not JSON: {error}", BAD_INPUT, "BadInput") from error
+        raise BadInput(f"--options is not JSON: {error}") from error
     if not isinstance(value, dict):
-        raise CommandError(f"--options must be a JSON object, got {text}", BAD_INPUT, "BadInput")
+        raise BadInput(f"--options must be a JSON object, got {text}")
     return value

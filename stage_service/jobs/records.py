@@ -17,10 +17,10 @@ class JobOptions(BaseModel):
 
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may look at:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
-    against, `environment` a `.hdr` or `.exr` file, `studio` or `sky`. `reconstruct`, `fit`,
-    `stage1` and `assess` go to the step of that name: fields of
-    `reconstruction.pipeline.ReconstructOptions`, `appearance.sun_fit.fit.FitOptions`,
-    `appearance.inverse_rendering.pipeline.Stage1Request`,
+    against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
+    file, `studio` or `sky`. `reconstruct`, `fit`, `stage1` and `assess` go to the step of that
+    name: fields of `reconstruction.pipeline.ReconstructOptions`,
+    `appearance.sun_fit.fit.FitOptions`, `appearance.inverse_rendering.pipeline.Stage1Request`,
     `appearance.model.assess.AssessOptions`.
     """
 

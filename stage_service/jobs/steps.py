@@ -115,19 +115,25 @@ def assess(context: StepContext) -> Figures:
 
 
 def evaluate(context: StepContext) -> Figures:
-    """Strands against true ones, beside the two baselines that use no method."""
+    """Strands against true ones, beside two baselines that use no method; appearance too, where
+    the truth is a folder that has it."""
     if context.options.truth is None:
-        return {"left_out": "no true strands were given"}
-    from stage_service.jobs.geometry import evaluate_geometry
+        return {"left_out": "no truth was given"}
+    from stage_service.jobs.evaluation import evaluate_appearance, evaluate_geometry
 
-    return evaluate_geometry(
+    truth = Path(context.options.truth)
+    figures = evaluate_geometry(
         Capture(context.capture),
         context.model,
-        Path(context.options.truth),
+        truth / "strands.npz" if truth.is_dir() else truth,
         held_out_cameras=context.options.held_out_cameras,
         seed=context.options.seed,
         progress=context.progress,
     )
+    appearance = truth / "appearance.json"
+    if "fit" in context.previous and appearance.is_file():
+        figures["appearance"] = evaluate_appearance(context.model, appearance)
+    return figures
 
 
 def results(context: StepContext) -> Figures:
@@ -136,7 +142,8 @@ def results(context: StepContext) -> Figures:
     from reconstruction.report.report import Report
 
     plots = context.model / "plots"
-    plot_report(Report.load(context.model / "report.json"), plots)
+    report = Report.load(context.model / "report.json")
+    plot_report(report, plots)
     done = {step: result["figures"] for step, result in context.previous.items()}
     figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
     if "assess" in done:
@@ -144,10 +151,13 @@ def results(context: StepContext) -> Figures:
     if "stage1" in done:
         figures["stage1"] = done["stage1"]
     if "visible" in done.get("evaluate", {}):
-        figures["geometry"] = {k: done["evaluate"][k] for k in ("visible", "all")}
-        figures["baselines"] = done["evaluate"]["baselines"]
-        ours = {"ours": figures["geometry"], **figures["baselines"]}
-        plot_geometry(ours, plots / "geometry.png")
+        geometry = dict(done["evaluate"])
+        for key in ("baselines", "appearance"):
+            if key in geometry:
+                figures[key] = geometry.pop(key)
+        figures["geometry"] = geometry
+        plot_geometry({"ours": geometry, **figures["baselines"]}, plots / "geometry.png")
+    figures["warnings"] = [f"{s.name}: {w}" for s in report.stages for w in s.warnings]
     part = context.model / "results.part"
     part.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
     part.replace(context.model / "results.json")

@@ -15,8 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from stage_service.cli.bench import BENCHMARKS
-from stage_service.cli.output import FAILED, CommandError, Output, add_command, progress_bar
-from stage_service.cli.runner import run_command
+from stage_service.cli.support import (
+    FAILED,
+    CommandError,
+    Output,
+    add_command,
+    progress_bar,
+    rig_path,
+    run_command,
+)
 
 _DATA, _CAPTURE = "HAIRSTAGE_DATA", "captures/cycles_wavy"
 
@@ -44,7 +51,7 @@ def main() -> int:
     bench.add_argument("--out", type=Path, default=Path("runs/bench"))
     bench.add_argument("--subject", default="wavy", help="wavy, straight, curly or a strand file")
     bench.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
-    bench.add_argument("--rig", type=Path, default=Path("deploy/rigs/demo.toml"))
+    bench.add_argument("--rig", type=rig_path, default="demo")
     bench.add_argument("--capture", type=Path, help=f"for agreement; default: ${_DATA}/{_CAPTURE}")
     bench.add_argument(
         "--only",
@@ -156,7 +163,7 @@ def _appearance(args: argparse.Namespace) -> dict[str, Any]:
 
 def _acquisition(args: argparse.Namespace) -> dict[str, Any]:
     from benchmarks.acquisition.rates import run
-    from stage_service.cli.children import Children
+    from stage_service.cli.support.children import Children
     from stage_service.config import RigFile, load_rig_file
 
     with tempfile.TemporaryDirectory() as scratch, progress_bar("bench acquisition") as progress:
@@ -207,9 +214,10 @@ BENCHES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
 
 def _write_truth(args: argparse.Namespace, folder: Path) -> None:
     """The subject comes from the simulators, which only they may import."""
-    from stage_service.cli.children import simulator_base
+    from stage_service.cli.support.children import SimulatedRig
 
-    command = [*simulator_base(args), "--truth-only", str(folder)]
+    simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed)
+    command = simulated.command("--truth-only", folder)
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         lines = done.stderr.strip().splitlines()

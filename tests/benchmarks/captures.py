@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import shutil
@@ -12,9 +11,9 @@ from typing import Any
 
 from reconstruction.capture.compression import compress
 from reconstruction.report.report import Progress, silent
-from stage_service.cli.children import Children, own_command, simulator_command
-from stage_service.cli.client import Service
-from stage_service.cli.output import FAILED, CommandError
+from stage_service.cli.support import FAILED, CommandError
+from stage_service.cli.support.children import Children, SimulatedRig, own_command
+from stage_service.cli.support.client import ServiceClient
 
 VERSION = 1
 """Of the frames: another number makes kept captures stale."""
@@ -59,18 +58,18 @@ class SimulatedCapture:
     def _shoot(self, folder: Path, cache: Path, progress: Progress) -> Path:
         rig = folder / "rig.toml"
         rig.write_text(self.rig)
-        args = argparse.Namespace(rig=rig, subject=self.subject, head=self.head, seed=self.seed)
-        more = ["--ports", "auto", "--spp", str(self.spp), "--drift-mm", str(self.drift_mm)]
-        more += ["--cache", str(cache.resolve() / "lamps")]
         truth = folder / "truth"
+        command = SimulatedRig(rig, self.subject, self.head, self.seed).command(
+            *("--state", folder / "simulated", "--truth", truth, "--ports", "auto"),
+            *("--spp", str(self.spp), "--drift-mm", str(self.drift_mm)),
+            *("--cache", cache.resolve() / "lamps"),
+        )
         with Children(folder / "logs") as children:
-            command = simulator_command(args, folder / "simulated", truth, *more)
-            simulators = children.start("simulators", command, answers=True)
-            devices = children.first_line("simulators", simulators, 300)["devices"]
+            devices = children.ready("simulators", command, 300)["devices"]
             serve = own_command("serve", "--json", "--rig", rig, "--devices", devices)
             serve += ["--root", str(folder), "--port", "0"]
             service = children.start("service", serve, answers=True)
-            with Service(children.first_line("service", service, 60)["url"]) as client:
+            with ServiceClient(children.first_line("service", service, 60)["url"]) as client:
                 body: dict[str, Any] = {"plan": {}}
                 if (truth / "head.obj").is_file():
                     body["head"] = str(truth / "head.obj")

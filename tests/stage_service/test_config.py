@@ -9,7 +9,7 @@ import pytest
 from reconstruction.geometry.rig import RigError
 from stage_service.config import load_rig_file
 
-RIGS = Path(__file__).resolve().parents[2] / "deploy" / "rigs"
+RIGS = Path(__file__).resolve().parents[2] / "stage_service" / "rigs"
 SMALL = """
 name = "small"
 [[cameras]]

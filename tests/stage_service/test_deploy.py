@@ -1,4 +1,4 @@
-"""What deploy/ offers to install must fit the command line and the rig files beside it."""
+"""What deploy/ offers to install must fit the command line and the rig files that come with it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from stage_service.cli import build_parser
+from stage_service.cli.support import rig_path
 from stage_service.config import load_rig_file
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -29,7 +30,7 @@ def test_units_start_commands_that_there_are(unit):
 
 def test_rig_files_use_the_ports_that_the_udev_rules_name():
     rules = (DEPLOY / "udev" / "70-hairstage.rules").read_text()
-    devices = load_rig_file(DEPLOY / "rigs" / "stage331.toml").devices
+    devices = load_rig_file(rig_path("stage331")).devices
     assert devices is not None
     assert devices.projectors is not None
     for port in (devices.trigger.port, devices.projectors.port):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-DEMO_RIG = Path(__file__).resolve().parents[2] / "deploy" / "rigs" / "demo.toml"
+DEMO_RIG = Path(__file__).resolve().parents[2] / "stage_service" / "rigs" / "demo.toml"
 
 
 def command(stage, out: Path, *subject: str) -> list[str]:

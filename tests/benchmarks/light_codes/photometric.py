@@ -9,7 +9,7 @@ from benchmarks.light_codes.patches import quick, run_imported, run_patch
 from benchmarks.light_codes.rig import TARGETS, patch
 from reconstruction.pipeline import ReconstructOptions
 from reconstruction.report.report import Progress, silent
-from stage_service.cli.evaluate import geometry_table
+from stage_service.cli.support.tables import geometry_table
 
 
 def run(

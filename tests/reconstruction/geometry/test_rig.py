@@ -45,7 +45,7 @@ width = 64
 height = 64
 line_sigma = 0.6
 """
-DEMO = Path(__file__).resolve().parents[3] / "deploy" / "rigs" / "demo.toml"
+DEMO = Path(__file__).resolve().parents[3] / "stage_service" / "rigs" / "demo.toml"
 angles = st.floats(-np.pi, np.pi)
 coordinates = st.floats(-3, 3)
 
@@ -195,7 +195,7 @@ def test_a_rig_without_cameras_is_refused(tmp_path):
 
 def test_the_domes_radius_is_not_that_of_its_lamps(tmp_path):
     for name in ("demo", "stage331"):
-        rig = Rig.load(Path(__file__).resolve().parents[3] / "deploy" / "rigs" / f"{name}.toml")
+        rig = Rig.load(DEMO.with_name(f"{name}.toml"))
         assert {light.radius for light in rig.lights} == {0.0}
     (tmp_path / "rig.toml").write_text(
         "[dome]\nlights = 5\nradius = 1.2\nlamp_radius = 0.02\nintensity = [1.0, 1.0, 1.0]\n"

@@ -219,7 +219,7 @@ def test_angles_and_pitch_agree_with_the_planes(
 
 
 def test_the_demo_rig_is_well_conditioned() -> None:
-    rig = Rig.load(Path(__file__).parents[3] / "deploy" / "rigs" / "demo.toml")
+    rig = Rig.load(Path(__file__).parents[3] / "stage_service" / "rigs" / "demo.toml")
     result = condition(rig)
     assert len(result.pairs) == 24
     assert result.triangulated > 0.85

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -12,6 +14,7 @@ from reconstruction.geometry.strands import Strands
 from reconstruction.head.generic import generic_head, skin_distance
 from simulators.subject.subject import SubjectError, check_fits, load_subject, make_subject
 
+DEMO = Path(__file__).parents[3] / "stage_service" / "rigs" / "demo.toml"
 NAMES = ("wavy", "straight", "curly")
 
 
@@ -122,7 +125,7 @@ def test_sintel_fits_the_demo_rig(shared_data):
     assert len(subject.strands) == 11_400
     assert subject.strands.radius == pytest.approx(0.351e-3, abs=1e-6)
     assert "0.35 mm" in lines[0]
-    check_fits(subject, Rig.load("deploy/rigs/demo.toml"))
+    check_fits(subject, Rig.load(DEMO))
 
 
 def test_a_subject_elsewhere_is_an_error_that_says_so(tiny_rig, subjects):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,10 +24,10 @@ from reconstruction.files.strands import write_strands
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
 from stage_service.cli import build_parser, main
-from stage_service.cli.children import Children
-from stage_service.cli.output import CommandError
+from stage_service.cli.support import CommandError, rig_path
+from stage_service.cli.support.children import Children
 
-RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
+RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, dict[str, Any]]:
@@ -58,6 +59,13 @@ def test_every_command_says_what_it_does_and_speaks_json():
         assert callable(parser.get_default("run")), name
         assert len(parser.description or "") > 12, name
         assert len(parser.format_help().splitlines()) > 5, name
+        assert "(default: None)" not in parser.format_help(), name
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert re.fullmatch(r"hairstage \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
 
 def test_help_is_fast_because_nothing_heavy_is_imported():
@@ -82,6 +90,7 @@ def test_wrong_usage_is_exit_code_2(capsys):
 @pytest.mark.parametrize("name", ["demo.toml", "stage331.toml"])
 def test_rig_check_counts_and_conditions(capsys, name):
     code, data = run(capsys, "rig", "check", RIGS / name)
+    assert rig_path(name.removesuffix(".toml")).samefile(RIGS / name)
     assert code == 0
     assert (data["lights"], data["projectors"]) == (331, 3)
     assert data["cameras"] == {"demo.toml": 8, "stage331.toml": 50}[name]
@@ -216,6 +225,39 @@ def test_evaluate_images_compares_files_and_folders(capsys, tmp_path):
     )
     assert code == 3
     assert "two EXR files" in data["error"]["detail"]
+
+
+def test_evaluate_table_sets_demos_below_each_other(capsys, tmp_path):
+    def strands(f: float) -> dict[str, Any]:
+        return {"visible": {"1mm_10deg": {"f": f}}}
+
+    pictures = {name: {"psnr": 20.0, "ssim": 0.5} for name in ("ours", "diffuse", "three_nearest")}
+    results = {
+        "subject": "curly",
+        "seed": 3,
+        "geometry": strands(0.253),
+        "baselines": {"hull_vertical": strands(0.022), "hull_smooth_field": strands(0.032)},
+        "images": {
+            "held_out_lights": pictures,
+            "held_out_camera": {**pictures, "three_nearest": {"psnr": 21.44, "ssim": 0.706}},
+        },
+        "appearance": {"fitted": {"beta_m": 0.887}, "true": {"beta_m": 0.28}},
+        "warnings": ["fit: the roughness is at its bound"],
+    }
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps(results))
+    assert main(["evaluate", "table", str(file)]) == 0
+    head, _, row, *rest = capsys.readouterr().out.splitlines()
+    cells = dict(zip(head.split(" | "), row.split(" | "), strict=True))
+    assert cells["| subject"] == "| curly, seed 3 [1]"
+    assert cells["ours"] == "25.3 %"
+    assert cells["camera: three nearest"] == "21.44 / 0.71"
+    assert cells["β_M (true) |"] == "0.89 (0.28) |"
+    assert rest[-1] == "[1] fit: the roughness is at its bound"
+    del results["images"]
+    file.write_text(json.dumps(results))
+    code, data = run(capsys, "evaluate", "table", file)
+    assert (code, "has no images" in data["error"]["detail"]) == (3, True)
 
 
 def test_a_service_from_the_command_line(capsys, rig_file, world, tmp_path):

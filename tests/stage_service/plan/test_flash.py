@@ -17,7 +17,7 @@ from stage_service.plan.flash import flash_rate
 from stage_service.plan.resolved import resolve
 from stage_service.plan.timeline import Lit
 
-RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
+RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from stage_service.config import RigFile, load_rig_file
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError, resolve
 
-RIGS = Path(__file__).resolve().parents[3] / "deploy" / "rigs"
+RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 
 
 @pytest.fixture(scope="module")

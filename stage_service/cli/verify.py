@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from stage_service.cli.output import FAILED, Commands, Output, add_command, progress_bar
+from stage_service.cli.support import FAILED, Commands, Output, add_command, progress_bar
 
 
 def add(commands: Commands) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from stage_service.cli.output import (
-    BAD_INPUT,
-    CommandError,
+from stage_service.cli.support import (
+    BadInput,
     Commands,
     Output,
     add_command,
@@ -98,4 +97,4 @@ def run_mark(args: argparse.Namespace, output: Output) -> int:
 
 def _require_obj(path: Path) -> None:
     if path.suffix != ".obj":
-        raise CommandError(f"--out must end in .obj, got {path}", BAD_INPUT, "BadInput")
+        raise BadInput(f"--out must end in .obj, got {path}")

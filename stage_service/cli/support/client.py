@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import getpass
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -11,7 +13,7 @@ from typing import Any, Self
 import httpx
 
 from reconstruction.report.report import Progress
-from stage_service.cli.output import BAD_INPUT, FAILED, UNREACHABLE, CommandError
+from stage_service.cli.support.commands import BAD_INPUT, FAILED, UNREACHABLE, CommandError
 
 DEFAULT_URL = "http://127.0.0.1:8331"
 LEASE = "Hairstage-Lease"
@@ -19,7 +21,7 @@ LEASE_S = 120.0
 """A command that dies blocks the stage for no longer."""
 
 
-class Service:
+class ServiceClient:
     """A running service, for the length of a with-block. Its problems become `CommandError`s.
 
     `lease` is the token of the lease under which it steers.
@@ -64,7 +66,7 @@ class Service:
         )
 
     @contextmanager
-    def leased(self, holder: str) -> Iterator[Callable[[], None]]:
+    def leased(self) -> Iterator[Callable[[], None]]:
         """Steer alone until the end of the block; call what it yields at least every minute.
 
         Does nothing where this service already steers under a lease.
@@ -72,7 +74,7 @@ class Service:
         if LEASE in self._http.headers:
             yield lambda: None
             return
-        granted = self.post("/lease", {"holder": holder, "seconds": LEASE_S})
+        granted = self.post("/lease", {"holder": me(), "seconds": LEASE_S})
         self._steer_with(granted["token"])
         renewed = time.monotonic()
 
@@ -130,3 +132,12 @@ class Service:
                 return status
             check()
             time.sleep(0.3)
+
+
+def me() -> str:
+    """This user and machine, as holder of a lease."""
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError):  # a container's user may have no name
+        user = f"user {os.getuid()}"
+    return f"{user} on {socket.gethostname()}"

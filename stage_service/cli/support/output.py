@@ -1,41 +1,18 @@
-"""What commands print: results on stdout, progress on stderr, exit codes that mean something."""
+"""What commands print: results on stdout, progress on stderr."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from reconstruction.report.report import Progress
 
-EXIT_CODES = {
-    0: "done",
-    1: "it ran and failed: a failed job or capture, a damaged capture, a fault of the program",
-    2: "wrong usage",
-    3: "bad input: a file, folder, rig, plan or name that cannot be used",
-    4: "the service, the simulators or a device cannot be reached",
-    130: "interrupted",
-}
-
-FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
-
 LINE_EVERY_S = 10.0
 """Where progress goes to a log, a line so often."""
-
-Commands = Any  # argparse does not export the type of what add_subparsers returns
-Run = Callable[[argparse.Namespace, "Output"], int]
-
-
-class CommandError(Exception):
-    """Ends a command with `code`; the message is for the user, `more` goes into the JSON."""
-
-    def __init__(self, message: str, code: int = FAILED, kind: str = "Failed", **more: Any) -> None:
-        super().__init__(message)
-        self.code, self.kind, self.more = code, kind, more
 
 
 class Output:
@@ -104,24 +81,3 @@ def _lines(title: str) -> Progress:
             last[0] = now if share < 1 else float("inf")
 
     return show
-
-
-def add_command(
-    commands: Commands, name: str, run: Run, help: str, description: str | None = None
-) -> argparse.ArgumentParser:
-    """Add a command with what every command has: `--json`, help, the function that runs it."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name,
-        help=help,
-        description=description or help[0].upper() + help[1:] + ".",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    parser.set_defaults(run=run)
-    return parser
-
-
-def add_group(commands: Commands, name: str, help: str) -> Commands:
-    """Add a command that has commands of its own."""
-    parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
-    return parser.add_subparsers(dest="action", metavar="ACTION", required=True)

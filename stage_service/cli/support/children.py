@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import select
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from stage_service.cli.output import BAD_INPUT, UNREACHABLE, CommandError
+from stage_service.cli.support.commands import BAD_INPUT, UNREACHABLE, CommandError
 
 GRACE_S = 40.0
 """How long a child may take to end by itself: the service puts the lights off in that time."""
@@ -77,6 +77,10 @@ class Children:
         answer: dict[str, Any] = json.loads(line)
         return answer
 
+    def ready(self, name: str, command: list[str], seconds: float) -> dict[str, Any]:
+        """Start a child; returns the JSON object that it prints when it is ready."""
+        return self.first_line(name, self.start(name, command, answers=True), seconds)
+
     def check(self) -> None:
         """Raise `CommandError` when a child has ended by itself."""
         for name, child in self._running:
@@ -129,17 +133,17 @@ def own_command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "stage_service.cli", *map(str, arguments)]
 
 
-def simulator_base(args: argparse.Namespace) -> list[str]:
-    """The simulators' command line as far as it says which subject sits in which rig."""
-    command = [sys.executable, "-m", "simulators", "--rig", args.rig, "--subject", args.subject]
-    command += ["--seed", args.seed, *(["--head", args.head] if args.head is not None else [])]
-    return [str(word) for word in command]
+@dataclass(frozen=True)
+class SimulatedRig:
+    """A rig file, and who sits in it: a subject's name, or a strand file with its head."""
 
+    rig: Path
+    subject: str = "wavy"
+    head: Path | str | None = None
+    seed: int = 0
 
-def simulator_command(
-    args: argparse.Namespace, state: Path, truth: Path | None, *more: str | Path
-) -> list[str]:
-    """The simulators' command line with their state folder, and where the truth goes."""
-    command = [*simulator_base(args), "--state", state, *more]
-    command += ["--truth", truth] if truth is not None else []
-    return [str(word) for word in command]
+    def command(self, *more: str | Path) -> list[str]:
+        """The simulators' command line."""
+        words = [sys.executable, "-m", "simulators", "--rig", self.rig, "--subject", self.subject]
+        words += ["--seed", self.seed, *(["--head", self.head] if self.head is not None else [])]
+        return [str(word) for word in (*words, *more)]

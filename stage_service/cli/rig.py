@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from stage_service.cli.output import Commands, Output, add_command, add_group
+from stage_service.cli.support import Commands, Output, add_command, add_group, rig_path
 
 
 def add(commands: Commands) -> None:
@@ -21,7 +20,7 @@ def add(commands: Commands) -> None:
         "and projector the angle between camera rays and planes of light on a head-sized sphere: "
         "near 0 the depth is worthless.",
     )
-    check.add_argument("file", type=Path, help="rig file (.toml or .json)")
+    check.add_argument("file", type=rig_path, help="rig file (.toml or .json)")
     check.add_argument("--radius", type=float, default=0.12, help="of the sphere, metres")
 
 

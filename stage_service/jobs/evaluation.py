@@ -1,7 +1,8 @@
-"""Reconstructed strands against true ones, beside the baselines that use no method."""
+"""A model against the truth: its strands beside baselines that use no method, its appearance."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,9 @@ def evaluate_geometry(
 ) -> dict[str, Any]:
     """Score `model`'s strands and both hull baselines against the strand file `truth`.
 
-    Returns `{visible, all}` of ours, and `baselines.{hull_vertical, hull_smooth_field}` of the same
-    two. The true strands stand where the subject stood during the OLAT pass. The baselines get the
-    masks that the reconstruction had: those of the cameras that are not held out.
+    Returns `{visible, all}` of ours and `baselines.{hull_vertical, hull_smooth_field}` with the
+    same two. The true strands stand where the subject stood during the OLAT pass. The baselines get
+    the masks that the reconstruction had: those of the cameras that are not held out.
     """
     from appearance.observations import model_mask
     from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
@@ -54,3 +55,30 @@ def evaluate_geometry(
     baselines["hull_smooth_field"] = score(hull_smooth_field(hull, head))
     progress("judged", 1.0)
     return {**figures, "baselines": baselines}
+
+
+def evaluate_appearance(model: Path, truth: Path) -> dict[str, Any]:
+    """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
+
+    Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
+    at Sun's value: the same absorption means another colour under another beta_n.
+    """
+    from appearance.model.fitted_appearance import FittedAppearance
+    from appearance.scene.hair_appearance import HairAppearance
+    from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
+
+    def figures(hair: HairAppearance, skin: Sequence[float]) -> dict[str, Any]:
+        return {
+            "beta_m": hair.beta_m,
+            "v": float(variance_of_roughness(hair.beta_m)),
+            "beta_n": hair.beta_n,
+            "sigma_a": list(hair.sigma_a),
+            "colour": [float(c) for c in colour_of_absorption(hair.sigma_a, hair.beta_n)],
+            "skin": list(skin),
+        }
+
+    fitted, true = FittedAppearance.load(model), json.loads(truth.read_text())
+    return {
+        "fitted": figures(fitted.hair, fitted.skin),
+        "true": figures(HairAppearance.from_dict(true["hair"]), true["skin"]),
+    }

@@ -1,0 +1,143 @@
+"""`hairstage capture`: captures on a running service."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stage_service.cli.jobs import add_pipeline, wait_for_job
+from stage_service.cli.support import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    Commands,
+    Output,
+    add_group,
+    add_remote,
+    progress_bar,
+    read_json,
+    rig_path,
+)
+
+if TYPE_CHECKING:
+    from stage_service.cli.support.client import ServiceClient
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    capture = add_group(commands, "capture", "make and steer captures on a running service")
+    check = add_remote(capture, "check", run_check, "cost a plan without lighting a lamp")
+    start = add_remote(capture, "start", run_start, "begin a capture")
+    check.add_argument("--rig", type=rig_path, help="ask this rig file, not a service")
+    for parser in (check, start):
+        parser.add_argument("--plan", type=Path, help="plan as JSON; without it, everything")
+    start.add_argument("--head", type=Path, help="the digitised head (.obj)")
+    start.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
+    add_pipeline(start, None, "job to enqueue when the capture completes")
+    start.add_argument("--armed-by", help="who answers for flashes that the plan has consent for")
+    start.add_argument("--wait", action="store_true", help="wait for capture and job, steer alone")
+    add_remote(capture, "list", run_list_captures, "list captures, oldest first")
+    for action, what in (
+        ("show", "show where a capture is"),
+        ("pause", "pause at the next step"),
+        ("resume", "go on after a pause; shoot what an aborted or failed capture lacks"),
+        ("abort", "abort at the next step, lights off"),
+    ):
+        parser = add_remote(capture, action, run_capture_action, what)
+        parser.add_argument("capture", help="its id")
+        if action == "resume":
+            parser.add_argument("--armed-by", help="as for start")
+
+
+def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
+    """Cost a plan; with a rig file, without a service or a device."""
+    if args.rig is not None:
+        from pydantic import ValidationError
+
+        from stage_service.config import load_rig_file
+        from stage_service.plan.capture_plan import CapturePlan
+        from stage_service.plan.resolved import resolve
+
+        try:
+            plan = CapturePlan.model_validate(read_json(args.plan))
+        except ValidationError as error:
+            problems = "; ".join(
+                f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}"
+                for e in error.errors()
+            )
+            raise CommandError(f"{args.plan}: {problems}", BAD_INPUT) from error
+        cost = resolve(plan, load_rig_file(args.rig)).cost.model_dump(mode="json")
+    else:
+        cost = service.post("/plans:validate", read_json(args.plan))
+    output.result(cost, _costed(cost))
+    return 0
+
+
+def _costed(cost: dict[str, Any]) -> str:
+    """A plan's cost, for people."""
+    flash = cost["flash"]
+    kinds = ", ".join(f"{n} {kind}" for kind, n in cost["frames_by_kind"].items())
+    causes = ", ".join(f"{c} {s:.1f}" for c, s in cost["seconds_by_cause"].items() if s)
+    lines = [
+        f"{cost['steps']} steps, {cost['frames']} frames ({kinds}), {cost['bytes'] / 1e9:.1f} GB",
+        f"{cost['seconds']:.1f} s: {causes}; limited by {cost['limited_by']}",
+        cost["stepping_why"]
+        if cost["stepping"]["hardware"]
+        else f"the service clocks every step: {cost['stepping_why']}",
+        f"flashes at {flash['hz']:.1f} Hz ({flash['band']})"
+        + (": needs consent, or rate_hz; see docs/safety.md" if flash["needs_consent"] else ""),
+        f"light: {cost['lamp_seconds']:.1f} lamp seconds, "
+        f"{', '.join(f'{d:.3g}' for d in cost['dose'])} J/m² (R, G, B) at the head",
+    ]
+    lines += [f"left out: {x['what']}: {x['why']}" for x in cost["left_out"]]
+    return "\n".join(lines)
+
+
+def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
+    """Begin a capture, and wait for it where asked."""
+    body: dict[str, Any] = {"plan": read_json(args.plan)}
+    for field in ("head", "masks"):
+        if getattr(args, field) is not None:
+            body[field] = str(getattr(args, field).resolve())
+    if args.pipeline is not None:
+        body["pipeline"] = {"name": args.pipeline, "options": read_json(args.options)}
+    if args.armed_by is not None:
+        body["armed_by"] = args.armed_by
+    if not args.wait:
+        capture = service.post("/captures", body)
+        output.result(capture, f"capture {capture['id']} runs")
+        return 0
+    with service.leased() as renew, progress_bar("capture") as progress:
+        capture = service.post("/captures", body)
+        capture = service.follow_capture(capture["id"], progress, renew)
+    if capture["outcome"] != "completed":
+        output.result({"capture": capture}, f"{capture['outcome']}: {capture['error'] or ''}")
+        return FAILED
+    if capture["job"] is None:
+        output.result({"capture": capture}, f"capture {capture['id']}: {capture['path']}")
+        return 0
+    return wait_for_job(service, capture["job"], output, {"capture": capture})
+
+
+def run_list_captures(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
+    """List captures."""
+    captures = service.get("/captures")
+    lines = [
+        f"{c['id']}  {c['outcome'] or c['state']}  {c['frames_written']}/{c['frames_planned']} "
+        f"frames  {c['path']}"
+        for c in captures
+    ]
+    output.result({"captures": captures}, "\n".join(lines) or "no captures")
+    return 0
+
+
+def run_capture_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
+    """Show, pause, resume or abort."""
+    path = f"/captures/{args.capture}"
+    if args.action == "show":
+        output.result(service.get(path))
+        return 0
+    body = {"armed_by": args.armed_by} if args.action == "resume" else None
+    output.result(service.post(f"{path}/{args.action}", body))
+    return 0
