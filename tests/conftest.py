@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from waiting import machine_slack, slowed
 
 from reconstruction.geometry.rig import Rig
 from simulators.frames.frames import FrameMaker
 from simulators.frames.responses import Response
 from simulators.frames.sensor import Sensor
 from simulators.peers.devices import DEVICES_FILE, SimulatedStage
-from simulators.peers.faults import Fault, Faults
+from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps
 from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
@@ -26,6 +27,16 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 
 # What runs in the background starts with Ctrl-C ignored, and so would the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def slack() -> int:
+    """How many times longer devices may take than on an idle machine; of one test, one number.
+
+    The deadlines of the rig files, of the drivers and of the faults here are all this times longer:
+    a test says what happens within a device's deadline, not how fast the machine is.
+    """
+    return machine_slack()
 
 
 @pytest.fixture
@@ -75,18 +86,18 @@ height = 16
 [devices]
 hardware_stepping = true
 heartbeat_s = 0.05
-watchdog_s = 0.5
+watchdog_s = WATCHDOG_S
 [devices.lights]
-timeout_s = 0.3
+timeout_s = TIMEOUT_S
 [devices.trigger]
 port = "none"
-timeout_s = 0.3
+timeout_s = TIMEOUT_S
 [devices.projectors]
 port = "none"
-timeout_s = 0.3
+timeout_s = TIMEOUT_S
 [devices.cameras]
 port = 1
-timeout_s = 0.3
+timeout_s = TIMEOUT_S
 readout_s = 0.001
 [safety]
 living_subject = false
@@ -133,24 +144,31 @@ class Flat:
 
 
 @pytest.fixture
-def small_rig() -> str:
-    """The rig file's text that `simulated` uses."""
-    return SMALL_RIG
+def small_rig(slack: int) -> str:
+    """The rig file's text that `simulated` uses: deadlines of 0.3 s, a watchdog of 0.5 s."""
+    times = {"WATCHDOG_S": 0.5, "TIMEOUT_S": 0.3}
+    text = SMALL_RIG
+    for name, seconds in times.items():
+        text = text.replace(name, f"{seconds * slack:g}")
+    return text
 
 
 @pytest.fixture
-def simulated(tmp_path: Path) -> Iterator[Callable[..., tuple[RigFile, World]]]:
+def simulated(
+    tmp_path: Path, small_rig: str, slack: int
+) -> Iterator[Callable[..., tuple[RigFile, World]]]:
     """`simulated(*faults, rig=text)`: the simulators' devices, without a renderer, in this process.
 
-    Returns the rig file, which leads to them, and the world behind them.
+    Returns the rig file, which leads to them, and the world behind them. The faults' `seconds` are
+    those of an idle machine.
     """
     with ExitStack() as stack:
 
-        def start(*faults: Fault, rig: str = SMALL_RIG) -> tuple[RigFile, World]:
+        def start(*faults: Fault, rig: str = small_rig) -> tuple[RigFile, World]:
             path = tmp_path / f"small{len(list(tmp_path.glob('small*.toml')))}.toml"
             path.write_text(rig)
             rig_file = load_rig_file(path)
-            known, used, sensor = rig_file.rig, Faults(faults), Sensor()
+            known, used, sensor = rig_file.rig, slowed(faults, slack), Sensor()
             frames = FrameMaker(known, Flat(known), sensor, 0)
             world = World(known, Lamps(len(known.lights)), used, frames.counts)
             state = path.with_suffix("")

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from waiting import slowed
 
 from reconstruction.geometry.projectors import Projector
 from simulators.peers.faults import Fault, Faults
@@ -22,23 +23,10 @@ from stage_service.devices.projectors.serial_controller import SerialProjectorCo
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
 FIRMWARE = Path(__file__).resolve().parents[2] / "deploy" / "firmware"
-TIMEOUT_S = 5.0  # a busy machine is no fault of a device
+TIMEOUT_S = 30.0  # where no deadline is meant to be missed
 
 Edge = tuple[float, str, bool]
 """When, which output (L, P, C), and whether it went up; a camera pulse is the way up alone."""
-
-
-@pytest.fixture
-def until() -> Callable[[Callable[[], bool]], None]:
-    """`until(condition)`: poll for what another thread or process brings about."""
-
-    def wait(condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 10
-        while not condition():
-            assert time.monotonic() < deadline, "it did not happen within 10 s"
-            time.sleep(0.002)
-
-    return wait
 
 
 class Wires:
@@ -81,13 +69,17 @@ class Wires:
 
 
 class SerialStage:
-    """A simulated trigger box and projector controller, wired, each with its driver."""
+    """A simulated trigger box and projector controller, wired, each with its driver.
+
+    `now` is the projector controller's clock, seconds; it stands still.
+    """
 
     def __init__(self, folder: Path, faults: Faults, stack: ExitStack, timeout_s: float) -> None:
         places = {"left": [0.0, 1.0, 0.3], "right": [0.5, 1.0, 0.3]}
         rig = [Projector.look_at(n, 8, 768, p, [0, 0, 0], 20.0) for n, p in places.items()]
         self.folder, self.faults = folder, faults
-        self.controller = ProjectorController(rig, self.blank)
+        self.timeout_s, self.now = timeout_s, 0.0
+        self.controller = ProjectorController(rig, self.blank, lambda: self.now)
         self.wires = Wires(self.controller, faults)
         self.box = TriggerBox(self.wires, faults)
         stack.callback(self.box.stop)
@@ -130,12 +122,15 @@ class SerialStage:
 
 
 @pytest.fixture
-def serial_stage(tmp_path: Path) -> Iterator[Callable[..., SerialStage]]:
-    """`serial_stage(*faults)`: simulated trigger box and projectors on pseudo-terminals."""
+def serial_stage(tmp_path: Path, slack: int) -> Iterator[Callable[..., SerialStage]]:
+    """`serial_stage(*faults)`: simulated trigger box and projectors on pseudo-terminals.
+
+    Times are those of an idle machine.
+    """
     with ExitStack() as stack:
 
         def start(*faults: Fault, timeout_s: float = TIMEOUT_S) -> SerialStage:
-            return SerialStage(tmp_path, Faults(faults), stack, timeout_s)
+            return SerialStage(tmp_path, slowed(faults, slack), stack, timeout_s * slack)
 
         yield start
 

@@ -7,6 +7,7 @@ import random
 import subprocess
 
 import pytest
+from waiting import until
 
 from stage_service.devices.trigger.interface import TableRow
 
@@ -216,7 +217,7 @@ def test_the_sanitizers_find_nothing_in_garbage(firmware_host):
     assert program.stdout.endswith(b"HAIRSTAGE-TRIGGER 2 4096\n")
 
 
-def test_the_driver_crosses_the_wrap_on_a_real_clock(firmware, until):
+def test_the_driver_crosses_the_wrap_on_a_real_clock(firmware):
     box = firmware(WRAP - 30_000)  # 30 ms after the start
     box.trigger.load_table([TableRow(10, "L", 0.001, 0.001, 0.01)], 1.0)
     box.trigger.go()

@@ -6,6 +6,7 @@ import math
 import threading
 
 import pytest
+from waiting import until
 
 from simulators.peers.faults import Fault
 from stage_service.devices.errors import DeviceError, SafetyRefusal
@@ -133,7 +134,7 @@ def test_a_box_without_a_table_says_so(serve):
     driver.close()
 
 
-def test_a_table_runs_from_its_first_step_to_its_last(box, until):
+def test_a_table_runs_from_its_first_step_to_its_last(box):
     driver = box.driver
     assert driver.table_rows == 4096
     driver.pulse(0.001)
@@ -158,7 +159,7 @@ def test_a_table_runs_from_its_first_step_to_its_last(box, until):
     assert order[10:] == [("P", True), ("P", False)]
 
 
-def test_steps_keep_their_times(box, until):
+def test_steps_keep_their_times(box):
     steps, settle, exposure, period = 6, 0.006, 0.004, 0.03
     running(box, TableRow(steps, "L", settle, exposure, period))
     until(lambda: box.driver.progress().state == "done")
@@ -172,15 +173,18 @@ def test_steps_keep_their_times(box, until):
         assert opened[i] - opened[0] >= i * period - 0.01
 
 
-def test_a_step_that_takes_longer_than_its_period_is_followed_at_once(box, until):
-    running(box, TableRow(3, "L", 0.0, 0.02, 0.001))
+def test_a_step_that_takes_longer_than_its_period_is_followed_at_once(box):
+    """Not at the next multiple of the period, 20 ms later, nor a period after its own end."""
+    running(box, TableRow(5, "L", 0.0, 0.04, 0.03))
     until(lambda: box.driver.progress().state == "done")
-    until(lambda: len(times(box, "L", False)) == 3)
-    for opened, shut in zip(times(box, "L")[1:], times(box, "L", False)[:-1], strict=True):
-        assert 0 <= opened - shut < 0.02
+    until(lambda: len(times(box, "L", False)) == 5)
+    pairs = zip(times(box, "L")[1:], times(box, "L", False)[:-1], strict=True)
+    dark = [opened - shut for opened, shut in pairs]
+    assert min(dark) >= 0
+    assert min(dark) < 0.01  # the others wait for this machine
 
 
-def test_an_armed_table_can_be_run_again(box, until):
+def test_an_armed_table_can_be_run_again(box):
     running(box, TableRow(2, "L", 0.0, 0.001, 0.0))
     until(lambda: box.driver.progress().state == "done")
     with pytest.raises(DeviceError, match=r"starting the table: .*ERR 4"):
@@ -191,7 +195,7 @@ def test_an_armed_table_can_be_run_again(box, until):
     assert box.driver.count() == 5
 
 
-def test_stop_closes_the_gates_in_mid_step(box, until):
+def test_stop_closes_the_gates_in_mid_step(box):
     running(box, TableRow(2, "L", 0.0, 0.001, 0.0), LONG)
     until(lambda: box.driver.progress().pulses == 3)
     assert not closed(box)
@@ -210,7 +214,7 @@ def test_stop_takes_an_armed_table_back(box):
         box.driver.go()
 
 
-def test_a_running_table_is_not_disturbed(box, until):
+def test_a_running_table_is_not_disturbed(box):
     running(box, LONG)
     until(lambda: box.driver.progress().pulses == 1)
     for call in (
@@ -226,13 +230,13 @@ def test_a_running_table_is_not_disturbed(box, until):
     box.driver.stop()
 
 
-def test_the_table_stops_when_nobody_asks(box, until):
-    running(box, LONG, watchdog_s=0.1)
+def test_the_table_stops_when_nobody_asks(box, slack):
+    running(box, LONG, watchdog_s=0.1 * slack)
     until(lambda: closed(box))
     assert box.driver.progress() == TableProgress("stopped", 0, 1, "watchdog")
 
 
-def test_noise_does_not_feed_the_watchdog(box, until):
+def test_noise_does_not_feed_the_watchdog(box):
     running(box, LONG, watchdog_s=0.2)
     lines, ended = box.driver._lines, threading.Event()
 
@@ -251,7 +255,7 @@ def test_noise_does_not_feed_the_watchdog(box, until):
 
 
 @pytest.mark.parametrize("what", ["interlock", "estop"])
-def test_a_safety_input_stops_the_table_and_refuses_the_next(box, until, what):
+def test_a_safety_input_stops_the_table_and_refuses_the_next(box, what):
     running(box, LONG)
     until(lambda: box.driver.progress().pulses == 1)
     box.press(what)
@@ -266,7 +270,7 @@ def test_a_safety_input_stops_the_table_and_refuses_the_next(box, until, what):
     assert box.driver.count() == 1
 
 
-def test_without_a_pattern_no_camera_fires(box, until):
+def test_without_a_pattern_no_camera_fires(box):
     box.no_patterns()
     running(box, TableRow(1, "LP", 0.0, 0.001, 0.0))
     until(lambda: closed(box))

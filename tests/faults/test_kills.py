@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import until
 
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.verify import verify
@@ -61,7 +62,7 @@ STAGES = [
 
 
 @pytest.mark.parametrize(("name", "place", "call", "stepping"), STAGES, ids=[s[0] for s in STAGES])
-def test_sigkill_of_the_service(name, place, call, stepping, simulated, tmp_path, told):
+def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, tmp_path, told):
     rig_file, world = simulated()
     plan = CapturePlan(**PLAN, stepping=stepping)
     child = subprocess.Popen(
@@ -82,13 +83,14 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, tmp_path
     assert child.stdout is not None
     assert child.stdout.readline() == b"here\n"
     if name == "a table running":
-        until(lambda: world.lamps.power().any(), 5)
+        until(lambda: world.lamps.power().any())
     child.kill()
     child.wait()
     child.stdout.close()
     lit = bool(world.lamps.power().any() or world.projectors.show.level)
     killed = time.monotonic()
-    until(lambda: not (world.lamps.power().any() or world.projectors.show.level), 1.5)
+    dark = rig_file.devices.watchdog_s + 1.0 * slack
+    until(lambda: not (world.lamps.power().any() or world.projectors.show.level), dark)
     seconds = time.monotonic() - killed
     kept = frames(tmp_path / "c")
     writer = CaptureWriter.reopen(tmp_path / "c")
@@ -117,7 +119,7 @@ def test_sigkill_of_the_devices(simulated, tmp_path, told):
             [*command, "--ports", "auto", "--spp", "1"], cwd=CHECKOUT, stdout=log, stderr=log
         )
     try:
-        until(lambda: (state / DEVICES_FILE).exists() or peers.poll() is not None, 60)
+        until(lambda: (state / DEVICES_FILE).exists() or peers.poll() is not None)
         there = load_rig_file(rig, state / DEVICES_FILE)
         plan = resolve(CapturePlan(projectors=(), stepping="software"), there)
         writer = CaptureWriter.create(tmp_path / "c", there.rig, {"steps": plan.steps})
@@ -148,10 +150,3 @@ def frames(path: Path) -> dict[tuple[int, str], str]:
                 assert capture.frame(step, camera).shape == (12, 16, 3)
                 found[step.index, camera] = str(capture.records[step.index, camera].sha256)
     return found
-
-
-def until(condition: Any, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import serial
 from pymodbus.client import ModbusTcpClient
+from waiting import machine_slack
 
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
@@ -74,7 +75,7 @@ class SerialClient:
     """One line out, one line back."""
 
     def __init__(self, port: str) -> None:
-        self.port = serial.Serial(port, timeout=0.5)
+        self.port = serial.Serial(port, timeout=0.5 * machine_slack())
 
     def ask(self, line: str) -> str:
         self.port.write(line.encode() + b"\n")
@@ -85,7 +86,7 @@ class CameraClient:
     """One connection to the camera link."""
 
     def __init__(self, host: str, port: int) -> None:
-        self.socket = socket.create_connection((host, port), timeout=5)
+        self.socket = socket.create_connection((host, port), timeout=60)
 
     def ask(self, **request: Any) -> dict[str, Any]:
         return self.raw(json.dumps(request).encode())
@@ -122,7 +123,7 @@ class Bench:
     def __init__(self, stage: SimulatedStage, world: World, now: list[float]) -> None:
         d = stage.devices
         self.stage, self.world, self.now, self.wires = stage, world, now, d
-        self.lights = ModbusTcpClient(d["lights"]["host"], port=d["lights"]["port"], timeout=2)
+        self.lights = ModbusTcpClient(d["lights"]["host"], port=d["lights"]["port"], timeout=30)
         assert self.lights.connect()
         self.trigger = SerialClient(d["trigger"]["port"])
         self.projectors = SerialClient(d["projectors"]["port"])

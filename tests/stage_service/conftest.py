@@ -248,7 +248,7 @@ def world() -> World:
 
 
 @pytest.fixture
-def rig_file(world: World, tmp_path: Path) -> Iterator[RigFile]:
+def rig_file(world: World, tmp_path: Path, slack: int) -> Iterator[RigFile]:
     """A rig of 200 lamps, 3 small cameras and 2 projectors whose devices answer on real wires."""
     servers = []
     for handler in (Lights, Cameras):
@@ -258,7 +258,8 @@ def rig_file(world: World, tmp_path: Path) -> Iterator[RigFile]:
         servers.append(server)
     serial = [SerialPeer(world, answer) for answer in (trigger, projectors)]
     path = tmp_path / "rig.toml"
-    path.write_text(RIG + devices([s.server_address[1] for s in servers], [s.path for s in serial]))
+    ports, paths = [s.server_address[1] for s in servers], [s.path for s in serial]
+    path.write_text(RIG + devices(ports, paths, slack))
     yield load_rig_file(path)
     for server in servers:
         server.shutdown()
@@ -267,26 +268,26 @@ def rig_file(world: World, tmp_path: Path) -> Iterator[RigFile]:
         peer.close()
 
 
-def devices(ports: list[int], paths: list[str]) -> str:
+def devices(ports: list[int], paths: list[str], slack: int) -> str:
     return f"""
 [safety]
 living_subject = false
 [devices]
 heartbeat_s = 0.05
-watchdog_s = 0.5
+watchdog_s = {0.5 * slack:g}
 [devices.lights]
 port = {ports[0]}
-timeout_s = 0.3
+timeout_s = {0.3 * slack:g}
 [devices.trigger]
 port = "{paths[0]}"
-timeout_s = 0.3
+timeout_s = {0.3 * slack:g}
 [devices.projectors]
 port = "{paths[1]}"
-timeout_s = 0.3
+timeout_s = {0.3 * slack:g}
 [devices.cameras]
 port = {ports[1]}
-timeout_s = 0.3
-busy_s = 5.0
+timeout_s = {0.3 * slack:g}
+busy_s = 30.0
 [capture.exposure]
 dark = 0.002
 all_on = 0.001

@@ -10,7 +10,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+from waiting import machine_slack, until
 
 from reconstruction.files.strands import write_strands
 from reconstruction.geometry.mesh import Mesh, write_obj
@@ -29,7 +29,6 @@ from reconstruction.geometry.strands import Strands
 T = TypeVar("T")
 LIGHTS, CAMERAS, ROWS = 24, 3, 16
 FRAMES = CAMERAS * (LIGHTS + ROWS + 1 + 4)  # one tracking frame, dark and all-on at both ends
-WATCHDOG_S = 1.0
 
 RIG = f"""
 name = "tiny"
@@ -42,16 +41,19 @@ beside_cameras_at = 0.05
 living_subject = false
 [devices]
 heartbeat_s = 0.2
-watchdog_s = {WATCHDOG_S}
+watchdog_s = WATCHDOG_S
 [devices.lights]
 port = 15020
+timeout_s = 20.0
 [devices.trigger]
 port = "trigger"
 timeout_s = 20.0  # a lost reply leaves the lamp lit that long: time to kill the service
 [devices.projectors]
 port = "projectors"
+timeout_s = 20.0
 [devices.cameras]
 port = 15021
+timeout_s = 20.0
 busy_s = 120.0
 """ + "".join(
     f"""
@@ -76,24 +78,21 @@ height = {size}
 class TinyStage:
     """Simulators, service and worker as a user starts them; everything ends with `close`."""
 
-    LIGHTS, CAMERAS, FRAMES, WATCHDOG_S = LIGHTS, CAMERAS, FRAMES, WATCHDOG_S
-
-    @staticmethod
-    def until(what: Callable[[], T], seconds: float = 60.0) -> T:
-        """What `what` returns once that is true; fails after `seconds`."""
-        deadline = time.monotonic() + seconds
-        while not (found := what()):
-            assert time.monotonic() < deadline, "it did not happen in time"
-            time.sleep(0.02)
-        return found
+    LIGHTS, CAMERAS, FRAMES = LIGHTS, CAMERAS, FRAMES
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.root = folder, folder / "root"
         self.rig = folder / "rig.toml"
-        self.rig.write_text(RIG)
+        self.slack = machine_slack()
+        self.watchdog_s = 1.0 * self.slack
+        self.rig.write_text(RIG.replace("WATCHDOG_S", str(self.watchdog_s)))
         _write_subject(folder)
         self._running: list[subprocess.Popen[str]] = []
-        self.http = httpx.Client(timeout=30, trust_env=False)
+        self.http = httpx.Client(timeout=120, trust_env=False)
+
+    def until(self, what: Callable[[], T], seconds: float = 60.0) -> T:
+        """What `what` returns once that is true; fails after `seconds` of an idle machine."""
+        return until(what, seconds * self.slack)
 
     def start(self, *words: str | Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
         """Start `hairstage …` and read the object that it prints when it is ready."""
@@ -167,7 +166,7 @@ class TinyStage:
     def lamps_lit(self) -> int:
         """Lamps that are lit, asked over Modbus TCP by hand (read input register 1 of unit 1)."""
         lights = tomllib.loads(self.devices.read_text())["devices"]["lights"]
-        with socket.create_connection(("127.0.0.1", lights["port"]), timeout=5) as bank:
+        with socket.create_connection(("127.0.0.1", lights["port"]), timeout=60) as bank:
             bank.sendall(struct.pack(">HHHBBHH", 7, 0, 6, 1, 4, 1, 1))
             answer = bank.recv(11, socket.MSG_WAITALL)
         lit: int = struct.unpack(">HHHBBBH", answer)[-1]
@@ -187,7 +186,7 @@ class TinyStage:
         for child in reversed(self._running):
             child.terminate()
             try:
-                child.wait(20)
+                child.wait(60)
             finally:
                 child.kill()
                 child.wait()

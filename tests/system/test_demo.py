@@ -77,7 +77,7 @@ def test_ctrl_c_ends_the_demo_in_order_and_its_folder_may_be_used_again(stage):
             try:
                 stage.until(lambda: not old.exists() and list(out.glob("captures/*/frames/*/*")))
                 begun.send_signal(signal.SIGINT)
-                answer, _ = begun.communicate(timeout=60)
+                answer, _ = begun.communicate(timeout=300)
             finally:
                 begun.kill()
         assert begun.returncode == 130

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from pyModbusTCP.server import DataHandler, ModbusServer
+from waiting import slowed
 
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps
@@ -96,21 +97,21 @@ def driver_for(config: LightBankConfig, lamps: int) -> LightBank:
     return ModbusLightBank(config, lamps)
 
 
-CONFIGS: dict[str, Callable[[str], LightBankConfig]] = {
-    "simulated TCP": lambda _link: ModbusTcpConfig(port=1, timeout_s=TIMEOUT_S),
-    "simulated RTU": lambda link: ModbusRtuConfig(
-        kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, unit=7, parity="N", stop_bits=2
+CONFIGS: dict[str, Callable[[str, float], LightBankConfig]] = {
+    "simulated TCP": lambda _link, timeout_s: ModbusTcpConfig(port=1, timeout_s=timeout_s),
+    "simulated RTU": lambda link, timeout_s: ModbusRtuConfig(
+        kind="modbus_rtu", port=link, timeout_s=timeout_s, unit=7, parity="N", stop_bits=2
     ),
-    "simulated RTU, other registers": lambda link: ModbusRtuConfig(
-        kind="modbus_rtu", port=link, timeout_s=TIMEOUT_S, registers=ELSEWHERE, parity="N"
+    "simulated RTU, other registers": lambda link, timeout_s: ModbusRtuConfig(
+        kind="modbus_rtu", port=link, timeout_s=timeout_s, registers=ELSEWHERE, parity="N"
     ),
-    "simulated TCP, coils alone": lambda _link: ModbusTcpConfig(
-        port=1, timeout_s=TIMEOUT_S, registers=COILS_ALONE, accept_unverified_blackout=True
+    "simulated TCP, coils alone": lambda _link, timeout_s: ModbusTcpConfig(
+        port=1, timeout_s=timeout_s, registers=COILS_ALONE, accept_unverified_blackout=True
     ),
-    "simulated DMX": lambda link: DmxConfig(
+    "simulated DMX": lambda link, timeout_s: DmxConfig(
         kind="dmx_enttec",
         port=link,
-        timeout_s=TIMEOUT_S,
+        timeout_s=timeout_s,
         first_channel=5,
         accept_unverified_blackout=True,
     ),
@@ -118,8 +119,12 @@ CONFIGS: dict[str, Callable[[str], LightBankConfig]] = {
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
-    """`bench(kind, *faults, lamps=…, connect=…, clock=…)`: a driver and its peer."""
+def bench(tmp_path: Path, slack: int) -> Iterator[Callable[..., Bench]]:
+    """`bench(kind, *faults, lamps=…, connect=…, clock=…)`: a driver and its peer.
+
+    The faults' `seconds` are those of an idle machine, as `TIMEOUT_S` is.
+    """
+    timeout_s = TIMEOUT_S * slack
     with ExitStack() as stack:
 
         def start(
@@ -131,11 +136,13 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
             paced: bool = False,
         ) -> Bench:
             if kind in CONFIGS:
-                one = _simulated(kind, faults, Lamps(lamps, clock), tmp_path, stack, paced)
+                config = CONFIGS[kind](str(tmp_path / "lights"), timeout_s)
+                struck = slowed(faults, slack)
+                one = _simulated(config, struck, Lamps(lamps, clock), tmp_path, stack, paced)
             elif kind == "pyModbusTCP":
-                one = _foreign(lamps, stack)
+                one = _foreign(lamps, stack, timeout_s)
             else:
-                one = _own(lamps, stack)
+                one = _own(lamps, stack, timeout_s)
             stack.callback(one.driver.close)
             if connect:
                 one.driver.connect()
@@ -145,16 +152,15 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
 
 
 def _simulated(
-    kind: str,
-    faults: tuple[Fault, ...],
+    config: LightBankConfig,
+    faults: Faults,
     lamps: Lamps,
     folder: Path,
     stack: ExitStack,
     paced: bool,
 ) -> Bench:
-    config = CONFIGS[kind](str(folder / "lights"))
     one = Bench(driver_for(config, lamps.count), lamps.power)
-    one.lamps, one.faults = lamps, Faults(faults)
+    one.lamps, one.faults = lamps, faults
     peer = light_bank(config, one, folder / "lights", ("127.0.0.1", 0), paced)
     place = peer.start()
     stack.callback(peer.stop)
@@ -200,17 +206,17 @@ class Foreign(DataHandler):  # type: ignore[misc]
         return self.Return(0)
 
 
-def _foreign(lamps: int, stack: ExitStack) -> Bench:
+def _foreign(lamps: int, stack: ExitStack, timeout_s: float) -> Bench:
     handler = Foreign(lamps)
     server = ModbusServer("127.0.0.1", 0, no_block=True, data_hdl=handler)
     server.start()
     stack.callback(server._service.server_close)
     stack.callback(server._service.shutdown)
     port = server._service.socket.getsockname()[1]
-    return Bench(driver_for(ModbusTcpConfig(port=port, timeout_s=TIMEOUT_S), lamps), handler.powers)
+    return Bench(driver_for(ModbusTcpConfig(port=port, timeout_s=timeout_s), lamps), handler.powers)
 
 
-def _own(lamps: int, stack: ExitStack) -> Bench:
+def _own(lamps: int, stack: ExitStack, timeout_s: float) -> Bench:
     """The hand-written peer that the service's tests use."""
     file = Path(__file__).resolve().parents[2] / "stage_service" / "conftest.py"
     spec = importlib.util.spec_from_file_location("service_peers", file)
@@ -225,7 +231,7 @@ def _own(lamps: int, stack: ExitStack) -> Bench:
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     stack.callback(server.server_close)
     stack.callback(server.shutdown)
-    config = ModbusTcpConfig(port=server.server_address[1], timeout_s=TIMEOUT_S)
+    config = ModbusTcpConfig(port=server.server_address[1], timeout_s=timeout_s)
 
     def powers() -> list[float]:
         return [world.levels[i] / 65535 if i in world.lit else 0.0 for i in range(lamps)]

@@ -10,7 +10,6 @@ import shutil
 import socket
 import subprocess
 import tempfile
-import time
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from simulators.peers.dmx_widget import DmxWidget
 from simulators.peers.lamps import Lamps
@@ -54,15 +54,6 @@ def free_ports(count):
     with ExitStack() as stack:
         listeners = [stack.enter_context(socket.create_server(("", 0))) for _ in range(count)]
         return [listener.getsockname()[1] for listener in listeners]
-
-
-def until(read):
-    """Poll for an answer that is not None."""
-    deadline = time.monotonic() + 30
-    while (value := read()) is None:
-        assert time.monotonic() < deadline, "it did not happen within 30 s"
-        time.sleep(0.05)
-    return value
 
 
 class Olad:
@@ -141,7 +132,7 @@ def test_olad_finds_the_widget_and_lights_its_lamps():
         assert json.loads(made)["ok"]
         levels = [(7 * lamp) % 256 for lamp in range(LAMPS)]
         assert olad.ask("set_dmx", u=1, d=",".join(map(str, levels))) == "ok"
-        until(lambda: olad.lamps.power()[-1] or None)
+        until(lambda: olad.lamps.power()[-1])
         np.testing.assert_allclose(olad.lamps.power(), np.array(levels) / 255)
         assert olad.ask("set_dmx", u=1, d=",".join("0" * LAMPS)) == "ok"
-        until(lambda: None if olad.lamps.power().any() else True)
+        until(lambda: not olad.lamps.power().any())

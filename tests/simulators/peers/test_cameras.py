@@ -194,7 +194,7 @@ def test_busy_while_the_frame_is_rendered(start):
     assert camera.ask(op="read") == {"ok": True, "status": "busy"}
     begun = time.monotonic()
     assert bench.lights.read_input_registers(1).registers == [1]
-    assert time.monotonic() - begun < 1
+    assert time.monotonic() - begun < 5  # of the 10 that the renderer waits
     gate.set()
     assert lit(camera.frame()) == pytest.approx(expected(0.5), rel=0.02)
 

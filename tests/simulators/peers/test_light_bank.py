@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
+from waiting import until
 
 from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps
@@ -129,9 +128,7 @@ def test_the_default_clock_is_real():
     assert lamps.watch(100)
     assert lamps.select(1)
     assert lamps.power()[0] == 1
-    deadline = time.monotonic() + 5
-    while lamps.power().any():
-        assert time.monotonic() < deadline
+    until(lambda: not lamps.power().any())
     assert lamps.status() == (1, 0)
 
 

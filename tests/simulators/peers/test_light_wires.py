@@ -29,7 +29,7 @@ def rtu(tmp_path):
     lamps = Lamps(5)
     config = ModbusRtuConfig(kind="modbus_rtu", port="x", baud=9600, unit=7)
     peer = ModbusRtuPeer(DisturbedUnit(ModbusUnit(lamps)), config, tmp_path / "l", paced=True)
-    with serial.Serial(None, timeout=0.5) as port:
+    with serial.Serial(None, timeout=10) as port:
         port.port = peer.start()
         port.open()
         yield lamps, port
@@ -63,7 +63,7 @@ def test_what_is_not_for_it_is_neither_answered_nor_carried_out(rtu, frame):
     port.write(frame)
     assert port.read(1) == b""
     assert not lamps.power().any()
-    port.timeout = 0.5
+    port.timeout = 10
     port.write(with_crc(SELECT_2))
     assert port.read(8) == with_crc(SELECT_2)
 
@@ -90,7 +90,7 @@ def widget(tmp_path):
     """A widget whose 5 dimmers begin at channel 3, and its port."""
     lamps = Lamps(5)
     peer = DmxWidget(lamps, 3, tmp_path / "w")
-    with serial.Serial(None, timeout=0.5) as port:
+    with serial.Serial(None, timeout=10) as port:
         port.port = peer.start()
         port.open()
         yield lamps, port

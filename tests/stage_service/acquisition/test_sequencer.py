@@ -45,7 +45,7 @@ def test_every_frame_shows_the_light_of_its_step(rig_file, world, tmp_path):
     assert run.run() == "completed"
     assert is_dark(world)
     assert world.heartbeats > 1
-    assert world.watchdog_ms == 500
+    assert world.watchdog_ms == 1000 * rig_file.devices.watchdog_s
     assert verify(tmp_path / "c") == []
     capture = Capture(tmp_path / "c")
     assert world.pulses == len(capture.steps)
@@ -135,7 +135,7 @@ def test_a_busy_camera_is_waited_for(rig_file, world, tmp_path):
         ({"dead_lamps": True}, "putting lamp 3 on: expected 1 lamps lit, received 0 lit"),
         ({"interlock": True}, "interlock open"),
         ({"estop": True}, "emergency stop pressed"),
-        ({"late": ["PULSE 2000"]}, "firing the cameras: expected a line within 0.3 s"),
+        ({"late": ["PULSE 2000"]}, "firing the cameras: expected a line within"),
     ],
 )
 def test_trouble_fails_the_capture_dark_and_named(rig_file, world, tmp_path, fault, text):

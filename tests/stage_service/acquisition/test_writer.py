@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import until
 
 from reconstruction.capture.folder import Step
 from reconstruction.capture.writer import CaptureWriter
@@ -140,9 +141,7 @@ def test_what_writing_raises_reaches_the_sequencer(folder, monkeypatch):
     writer.put(shot(STEPS[0]))
     monkeypatch.setattr(folder, "store_frame", full)
     writer.put(shot(STEPS[1]))
-    deadline = time.monotonic() + 5
-    while writer._error is None and time.monotonic() < deadline:
-        time.sleep(0.001)
+    until(lambda: writer._error is not None)
     with pytest.raises(OSError, match="No space left"):
         writer.put(shot(STEPS[2]))
     with pytest.raises(OSError, match="No space left"):

@@ -6,13 +6,13 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from waiting import until
 
 from stage_service.acquisition.safety import blackout
 from stage_service.config import RigFile, load_rig_file
@@ -42,12 +42,16 @@ width = 12
 height = 12
 [devices.lights]
 port = 15020
+timeout_s = 30.0
 [devices.trigger]
 port = "trigger"
+timeout_s = 30.0
 [devices.projectors]
 port = "projectors"
+timeout_s = 30.0
 [devices.cameras]
 port = 15021
+timeout_s = 30.0
 """
 
 
@@ -66,14 +70,11 @@ def simulators(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigFile]:
             env=os.environ,
         )
     devices = folder / "devices.toml"
-    deadline = time.monotonic() + 60
-    while not devices.exists():
-        assert process.poll() is None, (folder / "log").read_text()
-        assert time.monotonic() < deadline, (folder / "log").read_text()
-        time.sleep(0.05)
+    until(lambda: devices.exists() or process.poll() is not None, 120.0)
+    assert devices.exists(), (folder / "log").read_text()
     yield load_rig_file(folder / "rig.toml", devices)
     process.terminate()
-    process.wait(20)
+    process.wait(60)
 
 
 @pytest.fixture(params=["the tests' peers", "simulators"])

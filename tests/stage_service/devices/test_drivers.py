@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from waiting import until
 
 from stage_service.config import RigFile, SerialConfig
 from stage_service.devices.cameras.fan_out import FanOut
@@ -26,14 +27,6 @@ from stage_service.devices.projectors.serial_controller import SerialProjectorCo
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
 NEVER = threading.Event()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Poll for what another thread brings about."""
-    deadline = time.monotonic() + 5
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen within 5 s"
-        time.sleep(0.002)
 
 
 @pytest.fixture
@@ -78,13 +71,13 @@ def test_light_bank_of_another_size_is_refused(rig_file):
     bank.close()
 
 
-def test_a_mute_light_bank_misses_its_deadline_and_comes_back(stage, world):
+def test_a_mute_light_bank_misses_its_deadline_and_comes_back(stage, rig_file, world, slack):
     with world.lock:  # the peer cannot answer meanwhile
         start = time.monotonic()
         with pytest.raises(DeviceTimeout) as error:
             stage.lights.select(3)
-        assert time.monotonic() - start < 1.0
-    assert error.value.deadline_s == 0.3
+        assert time.monotonic() - start < 1.0 * slack
+    assert error.value.deadline_s == rig_file.devices.lights.timeout_s
     assert "putting lamp 3 on" in str(error.value)
     until(lambda: world.lit == {3})  # the peer executes the command late, and answers nobody
     stage.lights.select(4)
@@ -127,7 +120,7 @@ def test_trigger_box(stage, world):
 def test_a_late_serial_reply_never_answers_the_next_request(stage, world):
     stage.trigger.pulse(0.001)
     world.late = ["COUNT?"]
-    with pytest.raises(DeviceTimeout, match=r"reading the pulse count: .*within 0.3 s"):
+    with pytest.raises(DeviceTimeout, match=r"reading the pulse count: .*within"):
         stage.trigger.count()
     status = stage.trigger.status()
     assert not status.estop_pressed
@@ -216,7 +209,7 @@ def test_cameras_of_another_rig_are_refused(rig_file, stage):
 
 def test_mute_and_busy_cameras(stage, world):
     world.mute = {"cam_0"}
-    with pytest.raises(DeviceTimeout, match=r"cam_0.*within 0.3 s"):
+    with pytest.raises(DeviceTimeout, match=r"cam_0.*within"):
         stage.cameras[0].read(NEVER)
     world.busy = {"cam_1": 10**9}
     cancel = threading.Event()
@@ -225,12 +218,12 @@ def test_mute_and_busy_cameras(stage, world):
         stage.cameras[1].read(cancel)
 
 
-def test_all_cameras_at_once_and_every_failure_is_named(stage, world):
+def test_all_cameras_at_once_and_every_failure_is_named(stage, world, slack):
     cameras = FanOut(stage.cameras)
     assert cameras(lambda c: c.name) == {n: n for n in ("cam_0", "cam_1", "cam_2")}
     world.mute = {"cam_0", "cam_2"}
     start = time.monotonic()
     with pytest.raises(ExceptionGroup, match=r"cam_0.*cam_2|cam_2.*cam_0"):
         cameras(lambda c: c.read(NEVER))
-    assert time.monotonic() - start < 0.55  # side by side: one deadline, not two
+    assert time.monotonic() - start < 0.55 * slack  # side by side: one deadline, not two
     cameras.close()

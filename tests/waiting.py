@@ -1,0 +1,46 @@
+"""The clock of the tests: how long a device may take on a machine that does other things, too."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from simulators.peers.faults import Fault, Faults
+
+T = TypeVar("T")
+LONGEST_S = 60.0
+
+
+def machine_slack() -> int:
+    """How many times longer than on an idle machine a deadline has to be: 1 where it is idle.
+
+    The number of runnable threads for each core, now or over the last minute.
+    HAIRSTAGE_TEST_SLACK, where it is set, says it instead.
+    """
+    if said := os.environ.get("HAIRSTAGE_TEST_SLACK"):
+        return int(said)
+    average, _, _, threads, _ = Path("/proc/loadavg").read_text().split()
+    running = max(float(average), float(threads.split("/")[0]))
+    return max(1, math.ceil(running / len(os.sched_getaffinity(0))))
+
+
+def slowed(faults: tuple[Fault, ...], slack: int) -> Faults:
+    """Faults whose lateness has grown as the deadlines have."""
+    return Faults(tuple(replace(f, seconds=min(f.seconds * slack, 60.0)) for f in faults))
+
+
+def until(what: Callable[[], T], seconds: float = LONGEST_S) -> T:
+    """Poll for what another thread or process brings about; what `what` returns once it is true.
+
+    `seconds` only where the deadline is what is tested, and then times `slack`.
+    """
+    deadline = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < deadline, f"it did not happen within {seconds:g} s"
+        time.sleep(0.002)
+    return found
