@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats, Ints
@@ -86,29 +84,6 @@ def observe(capture: Capture, camera: str, lights: Sequence[str], pixels: Ints) 
         radiance,
         valid,
     )
-
-
-def model_mask(model: Path, camera: str, kind: str, capture: Capture) -> Bools:
-    """The mask `(H, W)` of `kind` "hair" or "skin" that reconstruction left in the model folder.
-
-    A hair mask that is absent falls back to the user's in the capture, an absent skin mask to an
-    empty one. Raises `CaptureError` naming the file where there is no hair mask at all.
-    """
-    path = model / "masks" / f"{camera}_{kind}.png"
-    size = capture.rig.camera(camera)
-    shape = (size.height, size.width)
-    if path.is_file():
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None or image.shape != shape:
-            found = None if image is None else image.shape
-            raise CaptureError(f"{path}: expected a {shape} grey PNG, got {found}")
-        return np.asarray(image >= 128)
-    if kind == "skin":
-        return np.zeros(shape, bool)
-    user = capture.mask(camera)
-    if user is None:
-        raise CaptureError(f"{path} is missing: run 'hairstage reconstruct' into {model} first")
-    return user
 
 
 def chosen(mask: Bools, most: int, rng: np.random.Generator) -> Ints:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -19,6 +18,7 @@ from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.head.scalp_map import ScalpMap, sphere_center
+from reconstruction.model import Model
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,11 @@ class HairMaps:
         layers, columns, rows, _ = self.sigma_a.shape
         return layers, columns, rows
 
+    @property
+    def uniform(self) -> bool:
+        """Whether they are of one cell and turn no fibre: one material for all hair."""
+        return self.shape == (1, 1, 1) and not self.rotation.any()
+
     def mean(self) -> HairAppearance:
         """One colour for all of it: the mean absorption of the cells."""
         sigma_a = self.sigma_a.reshape(-1, 3)
@@ -75,30 +80,23 @@ class HairMaps:
             self, sigma_a=_resized(self.sigma_a, shape), rotation=_resized(self.rotation, shape)
         )
 
-    def save(self, path: Path, root_uv: ArrayLike) -> None:
-        """Write the maps and the strands' `root_uv (S, 2)` to an `.npz`, whole or not at all."""
-        scalars = [self.beta_m, self.beta_n, self.eta, self.tilt_deg]
+    def save(self, model: Model, root_uv: ArrayLike) -> None:
+        """Write the maps and the strands' `root_uv (S, 2)` as the model's `hair_maps.npz`."""
         arrays = {
             "sigma_a": self.sigma_a.astype(np.float32),
             "rotation": self.rotation.astype(np.float32),
-            "scalars": np.array(scalars),
+            "scalars": np.array([self.beta_m, self.beta_n, self.eta, self.tilt_deg]),
             "root_uv": np.asarray(root_uv, np.float32),
         }
-        part = path.with_suffix(".part.npz")
-        np.savez_compressed(part, **arrays)  # type: ignore[arg-type]
-        part.replace(path)
+        model.write_arrays("hair_maps.npz", arrays)
 
     @classmethod
-    def load(cls, path: Path) -> tuple[HairMaps, Array]:
-        """The maps of a file that `save` wrote, and `root_uv`."""
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{path} is missing: run a job of the pipeline 'appearance' on this model first"
-            )
-        with np.load(path) as data:
-            scalars = [float(x) for x in data["scalars"]]
-            maps = cls(data["sigma_a"], data["rotation"], *scalars)
-            return maps, np.asarray(data["root_uv"], float)
+    def load(cls, model: Model) -> tuple[HairMaps, Array]:
+        """The maps that `save` wrote, and `root_uv (S, 2)`; `ModelError` where there are none."""
+        data = model.arrays("hair_maps.npz")
+        scalars = [float(x) for x in data["scalars"]]
+        maps = cls(data["sigma_a"], data["rotation"], *scalars)
+        return maps, np.asarray(data["root_uv"], float)
 
 
 @dataclass(frozen=True, eq=False)

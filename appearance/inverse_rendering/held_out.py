@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import Exposure, mean_scores, relative_error, scores
-from appearance.observations import HeldOut, Observed, model_mask, observe
+from appearance.observations import HeldOut, Observed, observe
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.capture.folder import Capture
+from reconstruction.model import Model
 
 MAGNIFIED = 4.0
 """Factor on the differences of displayed values in error maps."""
 
 
-def held_out_frames(
-    capture: Capture, model: Path, held_out: HeldOut, most: int, seed: int
-) -> list[Observed]:
+def held_out_frames(capture: Capture, model: Model, held_out: HeldOut, most: int) -> list[Observed]:
     """Held-out cameras under held-out lights; where one of them is missing, under all others."""
     cameras = held_out.cameras or tuple(c.name for c in capture.rig.cameras)
     lights = held_out.lights or tuple(capture.olat_lights())
@@ -31,25 +30,32 @@ def held_out_frames(
     for name in cameras[:2]:
         there = [x for x in lights if capture.has_light(x, name)]
         some = there[:: max(1, -(-len(there) // max(1, most // min(2, len(cameras)))))]
-        pixels = np.flatnonzero(model_mask(model, name, "hair", capture))
+        pixels = np.flatnonzero(model.mask(name, "hair", capture))
         if len(pixels) and some:
             out.append(observe(capture, name, some, pixels))
     return out
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """Paths a pixel, vertices a path, and the seed."""
+
+    spp: int
+    max_depth: int
+    seed: int = 0
+
+
 def judge(
-    picture: Path,
+    model: Model,
     frames: Sequence[Observed],
     scenes: Mapping[str, HairScene],
     exposure: Exposure,
-    *,
-    spp: int,
-    max_depth: int,
-    seed: int = 0,
+    sampling: Sampling,
 ) -> dict[str, dict[str, float]]:
     """Mean `metrics.scores` and "relative_error" of each of `scenes` over lit `frames`; {} of none.
 
-    Writes a PNG: each frame as captured, as each scene renders it, and the last one's error map.
+    Writes the model's `inverse_rendering.png`: each frame as captured, as each scene renders it,
+    and the last one's error map.
     """
     found: dict[str, list[dict[str, float]]] = {name: [] for name in scenes}
     rows: list[Row] = []
@@ -59,10 +65,10 @@ def judge(
                 scene,
                 o.camera,
                 o.lights,
-                spp=spp,
-                max_depth=max_depth,
+                spp=sampling.spp,
+                max_depth=sampling.max_depth,
                 pixels=o.pixels,
-                seed=(seed << 8) + 91 + k,
+                seed=(sampling.seed << 8) + 91 + k,
             )
             for name, scene in scenes.items()
         }
@@ -85,7 +91,8 @@ def judge(
             rows.append((f"{o.camera.name}, {light.name}", shown, captions))
     if not rows:
         return {}
-    comparison_picture(picture, rows, ["captured", *scenes, "error"])
+    with model.writing("inverse_rendering.png") as part:
+        comparison_picture(part, rows, ["captured", *scenes, "error"])
     return {name: mean_scores(images) for name, images in found.items()}
 
 

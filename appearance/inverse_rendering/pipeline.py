@@ -1,206 +1,169 @@
-"""Stage 1 on a capture: from the model folder's strands and masks to maps and lamps."""
+"""Inverse rendering of a capture: from a model's strands and masks to maps and lights."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.held_out import held_out_frames, judge
+from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.held_out import Sampling, held_out_frames, judge
 from appearance.inverse_rendering.loop import Outcome, Stage1Options, run
-from appearance.inverse_rendering.problem import Effort, Problem
+from appearance.inverse_rendering.problem import Problem
 from appearance.inverse_rendering.unknowns import Lamps
 from appearance.metrics.scores import scores_unavailable
-from appearance.model.fitted_appearance import FittedAppearance
-from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
+from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.bounces import bounce_limit
 from appearance.scene.hair_scene import build_scene
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture
-from reconstruction.files.strands import read_strands
+from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
-from reconstruction.report.report import Progress, Report, Series, Stage, silent
+from reconstruction.model import Model, ModelError
+from reconstruction.options import options
+from reconstruction.report.report import Progress, Series, Stage, silent
 
-MAPS, LAMPS, PICTURE = "hair_maps.npz", "lamps.json", "stage1.png"
+Count = Annotated[int, Field(gt=0)]
+
+JUDGED_IMAGES = 6
+"""Held-out images that are judged, at most."""
+MOST_DEPTH = 16
 
 
-@dataclass(frozen=True)
-class Stage1Request:
+@options
+class InverseRenderingRequest:
     """What a job may ask for.
 
-    `hair_pixels` a camera are fitted, one colour before the volume. `fit` are fields of
-    `Stage1Options`, of which `effort` holds fields of `Effort`. Held-out images are
-    judged on at most `judged_images`, with `judged_spp` paths a pixel.
+    `hair_pixels` a camera are fitted, one colour before the volume. `max_depth` is the number of
+    vertices a path may have; None measures what the hair needs. Held-out images are judged with
+    `judged_spp` paths a pixel. `fit` is how the fit is run.
     """
 
-    hair_pixels: int = 4000
-    judged_images: int = 6
-    judged_spp: int = 48
-    fit: dict[str, Any] = field(default_factory=dict)
-
-    def options(self, max_depth: int) -> Stage1Options:
-        """The fit's own options; `TypeError` for fields that are unknown."""
-        given = dict(self.fit)
-        effort = Effort(**{"max_depth": max_depth, **given.pop("effort", {})})
-        shape = tuple(given.pop("shape", Stage1Options.shape))
-        return Stage1Options(effort=effort, shape=shape, **given)
+    hair_pixels: Count = 4000
+    judged_spp: Count = 48
+    max_depth: Count | None = None
+    fit: Stage1Options = Field(default_factory=Stage1Options)
 
 
-def fit_stage1(
+def inverse_rendering(
     capture: Capture,
-    model: Path,
+    model: Model,
     *,
     held_out: HeldOut | None = None,
-    request: Stage1Request | None = None,
+    request: InverseRenderingRequest | None = None,
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Fit maps and lamps, from the `appearance.json` of Sun's fit, and judge them.
+    """Fit maps and lights, from the `appearance.json` of Sun's fit, and judge them.
 
-    Reads `strands.npz`, `masks/` and `appearance.json` of the folder `model`. Writes
-    `hair_maps.npz`, `lamps.json`, `stage1.png` where images are held out (captured, rendered and
-    error maps) and the stage "stage1" of `report.json`; a fit that was killed goes on from its
-    checkpoint, which stays in the folder until the fit is done. Returns `{"ended", "steps",
-    "error", "start_error", "held_out": {"start" | "stage1": {"psnr", "ssim", "relative_error"}}}`,
-    the latter where images are held out. Raises `CaptureError`,
-    `FileNotFoundError` or `ValueError` naming what is missing.
+    The head is the model's. Writes `hair_maps.npz`, `lights.json`, `inverse_rendering.png` where
+    images are held out (captured, rendered and error maps) and the stage "inverse_rendering" of
+    the report; a fit that was killed goes on from its checkpoint, which stays in the model until
+    the fit is done. Returns `{"ended", "steps", "error", "start_error", "held_out": {"start" |
+    "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the latter where images are held
+    out. Raises `CaptureError` or `ModelError` naming what is missing.
     """
-    held_out, request = held_out or HeldOut(), request or Stage1Request()
+    held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     held_out.check(capture)
-    fitted = FittedAppearance.load(model)
-    strands = read_strands(model / "strands.npz")
-    report = Report.load(model / "report.json")
-    with report.stage("stage1") as stage:
+    fitted, strands, head = FittedAppearance.load(model), model.strands(), model.head(capture)
+    report = model.report()
+    with report.stage("inverse_rendering") as stage:
         progress("reading hair pixels", 0.0)
-        views = _views(capture, model, held_out, request, seed)
-        scene = build_scene(strands, capture.head, hair=fitted.hair, skin=fitted.skin)
-        mapped = MappedStrands.of(scene, strands, _root_uv(model, strands, capture))
-        depth = bounce_limit(scene, views[0].camera, 0.01, pixels=views[0].pixels, seed=seed).depth
-        options = request.options(min(depth, 16))
+        views = _views(capture, model, held_out, request.hair_pixels, seed)
+        scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
+        mapped = MappedStrands.of(scene, strands, root_uv(model, strands, head))
+        depth = request.max_depth
+        if depth is None:
+            look = views[0]
+            found = bounce_limit(scene, look.camera, 0.01, pixels=look.pixels, seed=seed)
+            depth = min(found.depth, MOST_DEPTH)
+        options = replace(request.fit, effort=replace(request.fit.effort, max_depth=depth))
         problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
         start = HairMaps.of(fitted.hair)
-        first = replace(options, row="original")
-        outcome = _run(problem, start, None, first, model, _part(progress, 0.05, 0.3), seed, stage)
-        outcome = _run(
-            problem,
-            outcome.maps,
-            outcome.lamps,
-            options,
-            model,
-            _part(progress, 0.3, 0.9),
-            seed,
-            stage,
-        )
-        outcome.maps.save(model / MAPS, mapped.root_uv)
-        _write_lamps(model / LAMPS, outcome.lamps, problem)
+        fit = _Fit(problem, model, stage, progress, seed)
+        one_colour = fit.run(replace(options, row="original"), start, None, (0.05, 0.3))
+        outcome = fit.run(options, one_colour.maps, one_colour.lamps, (0.3, 0.9))
+        outcome.maps.save(model, mapped.root_uv)
+        save_lights(model, outcome.lamps, problem.lights)
         progress("judging held-out images", 0.92)
-        result = {
+        result: dict[str, Any] = {
             "ended": outcome.ended,
             "steps": outcome.steps,
             "start_error": outcome.start_error,
             "error": outcome.error,
         }
-        frames = held_out_frames(capture, model, held_out, request.judged_images, seed)
+        frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
-            result["held_out"] = judge(
-                model / PICTURE,
-                frames,
-                {
-                    name: mapped.painted(maps).with_skin(fitted.skin)
-                    for name, maps in (("start", start), ("stage1", outcome.maps))
-                },
-                fitted.exposure,
-                spp=request.judged_spp,
-                max_depth=options.effort.max_depth,
-                seed=seed,
-            )
+            scenes = {
+                name: mapped.painted(maps).with_skin(fitted.skin)
+                for name, maps in (("start", start), ("inverse_rendering", outcome.maps))
+            }
+            judging = Sampling(request.judged_spp, depth, seed)
+            result["held_out"] = judge(model, frames, scenes, fitted.exposure, judging)
             result |= scores_unavailable()
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
-    report.save(model / "report.json")
-    for row in ("original", options.row):
-        _checkpoint(model, row).unlink(missing_ok=True)
-    progress("stage 1 done", 1.0)
+    model.write_report(report)
+    for variant in ("original", options.row):
+        model.checkpoint(variant).unlink(missing_ok=True)
+    progress("inverse rendering done", 1.0)
     return result
 
 
-def _run(
-    problem: Problem,
-    maps: HairMaps,
-    lamps: Lamps | None,
-    options: Stage1Options,
-    model: Path,
-    progress: Progress,
-    seed: int,
-    stage: Stage,
-) -> Outcome:
-    outcome = run(
-        problem,
-        maps,
-        lamps,
-        options=options,
-        checkpoint=_checkpoint(model, options.row),
-        progress=progress,
-        seed=seed,
-    )
-    series = Series(f"stage 1, {options.row}", "weighted mean squared difference, noise taken off")
-    series.points = [(seconds, error) for seconds, _, error in outcome.history]
-    stage.series.append(series)
-    if outcome.steps < options.steps and outcome.ended != "converged":
-        stage.warn(f"{options.row}: {outcome.ended}")
-    return outcome
+def root_uv(model: Model, strands: Strands, head: Mesh | None) -> Array:
+    """The roots' places on the scalp's map `(S, 2)`, as reconstruction left them where it did."""
+    known = model.root_uv(strands)
+    return scalp_coordinates(strands, head) if known is None else known
 
 
-def _root_uv(model: Path, strands: Strands, capture: Capture) -> Array:
-    """The roots' places on the scalp, of `scalp_map.npz` where reconstruction left one."""
-    file = model / "scalp_map.npz"
-    if file.is_file():
-        with np.load(file) as data:
-            roots = np.asarray(data["roots"], float)
-        if len(roots) == len(strands):
-            return np.clip(roots, 0, 1)
-    return scalp_coordinates(strands, capture.head)
+@dataclass(frozen=True)
+class _Fit:
+    """What the fit of one colour and that of the maps share."""
 
+    problem: Problem
+    model: Model
+    stage: Stage
+    progress: Progress
+    seed: int
 
-def _checkpoint(model: Path, row: str) -> Path:
-    return model / f"stage1-{row}.checkpoint.npz"
-
-
-def _part(progress: Progress, begin: float, end: float) -> Progress:
-    return lambda what, share: progress(what, begin + (end - begin) * share)
+    def run(
+        self, options: Stage1Options, maps: HairMaps, lamps: Lamps | None, part: tuple[float, float]
+    ) -> Outcome:
+        """Fit from `maps` and `lamps`; `part` is what it is of the progress."""
+        begin, end = part
+        outcome = run(
+            self.problem,
+            maps,
+            lamps,
+            options=options,
+            checkpoint=self.model.checkpoint(options.row),
+            progress=lambda what, share: self.progress(what, begin + (end - begin) * share),
+            seed=self.seed,
+        )
+        series = Series(
+            f"inverse rendering, {options.row}",
+            "weighted mean squared difference, noise taken off",
+        )
+        series.points = [(seconds, error) for seconds, _, error in outcome.history]
+        self.stage.series.append(series)
+        if outcome.steps < options.steps and outcome.ended != "converged":
+            self.stage.warn(f"{options.row}: {outcome.ended}")
+        return outcome
 
 
 def _views(
-    capture: Capture, model: Path, held_out: HeldOut, request: Stage1Request, seed: int
+    capture: Capture, model: Model, held_out: HeldOut, hair_pixels: int, seed: int
 ) -> list[Observed]:
     rng = np.random.default_rng(seed)
     lights = held_out.training_lights(capture)
     views = []
     for name in held_out.training_cameras(capture):
-        pixels = chosen(model_mask(model, name, "hair", capture), request.hair_pixels, rng)
+        pixels = chosen(model.mask(name, "hair", capture), hair_pixels, rng)
         if len(pixels):
             views.append(observe(capture, name, lights, pixels))
     if not views:
-        raise ValueError(f"{model}: the hair masks of the training cameras are all empty")
+        raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
     return views
-
-
-def _write_lamps(path: Path, lamps: Lamps, problem: Problem) -> None:
-    """The lamps as found: position and intensity, and how they differ from their calibration."""
-    found = lamps.of(problem.lights)
-    rows = [
-        {
-            **light.to_dict(),
-            "moved_m": lamps.position[i].tolist(),
-            "turned_rad": lamps.turn[i].tolist(),
-            "gain": float(lamps.gain[i]),
-            "profile_scale": float(lamps.profile[i]),
-        }
-        for i, light in enumerate(found)
-    ]
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
-    part.replace(path)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from appearance.metrics.pictures import comparison_picture
 from appearance.metrics.scores import (
+    Exposure,
     mean_scores,
     psnr,
     relative_error,
@@ -18,36 +19,37 @@ from appearance.metrics.scores import (
     scores_unavailable,
     ssim,
 )
-from appearance.model.fitted_appearance import FittedAppearance
-from appearance.model.relight import relight_model
-from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
+from appearance.model.fitted_model import FittedModel
+from appearance.model.relight import relight
+from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.smoothed import olat_smoothed
 from appearance.scene.hair_appearance import DiffuseHair
-from appearance.scene.hair_scene import HairScene, build_scene
+from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
 from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture
-from reconstruction.files.strands import read_strands
 from reconstruction.geometry.lights import Light
-from reconstruction.model import Model
-from reconstruction.report.report import Progress, Report, Stage, silent
+from reconstruction.model import Model, ModelError
+from reconstruction.options import options
+from reconstruction.report.report import Progress, Stage, silent
 
 METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
 COLUMNS = ("captured", "ours", "diffuse", "three_nearest")
+MAX_DEPTH = 16
+Count = Annotated[int, Field(gt=0)]
 
 
-@dataclass(frozen=True)
+@options
 class AssessOptions:
     """How much is compared: cameras and lights are spread evenly over what is there."""
 
-    cameras: int = 2
-    lights: int = 5
-    spp: int = 49
-    max_depth: int = 16
-    baseline_pixels: int = 100
-    baseline_lights: int = 48
-    relit_size: int = 320
-    relit_spp: int = 36
+    cameras: Count = 2
+    lights: Count = 5
+    spp: Count = 49
+    baseline_pixels: Count = 100
+    baseline_lights: Count = 48
+    relit_size: Count = 320
+    relit_spp: Count = 36
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,141 +64,143 @@ class _Compared:
 
 def assess(
     capture: Capture,
-    model: Path,
+    model: Model,
     *,
     held_out: HeldOut,
-    environment: str | Path | None = None,
+    environment: str = "studio",
     options: AssessOptions | None = None,
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Compare a fitted model with the frames it was not fitted to.
+    """Compare a fitted model with the frames it was not fitted to, and relight it.
 
-    Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}}, "held_out_camera":
-    …}` with the methods "ours", "mean_colour" (one colour: the mean over training frames and hair
-    pixels), "diffuse" (Lambertian fibres on our strands whose albedo reproduces that mean) and
-    "three_nearest" (the camera's own captured frames under the three nearest other training
-    lights, interpolated: a control that needs the camera's frames, also where that camera is held
-    out). Means over images, each over the captured hair mask. A group with nothing held out is left
-    out. "lpips" is a score like the others where its weights are given
-    (`appearance.metrics.lpips`), and a reason beside the groups where not.
+    The model is judged as `FittedModel` renders it: with hair maps and lights as found where there
+    are any. Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}},
+    "held_out_camera": …}` with the methods "ours", "mean_colour" (one colour: the mean over
+    training frames and hair pixels), "diffuse" (Lambertian fibres on our strands whose albedo
+    reproduces that mean) and "three_nearest" (the camera's own captured frames under the three
+    nearest other training lights, interpolated: a baseline that needs the camera's frames, also
+    where that camera is held out). Means over images, each over the captured hair mask. A group
+    with nothing held out is left out. "lpips" is a score like the others where its weights are
+    given (`appearance.metrics.lpips`), and a reason beside the groups where not.
 
-    Writes `comparison.png`, `relit.png` and `relit.exr` (see `relight_model` for `environment`)
-    into the folder `model`, and the stage "images" into its report.
+    Writes `comparison.png` where there is something to compare, `relit.png` and `relit.exr` (see
+    `relight`) and the stage "images" of the report.
     """
     options = options or AssessOptions()
     held_out.check(capture)
-    fitted = FittedAppearance.load(model)
-    strands = read_strands(model / "strands.npz")
-    report = Report.load(model / "report.json")
+    fitted = FittedModel.load(model, capture)
+    result: dict[str, Any] = {}
+    report = model.report()
     with report.stage("images") as stage:
-        head = Model(model).head(capture)
-        scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
-        progress("fitting the baselines", 0.0)
-        training = _training(capture, model, held_out, options, seed)
-        colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
-        albedo = fit_diffuse(scene, training, seed=seed)
-        diffuse = scene.with_hair(DiffuseHair(albedo))
-        groups: dict[str, list[_Compared]] = {}
-        for group, views in _views(capture, held_out, options).items():
-            groups[group] = []
-            for i, (camera, lights) in enumerate(views):
-                progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
-                mask = model_mask(model, camera, "hair", capture)
-                groups[group] += _compared(
-                    capture, camera, lights, held_out, (scene, diffuse), colour, mask, options, seed
-                )
-        result: dict[str, Any] = {
-            group: {name: _scores(images, name, fitted) for name in METHODS}
-            for group, images in groups.items()
-        }
-        judge(result, stage)
-        stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
+        if held_out.cameras or held_out.lights:
+            comparison = _Comparison(capture, model, fitted, held_out, options, seed)
+            result = comparison.run(stage, progress)
+        else:
+            stage.warn("no camera and no light is held out: nothing is compared")
         progress("relighting", 0.8)
-        comparison_picture(model / "comparison.png", _rows(groups, fitted), COLUMNS)
-        relight_model(
-            model,
-            head,
-            environment=environment,
-            size=options.relit_size,
-            spp=options.relit_spp,
-            seed=seed,
-        )
-    report.save(model / "report.json")
+        size, spp = options.relit_size, options.relit_spp
+        relight(fitted, model, environment, size=size, spp=spp, seed=seed)
+    model.write_report(report)
     progress("images compared", 1.0)
     return {**result, **scores_unavailable()}
 
 
-def _training(
-    capture: Capture, model: Path, held_out: HeldOut, options: AssessOptions, seed: int
-) -> list[Observed]:
-    """Hair pixels of the training cameras under some of the training lights."""
-    rng = np.random.default_rng(seed)
-    lights = _spread(held_out.training_lights(capture), options.baseline_lights)
-    out = []
-    for camera in held_out.training_cameras(capture):
-        pixels = chosen(model_mask(model, camera, "hair", capture), options.baseline_pixels, rng)
-        if len(pixels):
-            out.append(observe(capture, camera, lights, pixels))
-    if not out:
-        raise ValueError(f"{model}: the hair masks of the training cameras are all empty")
-    return out
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """What is compared with what."""
 
+    capture: Capture
+    model: Model
+    fitted: FittedModel
+    held_out: HeldOut
+    options: AssessOptions
+    seed: int
 
-def _views(
-    capture: Capture, held_out: HeldOut, options: AssessOptions
-) -> dict[str, list[tuple[str, list[str]]]]:
-    """Which cameras to compare under which lights, by group."""
-    new = _spread(list(held_out.lights), options.lights)
-    training = held_out.training_lights(capture)
-    views: dict[str, list[tuple[str, list[str]]]] = {}
-    if new:
-        cameras = _spread(held_out.training_cameras(capture), options.cameras)
-        views["held_out_lights"] = [(camera, new) for camera in cameras]
-    if held_out.cameras:
-        both = _spread(training, max(options.lights - len(new) // 2, 1)) + _spread(
-            new, len(new) // 2
-        )
-        views["held_out_camera"] = [
-            (camera, both) for camera in _spread(list(held_out.cameras), options.cameras)
-        ]
-    return views
-
-
-def _compared(
-    capture: Capture,
-    camera: str,
-    names: Sequence[str],
-    held_out: HeldOut,
-    scenes: tuple[HairScene, HairScene],
-    colour: AnyFloats,
-    mask: Bools,
-    options: AssessOptions,
-    seed: int,
-) -> list[_Compared]:
-    """The frames of one camera under the lights `names`, by every method."""
-    names = [n for n in names if capture.has_light(n, camera)]
-    if not names or not mask.any():
-        return []
-    lights = [capture.rig.light(n) for n in names]
-    device = capture.rig.camera(camera)
-    ours, diffuse = (
-        olat_smoothed(s, device, lights, spp=options.spp, max_depth=options.max_depth, seed=seed)
-        for s in scenes
-    )
-    out = []
-    for i, name in enumerate(names):
-        captured = capture.light(name, camera)[0]
-        near = three_nearest(capture, camera, capture.rig.light(name), held_out)
-        frames = {
-            "captured": captured,
-            "ours": ours[i],
-            "mean_colour": np.broadcast_to(colour, captured.shape),
-            "diffuse": diffuse[i],
-            "three_nearest": near,
+    def run(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """The scores by group and method; writes `comparison.png`."""
+        scene, exposure = self.fitted.scene(), self.fitted.appearance.exposure
+        progress("fitting the baselines", 0.0)
+        training = self._training()
+        colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
+        albedo = fit_diffuse(scene, training, seed=self.seed)
+        scenes = {"ours": scene, "diffuse": scene.with_hair(DiffuseHair(albedo))}
+        groups: dict[str, list[_Compared]] = {}
+        for group, views in self._views().items():
+            groups[group] = []
+            for i, (camera, lights) in enumerate(views):
+                progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
+                groups[group] += self._compared(camera, lights, scenes, colour)
+        result: dict[str, Any] = {
+            group: {name: _scores(images, name, exposure) for name in METHODS}
+            for group, images in groups.items()
         }
-        out.append(_Compared(camera, name, frames, mask))
-    return out
+        judge(result, stage)
+        stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
+        with self.model.writing("comparison.png") as part:
+            comparison_picture(part, _rows(groups, exposure), COLUMNS)
+        return result
+
+    def _training(self) -> list[Observed]:
+        """Hair pixels of the training cameras under some of the training lights."""
+        rng = np.random.default_rng(self.seed)
+        names = _spread(self.held_out.training_lights(self.capture), self.options.baseline_lights)
+        out = []
+        for camera in self.held_out.training_cameras(self.capture):
+            mask = self.model.mask(camera, "hair", self.capture)
+            pixels = chosen(mask, self.options.baseline_pixels, rng)
+            if len(pixels):
+                seen = observe(self.capture, camera, names, pixels)
+                out.append(replace(seen, lights=tuple(self.fitted.lights(names))))
+        if not out:
+            raise ModelError(f"{self.model}: the hair masks of the training cameras are all empty")
+        return out
+
+    def _views(self) -> dict[str, list[tuple[str, list[str]]]]:
+        """Which cameras to compare under which lights, by group."""
+        held_out, options = self.held_out, self.options
+        new = _spread(list(held_out.lights), options.lights)
+        training = held_out.training_lights(self.capture)
+        views: dict[str, list[tuple[str, list[str]]]] = {}
+        if new:
+            cameras = _spread(held_out.training_cameras(self.capture), options.cameras)
+            views["held_out_lights"] = [(camera, new) for camera in cameras]
+        if held_out.cameras:
+            both = _spread(training, max(options.lights - len(new) // 2, 1)) + _spread(
+                new, len(new) // 2
+            )
+            views["held_out_camera"] = [
+                (camera, both) for camera in _spread(list(held_out.cameras), options.cameras)
+            ]
+        return views
+
+    def _compared(
+        self, camera: str, names: Sequence[str], scenes: dict[str, HairScene], colour: AnyFloats
+    ) -> list[_Compared]:
+        """The frames of one camera under the lights `names`, by every method."""
+        capture = self.capture
+        mask = self.model.mask(camera, "hair", capture)
+        names = [n for n in names if capture.has_light(n, camera)]
+        if not names or not mask.any():
+            return []
+        device, lights = capture.rig.camera(camera), self.fitted.lights(names)
+        spp, seed = self.options.spp, self.seed
+        rendered = {
+            method: olat_smoothed(s, device, lights, spp=spp, max_depth=MAX_DEPTH, seed=seed)
+            for method, s in scenes.items()
+        }
+        out = []
+        for i, name in enumerate(names):
+            captured = capture.light(name, camera)[0]
+            near = three_nearest(capture, camera, capture.rig.light(name), self.held_out)
+            frames = {
+                "captured": captured,
+                **{method: images[i] for method, images in rendered.items()},
+                "mean_colour": np.broadcast_to(colour, captured.shape),
+                "three_nearest": near,
+            }
+            out.append(_Compared(camera, name, frames, mask))
+        return out
 
 
 def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut) -> AnyFloats:
@@ -227,14 +231,14 @@ def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut
     return np.asarray(total)
 
 
-def _scores(images: Sequence[_Compared], method: str, fitted: FittedAppearance) -> dict[str, float]:
+def _scores(images: Sequence[_Compared], method: str, exposure: Exposure) -> dict[str, float]:
     """Means over `images` of a method's `metrics.scores` and relative error on the hair."""
     found = []
     for image in images:
         radiance, truth = image.frames[method], image.frames["captured"]
-        shown, true = fitted.exposure(radiance), fitted.exposure(truth)
         relative = relative_error(radiance, truth, image.mask)
-        found.append({**scores(shown, true, image.mask), "relative_error": relative})
+        shown = scores(exposure(radiance), exposure(truth), image.mask)
+        found.append({**shown, "relative_error": relative})
     return mean_scores(found)
 
 
@@ -248,7 +252,7 @@ def judge(result: dict[str, Any], stage: Stage) -> None:
 
 
 def _rows(
-    groups: dict[str, list[_Compared]], fitted: FittedAppearance
+    groups: dict[str, list[_Compared]], exposure: Exposure
 ) -> list[tuple[str, dict[str, AnyFloats], dict[str, str]]]:
     """Two rows a group for the picture: a label, pictures by column, and their scores."""
     rows: list[tuple[str, dict[str, AnyFloats], dict[str, str]]] = []
@@ -258,7 +262,7 @@ def _rows(
         picked = ranked[:1]
         picked += [c for c in ranked if c.camera != picked[0].camera][:1] or ranked[1:2]
         for c in picked:
-            shown: dict[str, AnyFloats] = {k: fitted.exposure(v) for k, v in c.frames.items()}
+            shown: dict[str, AnyFloats] = {k: exposure(v) for k, v in c.frames.items()}
             captions = {
                 k: f"{psnr(v, shown['captured'], c.mask):.1f} dB  "
                 f"{ssim(v, shown['captured'], c.mask):.2f}"

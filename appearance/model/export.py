@@ -129,7 +129,7 @@ def export_mitsuba(
     if model.head is not None:
         scaled = Mesh(model.head.vertices * SCALE, model.head.faces)
         write_obj(folder / "head.obj", scaled)
-        shapes.append(_head(model.skin))
+        shapes.append(_head(model.appearance.skin))
     path = folder / "scene.xml"
     path.write_text(
         '<scene version="3.0.0">\n <integrator type="path"><integer name="max_depth" value="16"/>'

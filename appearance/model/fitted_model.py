@@ -1,54 +1,85 @@
-"""A fitted model as a scene: any view, light or environment, also on animated strands."""
+"""A fitted model: what renders, relights, edits and exports; every picture goes through it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from appearance.bsdf.maps import HairMaps, MappedStrands
-from appearance.inverse_rendering.pipeline import MAPS
-from appearance.model.fitted_appearance import FittedAppearance
+from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
+from appearance.inverse_rendering.found_lights import lights_as_found
+from appearance.render.mixed import Environment, render_mixed
 from appearance.scene.hair_scene import HairScene, build_scene
-from reconstruction.files.strands import read_strands
+from appearance.sun_fit.fitted_appearance import FittedAppearance
+from reconstruction.arrays import Array, Floats
+from reconstruction.capture.folder import Capture
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
+from reconstruction.model import Model, ModelError
 
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """What a model folder holds: strands, maps, the head and its albedo.
+    """Strands on a head, the hair's material, skin, exposure, and the lights it was seen under.
 
-    `root_uv (S, 2)` places the strands on the scalp's map; it was found at the fit's pose and
-    stays with the strands when they move.
+    `maps` are of one cell where the hair is one material. `placed (S, 2)` are the roots' places on
+    the scalp's map where they are known; they stay with the strands when they move. `rig` is the
+    capture's, its lights as inverse rendering found them.
     """
 
     strands: Strands
     head: Mesh | None
+    appearance: FittedAppearance
     maps: HairMaps
-    root_uv: np.ndarray
-    skin: tuple[float, float, float]
+    placed: Array | None = None
+    rig: Rig | None = None
 
     @classmethod
-    def load(cls, model: Path, head: Mesh | None) -> FittedModel:
-        """Read the folder `model`; errors name the file and what to do."""
-        maps, root_uv = HairMaps.load(model / MAPS)
-        strands = read_strands(model / "strands.npz")
-        if len(strands) != len(root_uv):
-            raise ValueError(
-                f"{model}: {MAPS} is of {len(root_uv)} strands and strands.npz holds "
-                f"{len(strands)}: fit again"
-            )
-        return cls(strands, head, maps, root_uv, FittedAppearance.load(model).skin)
+    def load(cls, model: Model, capture: Capture | None = None) -> FittedModel:
+        """Read a model; `capture` gives the rig, and the head where none was laid.
 
-    def scene(
-        self, maps: HairMaps | None = None, strands: Strands | None = None, head: Mesh | None = None
-    ) -> HairScene:
+        Raises `ModelError` naming what is missing.
+        """
+        appearance, strands = FittedAppearance.load(model), model.strands()
+        maps, placed = HairMaps.of(appearance.hair), model.root_uv(strands)
+        if model.has("hair_maps.npz"):
+            maps, placed = HairMaps.load(model)
+            if len(strands) != len(placed):
+                raise ModelError(
+                    f"{model.file('hair_maps.npz')} is of {len(placed)} strands and strands.npz "
+                    f"holds {len(strands)}: fit again"
+                )
+        rig = None
+        if capture is not None:
+            rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
+        return cls(strands, model.head(capture), appearance, maps, placed, rig)
+
+    @cached_property
+    def root_uv(self) -> Array:
+        """The roots' places on the scalp's map `(S, 2)` in [0, 1]."""
+        return scalp_coordinates(self.strands, self.head) if self.placed is None else self.placed
+
+    def with_maps(self, maps: HairMaps) -> FittedModel:
+        """The same with another material."""
+        return replace(self, maps=maps)
+
+    def lights(self, names: Sequence[str]) -> list[Light]:
+        """Lights of the rig: as found where they were fitted, else as calibrated."""
+        if self.rig is None:
+            raise ValueError("lights are parts of a rig: give the capture too")
+        return [self.rig.light(name) for name in names]
+
+    def scene(self, strands: Strands | None = None, head: Mesh | None = None) -> HairScene:
         """The scene for every renderer of `appearance.render`.
 
-        With other `maps` (an edit), and with moved `strands` and `head` of the same topology.
-        Raises `ValueError` where the strands' numbers of points differ.
+        With moved `strands` and `head` of the same topology. Raises `ValueError` where the strands'
+        numbers of points differ.
         """
         moved = self.strands if strands is None else strands
         if not np.array_equal(moved.offsets, self.strands.offsets):
@@ -57,8 +88,27 @@ class FittedModel:
                 f"{len(moved)} strands of {len(moved.points)} points, expected "
                 f"{len(self.strands)} of {len(self.strands.points)}"
             )
-        painted = self.maps if maps is None else maps
         base = build_scene(
-            moved, self.head if head is None else head, hair=painted.mean(), skin=self.skin
+            moved,
+            self.head if head is None else head,
+            hair=self.maps.mean(),
+            skin=self.appearance.skin,
         )
-        return MappedStrands.of(base, moved, self.root_uv).painted(painted)
+        if self.maps.uniform or not len(moved):
+            return base
+        return MappedStrands.of(base, moved, self.root_uv).painted(self.maps)
+
+    def render(
+        self,
+        camera: Camera,
+        lights: Sequence[Light] = (),
+        environments: Sequence[Environment] = (),
+        *,
+        weights: ArrayLike = 1.0,
+        spp: int = 64,
+        seed: int = 0,
+    ) -> Floats:
+        """Radiance `(H, W, 3)` under lights and environments together; see `render_mixed`."""
+        return render_mixed(
+            self.scene(), camera, lights, environments, weights=weights, spp=spp, seed=seed
+        )

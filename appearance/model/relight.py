@@ -8,47 +8,47 @@ import numpy as np
 
 from appearance.metrics.pictures import write_png
 from appearance.metrics.scores import Exposure
-from appearance.model.fitted_appearance import FittedAppearance
+from appearance.model.fitted_model import FittedModel
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.smoothed import environment_smoothed
-from appearance.scene.hair_scene import build_scene
 from reconstruction.arrays import Floats
 from reconstruction.files.exr import write_exr
-from reconstruction.files.strands import read_strands
 from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
+from reconstruction.model import Model
 
 PROCEDURAL = {"studio": studio, "sky": sky}
 
 
-def relight_model(
-    model: Path,
-    head: Mesh | None,
+def environment_map(name: str) -> Floats:
+    """The map `(h, w, 3)` "studio" or "sky", or that of an `.hdr` or `.exr` file."""
+    return PROCEDURAL[name]() if name in PROCEDURAL else load_environment(Path(name))
+
+
+def relight(
+    fitted: FittedModel,
+    model: Model,
+    environment: str = "studio",
     *,
-    environment: str | Path | None = None,
     size: int = 320,
     spp: int = 36,
     seed: int = 0,
 ) -> Floats:
-    """Render a model in three-quarter view under `environment`: radiance `(size, size, 3)`.
+    """Render `fitted` in three-quarter view under an `environment_map`: `(size, size, 3)`.
 
-    `environment` is "studio" (the default), "sky" or the path of an `.hdr` or `.exr` map. Writes
-    `relit.exr` (radiance) and `relit.png` (the subject's 99th percentile at white, sRGB) into the
-    folder `model`, which holds `strands.npz` and `appearance.json`.
+    Writes `relit.exr` (radiance) and `relit.png` (the subject's 99th percentile at white, sRGB)
+    into `model`.
     """
-    fitted = FittedAppearance.load(model)
-    strands = read_strands(model / "strands.npz")
-    scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
-    camera = three_quarter_view(strands, size)
-    procedural = PROCEDURAL.get(str(environment or "studio"))
-    envmap = procedural() if procedural else load_environment(Path(str(environment)))
+    envmap = environment_map(environment)
+    scene, camera = fitted.scene(), three_quarter_view(fitted.strands, size)
     radiance = environment_smoothed(scene, camera, envmap, spp=spp, seed=seed)
     share = coverage(scene, camera)
     subject = share["hair"] + share["head"] > 0.5
-    write_exr(model / "relit.exr", radiance)
-    write_png(model / "relit.png", Exposure.of([radiance[subject]])(radiance))
+    with model.writing("relit.exr") as part:
+        write_exr(part, radiance)
+    with model.writing("relit.png") as part:
+        write_png(part, Exposure.of([radiance[subject]])(radiance))
     return radiance
 
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from appearance.metrics.scores import Exposure
-from appearance.model.fitted_appearance import FittedAppearance
-from appearance.observations import HeldOut, Observed, chosen, model_mask, observe
+from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.longitudinal import (
     absorption_of_colour,
     roughness_of_variance,
@@ -32,30 +33,33 @@ from appearance.sun_fit.roughness_and_colour import (
 from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
 from reconstruction.arrays import Array, Ints
 from reconstruction.capture.folder import Capture
-from reconstruction.files.strands import read_strands
 from reconstruction.model import Model
+from reconstruction.options import options
 from reconstruction.report.report import Progress, Report, Series, Stage, silent
 
+MAX_DEPTH = 16
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
 
 
-@dataclass(frozen=True)
-class FitOptions:
-    """How much of a capture a fit looks at: pixels a camera, and samples a pixel when rendering."""
+Count = Annotated[int, Field(gt=0)]
 
-    hair_pixels: int = 1000
-    skin_pixels: int = 200
-    roughness_cameras: int = 4
-    roughness_spp: int = 12
-    colour_spp: int = 16
-    iterations: int = 5
-    max_depth: int = 16
+
+@options
+class FitOptions:
+    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
+
+    hair_pixels: Count = 1000
+    skin_pixels: Count = 200
+    roughness_cameras: Count = 4
+    roughness_spp: Count = 12
+    colour_spp: Count = 16
+    iterations: Count = 5
 
 
 def fit(
     capture: Capture,
-    model: Path,
+    model: Model,
     *,
     held_out: HeldOut | None = None,
     options: FitOptions | None = None,
@@ -70,17 +74,17 @@ def fit(
     """
     held_out, options = held_out or HeldOut(), options or FitOptions()
     held_out.check(capture)
-    strands = read_strands(model / "strands.npz")
+    strands = model.strands()
     if len(strands) == 0:
-        raise ValueError(f"{model / 'strands.npz'} has no strands: there is no hair to fit")
-    report = Report.load(model / "report.json")
+        raise ValueError(f"{model.file('strands.npz')} has no strands: there is no hair to fit")
+    report = model.report()
     with report.stage("samples") as stage:
         progress("reading hair pixels", 0.0)
         hair, skin = _observed(capture, model, held_out, options, stage, progress, seed)
         exposure = Exposure.of([o.radiance[o.valid] for o in hair])
         hair, skin = _reached(capture, hair, skin, exposure, stage)
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
-    head = Model(model).head(capture)
+    head = model.head(capture)
     scene = build_scene(strands, head, hair=start)
     fitting = SunFit(scene, hair, skin, options, seed, progress)
     with report.stage("roughness") as stage:
@@ -101,14 +105,16 @@ def fit(
         printed,
     )
     fitted.save(model)
-    report.save(model / "report.json")
+    for stale in ("hair_maps.npz", "lights.json", "inverse_rendering.png"):
+        model.remove(stale)
+    model.write_report(report)
     progress("appearance fitted", 1.0)
     return report
 
 
 def _observed(
     capture: Capture,
-    model: Path,
+    model: Model,
     held_out: HeldOut,
     options: FitOptions,
     stage: Stage,
@@ -119,11 +125,11 @@ def _observed(
     rng = np.random.default_rng(seed)
     cameras, lights = held_out.training_cameras(capture), held_out.training_lights(capture)
     hair, skin, seen = [], [], 0
-    has_head = Model(model).head(capture) is not None
+    has_head = model.head(capture) is not None
     for i, name in enumerate(cameras):
         progress("reading hair pixels", 0.3 * i / len(cameras))
-        mask = model_mask(model, name, "hair", capture)
-        bare = model_mask(model, name, "skin", capture) & ~mask
+        mask = model.mask(name, "hair", capture)
+        bare = model.mask(name, "skin", capture) & ~mask
         seen += int(mask.sum())
         wanted = chosen(mask, options.hair_pixels, rng)
         beside = chosen(bare if has_head else bare & False, options.skin_pixels, rng)
@@ -271,7 +277,7 @@ class SunFit:
             start=start,
             iterations=iterations or self.options.iterations,
             spp=self.options.colour_spp,
-            max_depth=self.options.max_depth,
+            max_depth=MAX_DEPTH,
             seed=self.seed,
             told=told,
         )
@@ -313,7 +319,7 @@ class SunFit:
             o.camera,
             o.lights,
             spp=self.options.roughness_spp,
-            max_depth=self.options.max_depth,
+            max_depth=MAX_DEPTH,
             seed=self.seed,
             pixels=o.pixels,
         )

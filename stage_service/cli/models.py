@@ -16,6 +16,8 @@ from stage_service.cli.support import (
     progress_bar,
 )
 
+FIT_METHODS = ("sun", "inverse_rendering")
+
 
 def add(commands: Commands) -> None:
     """Add the commands."""
@@ -36,26 +38,41 @@ def add(commands: Commands) -> None:
         commands,
         "fit",
         run_fit,
-        "roughness and colour of hair and skin from a capture and its strands",
-        "Write MODEL/appearance.json; with held-out cameras or lights, judge the fit on them.",
+        "the hair's appearance from a capture and its strands",
+        "Write MODEL/appearance.json: roughness and colour of hair and skin (method sun). "
+        "inverse_rendering goes on from there, with a sun fit first where there is none: hair that "
+        "varies over the scalp and along strands, and the lights as they are found, in "
+        "MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With held-out "
+        "cameras or lights, judge the model on them.",
     )
     fit.add_argument("capture", type=Path)
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
+    fit.add_argument("--method", choices=FIT_METHODS, default="sun")
+    fit.add_argument("--options", help="the method's options as JSON")
     _held_out(fit)
     fit.add_argument("--environment", default="studio", help="studio, sky, or an .hdr or .exr file")
+    fit.add_argument("--seed", type=int, default=0)
 
     render = add_command(
         commands,
         "render",
         run_render,
-        "a model under an environment map or a lamp",
-        "Render MODEL's strands with its fitted appearance, in the pose of its capture.",
+        "a model under an environment map, or lights of its rig",
+        "Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, "
+        "where there are any), in the pose of its capture.",
     )
     render.add_argument("model", type=Path)
     render.add_argument("--capture", type=Path, help="the capture that gives rig and head")
-    render.add_argument("--camera", help="a camera of the rig (default: a three-quarter view)")
-    render.add_argument("--light", help="a light of the rig, instead of the environment")
-    render.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
+    render.add_argument("--camera", help="a camera of the rig, instead of a three-quarter view")
+    render.add_argument(
+        "--light",
+        action="append",
+        default=[],
+        help="a light of the rig (repeat for more); the environment is then dark unless given",
+    )
+    render.add_argument(
+        "--environment", help="studio (where nothing else is given), sky, or an .hdr or .exr file"
+    )
     render.add_argument("--out", type=Path, help=".png (exposed, sRGB) or .exr (linear)")
     render.add_argument("--spp", type=int, default=64, help="samples a pixel")
     render.add_argument("--seed", type=int, default=0)
@@ -90,21 +107,28 @@ def run_reconstruct(args: argparse.Namespace, output: Output) -> int:
 
 
 def run_fit(args: argparse.Namespace, output: Output) -> int:
-    """Fit roughness and colour."""
+    """Fit the appearance."""
+    from reconstruction.model import Model
     from stage_service.jobs.records import JobOptions
-    from stage_service.jobs.steps import StepContext, assess, fit
+    from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
 
+    model, inverse = Model(args.model), args.method == "inverse_rendering"
     options = JobOptions(
         held_out_cameras=tuple(args.hold_out_camera),
         held_out_lights=tuple(args.hold_out_light),
         environment=args.environment,
+        seed=args.seed,
+        fit={} if inverse else _json(args.options),
+        inverse_rendering=_json(args.options) if inverse else {},
     )
-    with progress_bar("fit") as progress:
-        fit(StepContext(args.capture, args.model, options, progress))
-    data: dict[str, Any] = {
-        "model": str(args.model),
-        "appearance": json.loads((args.model / "appearance.json").read_text()),
-    }
+    data: dict[str, Any] = {"model": str(model), "method": args.method}
+    if not inverse or not model.has("appearance.json"):
+        with progress_bar("sun") as progress:
+            fit(StepContext(args.capture, args.model, options, progress))
+    if inverse:
+        with progress_bar("inverse") as progress:
+            data |= inverse_rendering(StepContext(args.capture, args.model, options, progress))
+    data["appearance"] = model.json("appearance.json")
     if options.held_out_cameras or options.held_out_lights:
         with progress_bar("assess") as progress:
             data["images"] = assess(StepContext(args.capture, args.model, options, progress))

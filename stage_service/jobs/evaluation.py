@@ -9,12 +9,13 @@ from typing import Any
 
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.strands import Strands
+from reconstruction.model import Model
 from reconstruction.report.report import Progress, silent
 
 
 def evaluate_geometry(
     capture: Capture,
-    model: Path,
+    model: Model,
     truth: Path,
     *,
     held_out_cameras: Sequence[str] = (),
@@ -27,15 +28,13 @@ def evaluate_geometry(
     same two. The true strands stand where the subject stood during the OLAT pass. The baselines get
     the masks that the reconstruction had: those of the cameras that are not held out.
     """
-    from appearance.observations import model_mask
     from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
     from reconstruction.files.strands import read_strands
-    from reconstruction.model import Model
 
     true = read_strands(truth)
-    cameras, head = capture.rig.cameras, Model(model).head(capture)
+    cameras, head = capture.rig.cameras, model.head(capture)
     progress("what the cameras see of the true strands", 0.0)
     visibility = Visibility(cameras, true, head)
 
@@ -45,10 +44,10 @@ def evaluate_geometry(
         )
 
     progress("our strands against the true ones", 0.2)
-    figures = score(read_strands(model / "strands.npz"))
+    figures = score(model.strands())
     progress("baseline: the hull filled with vertical lines", 0.3)
     used = [c for c in cameras if c.name not in held_out_cameras]
-    masks = {c.name: model_mask(model, c.name, "hair", capture) for c in used}
+    masks = {c.name: model.mask(c.name, "hair", capture) for c in used}
     hull = baseline_hull(used, masks, head)
     baselines = {"hull_vertical": score(hull_vertical(hull))}
     progress("baseline: the hull filled with the smooth field of its surface", 0.6)
@@ -57,14 +56,14 @@ def evaluate_geometry(
     return {**figures, "baselines": baselines}
 
 
-def evaluate_appearance(model: Path, truth: Path) -> dict[str, Any]:
+def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
 
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
-    from appearance.model.fitted_appearance import FittedAppearance
     from appearance.scene.hair_appearance import HairAppearance
+    from appearance.sun_fit.fitted_appearance import FittedAppearance
     from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
 
     def figures(hair: HairAppearance, skin: Sequence[float]) -> dict[str, Any]:

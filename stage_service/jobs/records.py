@@ -18,9 +18,10 @@ class JobOptions(BaseModel):
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may look at:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
     against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
-    file, `studio` or `sky`. `reconstruct`, `fit`, `stage1` and `assess` go to the step of that
-    name: fields of `reconstruction.pipeline.ReconstructOptions`,
-    `appearance.sun_fit.fit.FitOptions`, `appearance.inverse_rendering.pipeline.Stage1Request`,
+    file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering` and `assess` go to the step
+    of that name: fields of `reconstruction.pipeline.ReconstructOptions`,
+    `appearance.sun_fit.fit.FitOptions`,
+    `appearance.inverse_rendering.pipeline.InverseRenderingRequest`,
     `appearance.model.assess.AssessOptions`.
     """
 
@@ -35,7 +36,7 @@ class JobOptions(BaseModel):
     seed: int = Field(default=0, ge=0)
     reconstruct: dict[str, Any] = Field(default_factory=dict)
     fit: dict[str, Any] = Field(default_factory=dict)
-    stage1: dict[str, Any] = Field(default_factory=dict)
+    inverse_rendering: dict[str, Any] = Field(default_factory=dict)
     assess: dict[str, Any] = Field(default_factory=dict)
 
 

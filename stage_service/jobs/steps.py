@@ -7,15 +7,19 @@ a crash) writes the same files again.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from reconstruction.capture.folder import Capture
+from reconstruction.model import Model
+from reconstruction.options import parse_options
 from reconstruction.report.report import Progress
 from stage_service.jobs.records import JobOptions
+
+if TYPE_CHECKING:
+    from appearance.observations import HeldOut
 
 Figures = dict[str, Any]
 T = TypeVar("T")
@@ -63,52 +67,53 @@ def reconstruct(context: StepContext) -> Figures:
 
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
-    from appearance.observations import HeldOut
     from appearance.sun_fit.fit import FitOptions
     from appearance.sun_fit.fit import fit as run
 
     run(
         Capture(context.capture),
-        context.model,
-        held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
-        options=_options(FitOptions, "fit", context.options.fit),
+        Model(context.model),
+        held_out=_held_out(context.options),
+        options=parse_options(FitOptions, context.options.fit, "options.fit"),
         progress=context.progress,
         seed=context.options.seed,
     )
     return {"appearance": "appearance.json"}
 
 
-def stage1(context: StepContext) -> Figures:
-    """The hair's maps and the lamps by inverse rendering: `hair_maps.npz`, `lamps.json`.
+def inverse_rendering(context: StepContext) -> Figures:
+    """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`.
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
-    from appearance.inverse_rendering.pipeline import Stage1Request, fit_stage1
-    from appearance.observations import HeldOut
+    from appearance.inverse_rendering.pipeline import InverseRenderingRequest
+    from appearance.inverse_rendering.pipeline import inverse_rendering as run
 
-    found = fit_stage1(
+    asked = context.options
+    found = run(
         Capture(context.capture),
-        context.model,
-        held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
-        request=_options(Stage1Request, "stage1", context.options.stage1),
+        Model(context.model),
+        held_out=_held_out(asked),
+        request=parse_options(
+            InverseRenderingRequest, asked.inverse_rendering, "options.inverse_rendering"
+        ),
         progress=context.progress,
-        seed=context.options.seed,
+        seed=asked.seed,
     )
-    return {"maps": "hair_maps.npz", "lamps": "lamps.json", **found}
+    return {"maps": "hair_maps.npz", "lights": "lights.json", **found}
 
 
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
     from appearance.model.assess import AssessOptions
     from appearance.model.assess import assess as run
-    from appearance.observations import HeldOut
 
     return run(
         Capture(context.capture),
-        context.model,
-        held_out=HeldOut(context.options.held_out_cameras, context.options.held_out_lights),
+        Model(context.model),
+        held_out=_held_out(context.options),
         environment=context.options.environment,
-        options=_options(AssessOptions, "assess", context.options.assess),
+        options=parse_options(AssessOptions, context.options.assess, "options.assess"),
         seed=context.options.seed,
         progress=context.progress,
     )
@@ -124,7 +129,7 @@ def evaluate(context: StepContext) -> Figures:
     truth = Path(context.options.truth)
     figures = evaluate_geometry(
         Capture(context.capture),
-        context.model,
+        Model(context.model),
         truth / "strands.npz" if truth.is_dir() else truth,
         held_out_cameras=context.options.held_out_cameras,
         seed=context.options.seed,
@@ -132,24 +137,23 @@ def evaluate(context: StepContext) -> Figures:
     )
     appearance = truth / "appearance.json"
     if "fit" in context.previous and appearance.is_file():
-        figures["appearance"] = evaluate_appearance(context.model, appearance)
+        figures["appearance"] = evaluate_appearance(Model(context.model), appearance)
     return figures
 
 
 def results(context: StepContext) -> Figures:
     """Gather every figure of the job in `results.json`, and draw the report's plots."""
     from reconstruction.report.plots import plot_geometry, plot_report
-    from reconstruction.report.report import Report
 
-    plots = context.model / "plots"
-    report = Report.load(context.model / "report.json")
+    model = Model(context.model)
+    plots, report = model.file("plots"), model.report()
     plot_report(report, plots)
     done = {step: result["figures"] for step, result in context.previous.items()}
     figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
     if "assess" in done:
         figures["images"] = done["assess"]
-    if "stage1" in done:
-        figures["stage1"] = done["stage1"]
+    if "inverse_rendering" in done:
+        figures["inverse_rendering"] = done["inverse_rendering"]
     if "visible" in done.get("evaluate", {}):
         geometry = dict(done["evaluate"])
         for key in ("baselines", "appearance"):
@@ -158,10 +162,14 @@ def results(context: StepContext) -> Figures:
         figures["geometry"] = geometry
         plot_geometry({"ours": geometry, **figures["baselines"]}, plots / "geometry.png")
     figures["warnings"] = [f"{s.name}: {w}" for s in report.stages for w in s.warnings]
-    part = context.model / "results.part"
-    part.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
-    part.replace(context.model / "results.json")
+    model.write_json("results.json", figures)
     return {"results": "results.json"}
+
+
+def _held_out(options: JobOptions) -> HeldOut:
+    from appearance.observations import HeldOut
+
+    return HeldOut(options.held_out_cameras, options.held_out_lights)
 
 
 def _options(kind: Callable[..., T], field: str, values: dict[str, Any]) -> T:
@@ -175,7 +183,7 @@ STEPS: dict[str, Callable[[StepContext], Figures]] = {
     "compress": compress,
     "reconstruct": reconstruct,
     "fit": fit,
-    "stage1": stage1,
+    "inverse_rendering": inverse_rendering,
     "assess": assess,
     "evaluate": evaluate,
     "results": results,

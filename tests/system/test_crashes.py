@@ -76,7 +76,7 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
     made = stage.capture({**stage.subject(), "pipeline": stage.pipeline()})
     model = Path(stage.get(f"/jobs/{made['job']}")["model"]).name
     stage.until(lambda: stage.get(f"/jobs/{made['job']}")["state"] == "done", 200)
-    effort = {"pixels": 60, "spp": 4, "gradient_spp": 2, "max_depth": 4}
+    effort = {"pixels": 60, "spp": 4, "gradient_spp": 2}
     fit = {"row": "correctives", "shape": [2, 2, 2], "steps": 200, "check_every": 5, "halvings": 99}
     asked = {
         "capture": made["id"],
@@ -85,7 +85,12 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
             "name": "appearance",
             "options": {
                 "fit": {"iterations": 2},
-                "stage1": {"judged_spp": 4, "fit": fit | {"effort": effort}},
+                "inverse_rendering": {
+                    "judged_spp": 4,
+                    "max_depth": 4,
+                    "fit": fit | {"effort": effort},
+                },
+                "assess": {"relit_size": 32, "relit_spp": 4},
             },
         },
     }
@@ -107,4 +112,4 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
     job = stage.get(path)
     assert (job["outcome"], job["error"]) == ("succeeded", None)
     found = {a["path"] for a in stage.get(f"{path}/artifacts")}
-    assert {"hair_maps.npz", "lamps.json", "report.json"} <= found
+    assert {"hair_maps.npz", "lights.json", "report.json"} <= found

@@ -1,33 +1,38 @@
-"""Stage 1 on a capture: what it leaves in the model folder, and going on after a kill."""
+"""Inverse rendering of a capture: what it leaves in the model, and going on after a kill."""
 
 from __future__ import annotations
 
-import json
+import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.pipeline import Stage1Request, fit_stage1
+from appearance.inverse_rendering.pipeline import InverseRenderingRequest, inverse_rendering
 from appearance.metrics.scores import Exposure
-from appearance.model.fitted_appearance import FittedAppearance
 from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.writer import CaptureWriter
-from reconstruction.files.strands import write_strands
 from reconstruction.geometry.rig import Rig
-from reconstruction.report.report import Report
+from reconstruction.model import Model
+from reconstruction.options import BadOptions, parse_options
 
-REQUEST = Stage1Request(
-    judged_spp=4,
-    fit={
-        "row": "correctives",
-        "steps": 12,
-        "shape": [2, 2, 2],
-        "check_every": 5,
-        "effort": {"pixels": 60, "spp": 8, "gradient_spp": 2, "max_depth": 5},
+REQUEST = parse_options(
+    InverseRenderingRequest,
+    {
+        "judged_spp": 4,
+        "max_depth": 5,
+        "fit": {
+            "row": "correctives",
+            "steps": 12,
+            "shape": [2, 2, 2],
+            "check_every": 5,
+            "effort": {"pixels": 60, "spp": 8, "gradient_spp": 2},
+        },
     },
 )
 HELD_OUT = HeldOut(lights=("l1", "l3"))
@@ -36,7 +41,7 @@ HELD_OUT = HeldOut(lights=("l1", "l3"))
 @pytest.fixture(scope="module")
 def made(plain, tufted, tmp_path_factory):
     """The tuft's frames as a capture, and a model that Sun's fit has left."""
-    folder = tmp_path_factory.mktemp("stage1")
+    folder = tmp_path_factory.mktemp("inverse_rendering")
     cameras = tuple(o.camera for o in plain.views)
     steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(plain.lights)]
     writer = CaptureWriter.create(
@@ -44,14 +49,13 @@ def made(plain, tufted, tmp_path_factory):
         Rig("tuft", cameras, plain.lights),
         {"steps": [s.to_dict() for s in steps]},
     )
-    model = folder / "model"
-    (model / "masks").mkdir(parents=True)
-    write_strands(model / "strands.npz", tufted.strands)
+    model = Model(folder / "model").create()
+    model.write_strands(tufted.strands)
     for o in plain.views:
         size = (o.camera.height, o.camera.width)
         mask = np.zeros(size, bool)
         mask.reshape(-1)[o.pixels] = True
-        cv2.imwrite(str(model / "masks" / f"{o.camera.name}_hair.png"), mask.astype(np.uint8) * 255)
+        model.write_mask(o.camera.name, "hair", mask)
         for step, values in zip(steps, o.radiance, strict=True):
             image = np.zeros((*size, 3), np.float32)
             image[mask] = values
@@ -63,7 +67,7 @@ def made(plain, tufted, tmp_path_factory):
     return Capture(folder / "capture"), model
 
 
-def test_a_killed_fit_goes_on_and_leaves_maps_lamps_and_figures(made):
+def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
     capture, model = made
     told = []
 
@@ -73,10 +77,10 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lamps_and_figures(made):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_stage1(capture, model, held_out=HELD_OUT, request=REQUEST, progress=killed)
-    assert (model / "stage1-correctives.checkpoint.npz").is_file()
+        inverse_rendering(capture, model, held_out=HELD_OUT, request=REQUEST, progress=killed)
+    assert model.checkpoint("correctives").is_file()
     again = []
-    result = fit_stage1(
+    result = inverse_rendering(
         capture,
         model,
         held_out=HELD_OUT,
@@ -87,23 +91,47 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lamps_and_figures(made):
     assert steps[-1].startswith("step 10: error 0.")
     assert [share for _, share in again] == sorted(share for _, share in again)
     assert result["error"] <= result["start_error"]
-    assert set(result["held_out"]) == {"start", "stage1"}
-    picture = cv2.imread(str(model / "stage1.png"))
+    assert set(result["held_out"]) == {"start", "inverse_rendering"}
+    picture = cv2.imread(str(model.file("inverse_rendering.png")))
     # four frames, each captured, before, after and its error map
     assert picture.shape[0] > 3.5 * picture.shape[1] / 4
-    maps, uv = HairMaps.load(model / "hair_maps.npz")
+    maps, uv = HairMaps.load(model)
     assert maps.shape == (2, 2, 2)
     assert abs(maps.beta_m - 0.25) < abs(0.4 - 0.25) / 2
     assert uv.shape == (300, 2)
-    lamps = json.loads((model / "lamps.json").read_text())
-    assert [x["name"] for x in lamps] == ["l0", "l2", "l4", "l5", "l6", "l7"]
-    assert all(x["gain"] == 1 for x in lamps)
-    assert not list(model.glob("*.checkpoint.npz"))
-    stage = Report.load(model / "report.json")["stage1"]
-    assert [s.name for s in stage.series] == ["stage 1, original", "stage 1, correctives"]
+    lights = model.json("lights.json")
+    assert [x["name"] for x in lights] == ["l0", "l2", "l4", "l5", "l6", "l7"]
+    assert all(x["gain"] == 1 for x in lights)
+    assert not list(model.path.glob("*.checkpoint.npz"))
+    stage = model.report()["inverse_rendering"]
+    assert [s.name for s in stage.series] == [
+        "inverse rendering, original",
+        "inverse rendering, correctives",
+    ]
 
 
-def test_unknown_fields_of_the_fit_are_refused_by_name(made):
+def test_unknown_fields_of_the_fit_are_refused_by_name():
+    with pytest.raises(BadOptions, match=r"options.fit.stepps: "):
+        parse_options(InverseRenderingRequest, {"fit": {"stepps": 3}})
+
+
+def test_the_head_that_was_laid_under_points_casts_its_shadow(made, small, tmp_path):
+    """A board under the tuft, of which the capture knows nothing, hides the lights below it."""
     capture, model = made
-    with pytest.raises(TypeError, match="stepps"):
-        fit_stage1(capture, model, request=Stage1Request(fit={"stepps": 3}))
+    below = [x.name for x in capture.rig.lights if x.position[2] < -0.2]
+    board = small.plane()
+    board = replace(board, vertices=board.vertices + np.array([0, 0, -0.035]))
+    request = replace(REQUEST, fit=replace(REQUEST.fit, row="original"))
+    errors = []
+    for head in (None, board):
+        other = Model(tmp_path / str(head is None))
+        shutil.copytree(model.path, other.path)
+        if head is not None:
+            other.write_head(head)
+        found = inverse_rendering(
+            capture, other, held_out=HeldOut(lights=tuple(below[:2])), request=request
+        )
+        errors.append(found["held_out"]["start"]["relative_error"])
+    assert capture.head is None
+    assert abs(errors[0] - 1) > 0.2
+    assert errors[1] == pytest.approx(1.0, abs=0.02)  # black under lights that the board hides

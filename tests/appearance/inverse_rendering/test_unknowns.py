@@ -15,6 +15,7 @@ from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from reconstruction.geometry.cameras import facing
 from reconstruction.geometry.lights import Light
+from reconstruction.model import Model, ModelError
 
 NONE = np.zeros(2, np.int64)
 
@@ -128,12 +129,12 @@ def test_resizing_keeps_what_is_linear_along_the_strand_and_flat_on_the_scalp():
 
 def test_maps_are_saved_with_the_strands_places_and_bad_ones_refused(tmp_path):
     wanted, uv = maps(), np.random.default_rng(0).uniform(size=(7, 2))
-    wanted.save(tmp_path / "hair_maps.npz", uv)
-    found, places = HairMaps.load(tmp_path / "hair_maps.npz")
+    wanted.save(Model(tmp_path), uv)
+    found, places = HairMaps.load(Model(tmp_path))
     np.testing.assert_allclose(found.sigma_a, wanted.sigma_a, rtol=1e-6)
     np.testing.assert_allclose(places, uv, atol=1e-6)
-    with pytest.raises(FileNotFoundError, match="appearance"):
-        HairMaps.load(tmp_path / "none.npz")
+    with pytest.raises(ModelError, match="hairstage fit"):
+        HairMaps.load(Model(tmp_path / "none"))
     with pytest.raises(ValueError, match="sigma_a must be"):
         HairMaps(np.ones((2, 2, 3)), np.zeros((1, 1, 1, 2)), 0.3, 0.3)
     with pytest.raises(ValueError, match="negative"):

@@ -7,23 +7,23 @@ import pytest
 from appearance.metrics.pictures import comparison_picture
 from appearance.metrics.scores import Exposure
 from appearance.model.assess import AssessOptions, assess, judge, three_nearest
-from appearance.model.fitted_appearance import FittedAppearance
-from appearance.model.relight import relight_model, three_quarter_view
+from appearance.model.relight import environment_map, three_quarter_view
 from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.render.smoothed import olat_smoothed, smoothed
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.exr import read_exr
-from reconstruction.files.strands import write_strands
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
-from reconstruction.report.report import Report, Stage
+from reconstruction.model import Model
+from reconstruction.report.report import Stage
 
 TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.2, 0.2)
 HELD_OUT = HeldOut(("cam_2",), ("l4", "l7"))
@@ -57,9 +57,8 @@ def made(tmp_path_factory):
     writer = CaptureWriter.create(
         folder / "capture", Rig("wisp", cameras, lights), {"steps": [s.to_dict() for s in steps]}
     )
-    model = folder / "model"
-    (model / "masks").mkdir(parents=True)
-    write_strands(model / "strands.npz", strands)
+    model = Model(folder / "model").create()
+    model.write_strands(strands)
     bright = []
     for camera in cameras:
         images = render_olat(scene, camera, lights, spp=256, seed=7)
@@ -67,7 +66,7 @@ def made(tmp_path_factory):
             writer.write_frame(step, camera.name, image, pulse=1, block_id=1, timestamp=0.0)
         mask = coverage(scene, camera)["hair"] > 0.5
         bright.append(images[:, mask])
-        cv2.imwrite(str(model / "masks" / f"{camera.name}_hair.png"), mask.astype(np.uint8) * 255)
+        model.write_mask(camera.name, "hair", mask)
     writer.finish("completed", {})
     exposure = Exposure.of(bright)
     FittedAppearance(TRUTH, (0.1,) * 3, (0.3,) * 3, exposure, 0.1, 0.1, 0.1).save(model)
@@ -93,13 +92,13 @@ def test_the_true_model_beats_the_trivial_baselines(result):
 
 def test_pictures_and_report_are_left_in_the_model(made, result):
     _, model, _ = made
-    stage = Report.load(model / "report.json")["images"]
+    stage = model.report()["images"]
     assert stage.figures["held_out_lights"] == result["held_out_lights"]
     assert not stage.warnings
-    comparison = cv2.imread(str(model / "comparison.png"))
+    comparison = cv2.imread(str(model.file("comparison.png")))
     assert comparison.shape[1] > comparison.shape[0] / 2 > 200
-    relit, _ = read_exr(model / "relit.exr")
-    picture = cv2.imread(str(model / "relit.png"))
+    relit, _ = read_exr(model.file("relit.exr"))
+    picture = cv2.imread(str(model.file("relit.png")))
     assert picture.shape == relit.shape == (32, 32, 3)
     assert (relit > 0).any()
     assert picture.max() == 255
@@ -168,16 +167,14 @@ def test_smoothing_leaves_no_blot_where_a_rare_path_hit():
     assert out.sum() == pytest.approx(images[0, ..., 0].sum(), rel=0.1)
 
 
-def test_relighting_names_and_views(made):
-    capture, model, _ = made
-    assert capture.head is None
+def test_relighting_names_and_views():
     strands = Strands.from_list([np.array([[0, 0, 0.1], [0, 0.1, 0], [0.1, 0, 0]])])
     view = three_quarter_view(strands, 64)
     pixels, depth = view.project(strands.points)
     assert view.inside(pixels).all()
     assert (depth > 0).all()
     with pytest.raises((ValueError, FileNotFoundError), match="nowhere"):
-        relight_model(model, None, environment="nowhere.hdr", size=16, spp=1)
+        environment_map("nowhere.hdr")
 
 
 def test_nothing_held_out_is_an_error_that_says_so(tmp_path):

@@ -14,38 +14,39 @@ from appearance.bsdf.parameters import Place
 from appearance.metrics.scores import Exposure
 from appearance.model.edit import recoloured, wisp_of
 from appearance.model.export import at_points, export_maps, export_mitsuba, export_usd
-from appearance.model.fitted_appearance import FittedAppearance
 from appearance.model.fitted_model import FittedModel
 from appearance.render.environment import render_environment
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.files.exr import read_exr
-from reconstruction.files.strands import read_strands, write_strands
+from reconstruction.files.strands import read_strands
 from reconstruction.geometry.cameras import Camera
+from reconstruction.model import Model
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 CAMERA = Camera.look_at("c", 16, 16, (0, -0.5, 0.1), (0, 0, 0.0), 12)
 
 
 @pytest.fixture(scope="module")
-def model(tufted, tmp_path_factory):
+def model(strands, root_uv, tmp_path_factory):
     """A model folder whose hair is darker at the tips, and half of it red."""
-    folder = tmp_path_factory.mktemp("model")
+    model = Model(tmp_path_factory.mktemp("model"))
     base = HairMaps.of(HAIR, (3, 4, 4))
     sigma_a = base.sigma_a * np.array([0.5, 1.0, 2.0])[:, None, None, None]
     half = np.zeros((4, 4))
     half[:2] = 1
     maps = recoloured(replace(base, sigma_a=sigma_a), half, (0.02, 1.0, 1.2))
-    write_strands(folder / "strands.npz", tufted.strands)
-    maps.save(folder / "hair_maps.npz", tufted.mapped.root_uv)
+    model.write_strands(strands)
+    maps.save(model, root_uv)
     skin = (0.3, 0.2, 0.1)
-    FittedAppearance(HAIR, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1).save(folder)
-    return folder
+    FittedAppearance(HAIR, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1).save(model)
+    return model
 
 
 @pytest.fixture(scope="module")
 def fitted(model):
-    return FittedModel.load(model, None)
+    return FittedModel.load(model)
 
 
 def test_a_brush_colours_its_wisp_and_nothing_else(fitted):
@@ -73,10 +74,11 @@ def test_dyed_and_smoother_hair_is_so_in_every_light(fitted, small):
     darker = recoloured(fitted.maps, np.ones((1, 1)), (5.0, 5.0, 5.0))
     lamps = small.lamps()[:1]
     pictures = [
-        render_olat(fitted.scene(m), CAMERA, lamps, spp=16, max_depth=4) for m in (None, darker)
+        render_olat(fitted.with_maps(m).scene(), CAMERA, lamps, spp=16, max_depth=4)
+        for m in (fitted.maps, darker)
     ]
     assert pictures[1].mean() < 0.7 * pictures[0].mean()
-    smoother = mi.traverse(fitted.scene(replace(fitted.maps, beta_m=0.1)).hair_bsdf)
+    smoother = mi.traverse(fitted.with_maps(replace(fitted.maps, beta_m=0.1)).scene().hair_bsdf)
     assert smoother["longitudinal_roughness"][0] == pytest.approx(0.1)
     sky = np.ones((4, 8, 3), np.float32)
     assert render_environment(fitted.scene(), CAMERA, sky, spp=4, max_depth=4).max() > 0.1

@@ -2,18 +2,17 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 
 from appearance.metrics.scores import Exposure
-from appearance.model.fitted_appearance import FittedAppearance
-from appearance.observations import HeldOut, chosen, model_mask, observe
+from appearance.observations import HeldOut, chosen, observe
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fit import FitOptions, fit
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.longitudinal import variance_of_roughness
 from reconstruction.capture.folder import Capture, CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter
@@ -23,7 +22,7 @@ from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
-from reconstruction.report.report import Report
+from reconstruction.model import Model, ModelError
 
 TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.25, 0.2)
 SKIN = (0.4, 0.3, 0.2)
@@ -61,17 +60,15 @@ def made(tmp_path_factory):
     writer = CaptureWriter.create(
         folder / "capture", rig, {"steps": [s.to_dict() for s in steps]}, head=head
     )
-    model = folder / "model"
-    (model / "masks").mkdir(parents=True)
-    write_strands(model / "strands.npz", strands)
+    model = Model(folder / "model").create()
+    model.write_strands(strands)
     for camera in cameras:
         images = render_olat(scene, camera, lights, spp=16, deep_lights=16, seed=7)
         for step, image in zip(steps, images, strict=True):
             writer.write_frame(step, camera.name, 0.5 * image, pulse=1, block_id=1, timestamp=0.0)
         share = coverage(scene, camera)
         for kind, mask in (("hair", share["hair"] > 0.5), ("skin", share["head"] > 0.95)):
-            path = model / "masks" / f"{camera.name}_{kind}.png"
-            cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
+            model.write_mask(camera.name, kind, mask)
     writer.finish("completed", {})
     return Capture(folder / "capture"), model
 
@@ -103,18 +100,18 @@ def test_fit_reports_what_it_did(made, fitted):
     errors = [e for _, e in report["colour"].series[0].points]
     assert min(errors) < 0.05
     assert len(report["roughness"].series[0].points) == 4
-    assert Report.load(made[1] / "report.json").to_dict() == report.to_dict()
+    assert made[1].report().to_dict() == report.to_dict()
 
 
 def test_missing_frames_and_masks_are_named(made, tmp_path):
     capture, model = made
-    (tmp_path / "masks").mkdir()
-    write_strands(tmp_path / "strands.npz", Strands.from_list([np.eye(3)[:2]]))
-    with pytest.raises(CaptureError, match="hairstage reconstruct"):
-        fit(capture, tmp_path, options=OPTIONS)
-    write_strands(tmp_path / "strands.npz", Strands.from_list([]))
+    bare = Model(tmp_path).create()
+    bare.write_strands(Strands.from_list([np.eye(3)[:2]]))
+    with pytest.raises(ModelError, match="hairstage reconstruct"):
+        fit(capture, bare, options=OPTIONS)
+    write_strands(bare.file("strands.npz"), Strands.from_list([]))
     with pytest.raises(ValueError, match="no strands"):
-        fit(capture, tmp_path, options=OPTIONS)
+        fit(capture, bare, options=OPTIONS)
     with pytest.raises(CaptureError, match="cam_9"):
         fit(capture, model, held_out=HeldOut(("cam_9",)), options=OPTIONS)
     with pytest.raises(CaptureError, match="every camera"):
@@ -123,7 +120,7 @@ def test_missing_frames_and_masks_are_named(made, tmp_path):
 
 def test_observations_are_responses_at_full_level(made):
     capture, model = made
-    mask = model_mask(model, "cam_0", "hair", capture)
+    mask = model.mask("cam_0", "hair", capture)
     pixels = chosen(mask, 10, np.random.default_rng(0))
     o = observe(capture, "cam_0", ["l3", "l0"], pixels)
     full = capture.olat("cam_0", ["l3", "l0"]).reshape(2, -1, 3)
@@ -149,14 +146,15 @@ def test_saturated_samples_are_not_valid(made, tmp_path):
 
 def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
     a = FittedAppearance(TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3)
-    a.save(tmp_path)
-    assert FittedAppearance.load(tmp_path) == a
+    model = Model(tmp_path)
+    a.save(model)
+    assert FittedAppearance.load(model) == a
     path = tmp_path / "appearance.json"
     data = json.loads(path.read_text())
     del data["skin"]
     path.write_text(json.dumps(data))
     with pytest.raises(ValueError, match="skin"):
-        FittedAppearance.load(tmp_path)
+        FittedAppearance.load(model)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match="hairstage fit"):
-        FittedAppearance.load(tmp_path)
+    with pytest.raises(ModelError, match="hairstage fit"):
+        FittedAppearance.load(model)

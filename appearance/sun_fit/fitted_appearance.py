@@ -1,14 +1,13 @@
-"""What a fit leaves in a model folder: `appearance.json`."""
+"""What Sun's fit leaves in a model: `appearance.json`."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from appearance.metrics.scores import Exposure
 from appearance.scene.hair_appearance import HairAppearance
+from reconstruction.model import Model, ModelError
 
 
 @dataclass(frozen=True)
@@ -29,21 +28,15 @@ class FittedAppearance:
     plain_v: float
     printed_v: float
 
-    def save(self, model: Path) -> None:
-        """Write `appearance.json` in the folder `model`, whole or not at all."""
-        path = model / "appearance.json"
+    def save(self, model: Model) -> None:
+        """Write `appearance.json`."""
         data = {**asdict(self), "hair": self.hair.to_dict(), "exposure": self.exposure.scale}
-        temporary = path.with_suffix(".part")
-        temporary.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
-        temporary.replace(path)
+        model.write_json("appearance.json", data)
 
     @classmethod
-    def load(cls, model: Path) -> FittedAppearance:
-        """Read `appearance.json` of `model`; errors name the file and what to do."""
-        path = model / "appearance.json"
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} is missing: run 'hairstage fit CAPTURE {model}' first")
-        data: dict[str, Any] = json.loads(path.read_text())
+    def load(cls, model: Model) -> FittedAppearance:
+        """Read `appearance.json`; `ModelError` names the file and what to do."""
+        data: dict[str, Any] = model.json("appearance.json")
         try:
             colour, skin = (tuple(float(x) for x in data[k]) for k in ("colour", "skin"))
             return cls(
@@ -54,4 +47,5 @@ class FittedAppearance:
                 *(float(data[k]) for k in ("v", "plain_v", "printed_v")),
             )
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: {error!r}: run 'hairstage fit' again") from error
+            path = model.file("appearance.json")
+            raise ModelError(f"{path}: {error!r}: run 'hairstage fit' again") from error
