@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
+from scipy.optimize import least_squares
 
 from reconstruction.arrays import Array
 
@@ -40,36 +41,37 @@ OPEN = 1e-12
 """A conditioning below which a direction counts as open."""
 
 
-def minimise(function: Linearised, x: Array, *, huber: float = 3.0, steps: int = 100) -> Solution:
-    """Minimise residuals in units of their standard deviation, by Levenberg and Marquardt.
+def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:
+    """Minimise residuals in units of their standard deviation, within a region of trust.
 
-    `function(x)` returns the residuals `(m,)` and their derivatives `(m, n)`. Residuals beyond
-    `huber` deviations count linearly. The covariance grows with the residuals where they are larger
-    than their deviations promised, and never shrinks.
+    `function(x)` of `x (n,)` returns the residuals `(m,)` and their derivatives `(m, n)`. Residuals
+    beyond `huber` deviations count linearly. The covariance grows with the residuals where they are
+    larger than their deviations promised, and never shrinks.
     """
     x = np.array(x, dtype=np.float64)
-    r, J = function(x)
-    damping = 1e-3
-    for _ in range(steps):
-        A, g = _normal(r, J, huber)
-        scale = np.sqrt(np.maximum(np.diag(A), np.finfo(float).tiny))
-        scale[scale < 1e-12 * scale.max(initial=0)] = 1.0
-        A, g = A / np.outer(scale, scale), g / scale
-        cost, better = _cost(r, huber), False
-        while damping < 1e12 and not better:
-            change = np.linalg.solve(A + damping * np.eye(len(x)), -g)
-            with np.errstate(all="ignore"):  # a wild step is refused below
-                r_new, J_new = function(x + change / scale)
-            new = _cost(r_new, huber)
-            better = bool(np.isfinite(new) and new < cost)
-            damping *= 0.1 if better else 10.0
-        if not better:
-            break
-        x, r, J = x + change / scale, r_new, J_new
-        damping = max(damping, 1e-12)
-        if cost - new <= 1e-12 * cost:
-            break
-    return _solution(x, r, J, huber)
+    last: dict[bytes, tuple[Array, Any]] = {}
+
+    def at(x: Array) -> tuple[Array, Any]:
+        if (key := x.tobytes()) not in last:
+            last.clear()
+            with np.errstate(all="ignore"):  # a wild step is refused
+                last[key] = function(x)
+        return last[key]
+
+    found = least_squares(
+        lambda x: at(x)[0],
+        x,
+        jac=lambda x: at(x)[1],
+        x_scale="jac",
+        loss="huber",
+        f_scale=huber,
+        ftol=1e-12,
+        xtol=1e-12,
+        gtol=1e-12,
+        max_nfev=200,
+        tr_options={"atol": 1e-12, "btol": 1e-12} if sparse.issparse(at(x)[1]) else {},
+    )
+    return _solution(found.x, *at(found.x), huber)
 
 
 def numeric(residual: Callable[[Array], Array], step: float = 1e-6) -> Linearised:
@@ -83,23 +85,10 @@ def numeric(residual: Callable[[Array], Array], step: float = 1e-6) -> Linearise
     return function
 
 
-def _weights(r: Array, huber: float) -> Array:
-    return np.minimum(1.0, huber / np.maximum(np.abs(r), huber))
-
-
-def _cost(r: Array, huber: float) -> float:
-    a = np.abs(r)
-    return float(np.where(a <= huber, 0.5 * a * a, huber * (a - 0.5 * huber)).sum())
-
-
-def _normal(r: Array, J: Any, huber: float) -> tuple[Array, Array]:
-    weights = _weights(r, huber)
-    A = J.T @ (sparse.diags_array(weights) @ J)
-    return (A.toarray() if sparse.issparse(A) else np.asarray(A)), J.T @ (weights * r)
-
-
 def _solution(x: Array, r: Array, J: Any, huber: float) -> Solution:
-    A, _ = _normal(r, J, huber)
+    weights = np.minimum(1.0, huber / np.maximum(np.abs(r), huber))
+    A = J.T @ (sparse.diags_array(weights) @ J)
+    A = A.toarray() if sparse.issparse(A) else A
     diagonal = np.sqrt(np.diag(A))
     seen = diagonal > 0
     scale = np.where(seen, diagonal, 1.0)
@@ -108,6 +97,6 @@ def _solution(x: Array, r: Array, J: Any, huber: float) -> Solution:
     with np.errstate(divide="ignore"):
         inverse = np.where(values > OPEN * len(x), 1 / np.maximum(values, 1e-300), 1e30)
     freedom = max(len(r) - len(x), 1)
-    spread = max(1.0, 2 * _cost(r, huber) / freedom)
+    spread = max(1.0, float((weights * (2 - weights) * r * r).sum()) / freedom)
     covariance = spread * (vectors * inverse) @ vectors.T / np.outer(scale, scale)
     return Solution(x, r, covariance, conditioning, vectors[:, 0] / scale)

@@ -55,22 +55,16 @@ class Rigid:
         return device.moved(self.rotation, self.translation)
 
 
-def fit_rigid(source: ArrayLike, target: ArrayLike) -> Rigid:
-    """The rigid motion that brings `source (N, 3)` nearest to `target (N, 3)` (Kabsch 1976)."""
-    a, b = np.asarray(source, float), np.asarray(target, float)
-    u, _, vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    keep = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ keep @ vt
-    return Rigid(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
-
-
 def align_devices(found: Sequence[Pinhole], wanted: Sequence[Pinhole]) -> Rigid:
     """The rigid motion from the world of `found` to that of `wanted`, device for device.
 
-    By their centres and by points half a metre along their axes, so that one device suffices.
+    By their centres and by points half a metre along their axes, so that one device suffices
+    (Kabsch 1976).
     """
 
     def points(devices: Sequence[Pinhole]) -> Array:
         return np.concatenate([[d.center, *(d.center + 0.5 * d.R)] for d in devices])
 
-    return fit_rigid(points(found), points(wanted))
+    a, b = points(found), points(wanted)
+    turn, _ = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))
+    return Rigid(turn.as_matrix(), b.mean(axis=0) - turn.apply(a.mean(axis=0)))
