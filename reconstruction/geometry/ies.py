@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +19,6 @@ VERSIONS = {
     "IES:LM-63-2019": 2019,
 }
 """First lines and the edition they stand for; a file of 1986 has none."""
-METRES_PER_FOOT = 0.3048
 _PHOTOMETRY: dict[int, Photometry] = {1: "C", 2: "B", 3: "A"}
 _MILLIWATTS = re.compile(r"\bmw\s*/\s*sr\b|\bmilliwatts?\b", re.IGNORECASE)
 
@@ -29,30 +27,12 @@ class IesError(ValueError):
     """A file that is not LM-63; the message names the file, the line and what was expected."""
 
 
-@dataclass(frozen=True, eq=False)
-class IesFile:
-    """What an LM-63 file says.
-
-    `profile` is the whole distribution, in candela or W/sr, multiplied by the file's multiplier and
-    ballast factors (and its tilt factor). `keywords` keeps the label lines; `opening_m` is the
-    luminous opening (width, length, height), negative for round ones; `lumens` is the rated flux
-    per lamp, or None for absolute photometry. `tilt` holds angles (degrees) and factors `(T, 2)`.
-    """
-
-    version: int
-    keywords: dict[str, str]
-    lamps: int
-    lumens: float | None
-    opening_m: tuple[float, float, float]
-    watts: float
-    tilt: Array | None
-    profile: LightProfile
-
-
 def read_ies(
     path: str | Path, *, unit: Literal["cd", "mW/sr"] | None = None, tilt_deg: float = 0.0
-) -> IesFile:
-    """Read an LM-63 file of any edition, photometry of type A, B or C.
+) -> LightProfile:
+    """The distribution in an LM-63 file of any edition, photometry of type A, B or C.
+
+    In candela or W/sr, multiplied by the file's multiplier, ballast and tilt factors.
 
     LM-63 knows candela only. Makers of infrared, ultraviolet and single-colour lamps write mW/sr in
     the same places: `unit` says which it is; without it a label line that names `mW/sr` or
@@ -66,7 +46,7 @@ def read_ies(
         lines = path.read_bytes().decode("latin-1").splitlines()
     except OSError as error:
         raise IesError(f"{path}: cannot be read: {error.strerror}") from error
-    start, version, keywords = _labels(path, lines)
+    start, version = _labels(path, lines)
     numbers = _Numbers(path, lines, start + 1)
     how = lines[start].split("=", 1)[1].strip().upper()
     tilt = _tilt(numbers) if how == "INCLUDE" else None
@@ -75,18 +55,19 @@ def read_ies(
             f"{path}, line {start + 1}: TILT={how}: tilt files are not looked up; "
             "put the table into the file (TILT=INCLUDE) or use TILT=NONE"
         )
-    lamps = numbers.count("number of lamps")
-    lumens = numbers.take("lumens per lamp")
+    numbers.count("number of lamps")
+    numbers.take("lumens per lamp")
     multiplier = numbers.take("multiplier", 0.0)
     sizes = [numbers.count(f"number of {k} angles") for k in ("vertical", "horizontal")]
     kind = numbers.one_of("photometric type (1 C, 2 B, 3 A)", (1, 2, 3))
-    metres = 1.0 if numbers.one_of("units (1 feet, 2 metres)", (1, 2)) == 2 else METRES_PER_FOOT
-    opening = [numbers.take(f"opening's {k}") * metres for k in ("width", "length", "height")]
+    numbers.one_of("units (1 feet, 2 metres)", (1, 2))
+    for side in ("width", "length", "height"):
+        numbers.take(f"opening's {side}")
     multiplier *= numbers.take("ballast factor", 0.0)
     photometric_factor = numbers.take("ballast-lamp photometric factor", 0.0)
     if version <= 1995:  # later editions keep the place for something that is no factor
         multiplier *= photometric_factor
-    watts = numbers.take("input watts")
+    numbers.take("input watts")
     if tilt is not None:
         multiplier *= float(np.interp(tilt_deg, tilt[:, 0], tilt[:, 1]))
     photometry = _PHOTOMETRY[kind]
@@ -94,55 +75,34 @@ def read_ies(
     values = numbers.many("candela values", sizes[0] * sizes[1], 0.0).reshape(sizes[1], sizes[0])
     numbers.end()
     radiometric = unit == "mW/sr" or (
-        unit is None and any(_MILLIWATTS.search(f"{k} {v}") for k, v in keywords.items())
+        unit is None and any(_MILLIWATTS.search(line) for line in lines[:start])
     )
     value_unit: Unit = "W/sr" if radiometric else "cd"
     values = values * (multiplier * (1e-3 if radiometric else 1.0))
-    profile = (
-        _type_c(path.stem, vertical, horizontal, values, value_unit)
-        if photometry == "C"
-        else _type_a_or_b(path.stem, vertical, horizontal, values, photometry, value_unit)
-    )
-    return IesFile(
-        version,
-        keywords,
-        lamps,
-        None if lumens < 0 else lumens,
-        (opening[0], opening[1], opening[2]),
-        watts,
-        tilt,
-        profile,
-    )
+    if photometry == "C":
+        return _type_c(path.stem, vertical, horizontal, values, value_unit)
+    return _type_a_or_b(path.stem, vertical, horizontal, values, photometry, value_unit)
 
 
-def _labels(path: Path, lines: list[str]) -> tuple[int, int, dict[str, str]]:
-    """Index of the TILT= line, edition and label lines."""
+def _labels(path: Path, lines: list[str]) -> tuple[int, int]:
+    """Index of the TILT= line, and the edition."""
     tilt = next((i for i, s in enumerate(lines) if s.strip().upper().startswith("TILT=")), None)
     if tilt is None:
         raise IesError(f"{path}, line {len(lines)}: no line starts with TILT=: not an LM-63 file")
     first = lines[0].strip().upper() if tilt else ""
     version = VERSIONS.get(first, 1986)
-    if version == 1986 and re.match(r"IES(NA)?:?\s*(LM-63|\d\d)", first):
-        raise IesError(f"{path}, line 1: edition {first!r} is unknown; known are {list(VERSIONS)}")
-    keywords: dict[str, str] = {}
-    last = ""
-    for number, line in enumerate(lines[:tilt], 1):
-        if number == 1 and version != 1986:
-            continue
-        found = re.match(r"\s*\[([^\]]*)\]\s*(.*)", line)
-        if found is None:
-            if version != 1986 and line.strip():
-                raise IesError(
-                    f"{path}, line {number}: expected a [KEYWORD] line or TILT=, got {line!r}"
-                )
-            keywords[f"line {number}"] = line.strip()
-        elif found[1].upper() == "MORE" and last:
-            keywords[last] += "\n" + found[2].strip()
-        else:
-            last = found[1].upper()
-            said = found[2].strip()
-            keywords[last] = f"{keywords[last]}\n{said}" if last in keywords else said
-    return tilt, version, keywords
+    if version == 1986:
+        if re.match(r"IES(NA)?:?\s*(LM-63|\d\d)", first):
+            raise IesError(
+                f"{path}, line 1: edition {first!r} is unknown; known are {list(VERSIONS)}"
+            )
+        return tilt, version
+    for number, line in enumerate(lines[1:tilt], 2):
+        if line.strip() and not re.match(r"\s*\[[^\]]*\]", line):
+            raise IesError(
+                f"{path}, line {number}: expected a [KEYWORD] line or TILT=, got {line!r}"
+            )
+    return tilt, version
 
 
 class _Numbers:

@@ -175,10 +175,10 @@ def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LightProfile]:
                 raise RigError(f"unknown fields {sorted(unknown)}")
             unit = table.get("unit")
             of_file = None if unit == "relative" else unit
-            read = read_ies(
+            profile = read_ies(
                 folder / table["file"], unit=of_file, tilt_deg=float(table.get("tilt_deg", 0.0))
             )
-            profile = read.profile.relative() if unit == "relative" else read.profile
+            profile = profile.relative() if unit == "relative" else profile
             out[name] = replace(profile, name=name)
         except (ValueError, TypeError) as error:
             raise RigError(f"{where}: {error}") from error

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from skimage.transform import SimilarityTransform
 
 from reconstruction.arrays import Array, Ints
 
@@ -83,14 +84,13 @@ def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
         raise ValueError(
             f"expected at least 3 pairs of landmarks, got {source.shape} and {target.shape}"
         )
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    if s[1] < 1e-6 * s[0]:
-        raise ValueError("the landmarks lie on a line: their rotation is undetermined")
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float((s * sign).sum() / (a**2).sum())
-    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+    for side in (source, target):
+        spans = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
+        if spans[1] < 1e-3 * spans[0]:
+            raise ValueError("the landmarks lie on a line: their rotation is undetermined")
+    found = SimilarityTransform.from_estimate(source, target)
+    scale = float(found.scale)
+    return scale, found.params[:3, :3] / scale, np.asarray(found.translation)
 
 
 def find_pose(
