@@ -10,15 +10,18 @@ from pathlib import Path
 
 from stage_service.cli.support import FAILED, CommandError, Commands, Output
 
-BENCHMARKS = (
-    "acquisition",
-    "agreement",
-    "appearance",
-    "renderers",
-    "light_planes",
-    "light_codes",
-    "all",
-)
+BENCHMARKS = {
+    "acquisition": "steps and bytes a second beside what wires and disk allow",
+    "agreement": "a capture that Blender Cycles rendered, from its true strands",
+    "appearance": "inverse rendering and its ablations on subjects of known appearance",
+    "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
+    "gradients": "path replay beside finite differences",
+    "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
+    "light_planes": "strands of three subjects, still and drifting, beside baselines",
+    "renderers": "our renderers beside Mitsuba's path integrator, light by light and line by line",
+    "all": "every one of them",
+}
+"""What each is about, for `python -m benchmarks` and its help too."""
 
 
 def add(commands: Commands) -> None:
@@ -28,7 +31,7 @@ def add(commands: Commands) -> None:
         help="measure error against run time (in a checkout)",
         description="Run a benchmark of the checkout; what follows NAME is its own.",
     )
-    bench.add_argument("name", choices=BENCHMARKS)
+    bench.add_argument("name", choices=tuple(BENCHMARKS))
     bench.add_argument("arguments", nargs=argparse.REMAINDER)
     bench.set_defaults(run=run_bench, json=False)
 

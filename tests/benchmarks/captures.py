@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ class SimulatedCapture:
         command = SimulatedRig(rig, self.subject, self.head, self.seed).command(
             *("--state", folder / "simulated", "--truth", truth, "--ports", "auto"),
             *("--spp", str(self.spp), "--drift-mm", str(self.drift_mm)),
-            *("--cache", cache.resolve() / "lamps"),
+            *("--cache", cache.resolve() / "lights"),
         )
         with Children(folder / "logs") as children:
             devices = children.ready("simulators", command, 300)["devices"]
@@ -78,6 +79,50 @@ class SimulatedCapture:
         if capture["outcome"] != "completed":
             raise CommandError(f"{self.name}: {capture['outcome']}: {capture['error']}", FAILED)
         return Path(capture["path"]).resolve()
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Cameras or projectors that look at one point."""
+
+    target: tuple[float, float, float]
+    fov_deg: float
+
+    def device(self, kind: str, number: int, position: Sequence[float]) -> str:
+        """The start of a device's table in a rig file."""
+        place = [round(p, 5) for p in position]
+        return (
+            f'[[{kind}]]\nname = "{kind[:3] if kind == "cameras" else "proj"}_{number:02d}"\nposition = {place}\n'
+            f"target = {list(self.target)}\nfov_deg = {self.fov_deg:.5f}\n"
+        )
+
+
+def levels(all_on: float) -> str:
+    """Exposures and levels of a rig file."""
+    exposure = ", ".join(f"{k} = 0.02" for k in ("dark", "all_on", "olat", "scanline", "tracking"))
+    return (
+        f"retries = 2\nexposure = {{{exposure}}}\n"
+        f"level = {{all_on = {all_on}, olat = 1.0, scanline = 1.0, tracking = 0.4}}"
+    )
+
+
+def rig_file(name: str, dome: str, devices: Sequence[str], capture: str) -> str:
+    """The text of a simulated rig's file: tables of `dome`, cameras and projectors, `capture`."""
+    swept = any(text.startswith("[[projectors]]") for text in devices)
+    tables = [
+        f'name = "{name}"',
+        f"[dome]\nintensity = [8.0, 8.0, 8.0]\n{dome}",
+        *devices,
+        "[devices]\nheartbeat_s = 1.0\nwatchdog_s = 10.0",
+        '[devices.lights]\nkind = "modbus_tcp"\nhost = "127.0.0.1"\nport = 15020',
+        '[devices.trigger]\nkind = "serial"\nport = "trigger"',
+        *['[devices.projectors]\nkind = "serial"\nport = "projectors"'] * swept,
+        '[devices.cameras]\nkind = "link"\nhost = "127.0.0.1"\nport = 15021\n'
+        "timeout_s = 120.0\nbusy_s = 14400.0",
+        "[safety]\nliving_subject = false",
+        f"[capture]\n{capture}",
+    ]
+    return "\n\n".join(tables) + "\n"
 
 
 def _content(subject: str | None) -> str | None:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.results import new_figure
 from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
@@ -31,8 +30,7 @@ def picture_model(
     """
     camera = capture.rig.cameras[min(1, len(capture.rig.cameras) - 1)]
     photograph = _exposed(capture.frame(capture.of_kind("all_on")[0], camera.name))
-    figure = Figure(figsize=(14, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(4, 1, (3.5, 4.6))
     panels = figure.subplots(1, 4)
     panels[0].imshow(photograph)
     pixels, depth = camera.project(cloud.points)
@@ -61,8 +59,7 @@ def picture_strands(path: Path, camera: Camera, sets: Mapping[str, Strands]) -> 
     The nearest point of each pixel has a colour by its tangent in the camera's frame: |x|, |y|, |z|
     are red, green and blue. The head is not drawn: what lies behind is seen through gaps.
     """
-    figure = Figure(figsize=(3.6 * len(sets), 3.9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(len(sets))
     for axes, (title, strands) in zip(figure.subplots(1, len(sets)), sets.items(), strict=True):
         dense = strands.resampled(2e-4)
         pixels, depth = camera.project(dense.points)
@@ -79,8 +76,7 @@ def picture_strands(path: Path, camera: Camera, sets: Mapping[str, Strands]) -> 
 
 def picture_motion(path: Path, clouds: Mapping[str, PointCloud]) -> None:
     """The same slice |x| < 1.5 mm through each of `clouds` side by side, as a PNG."""
-    figure = Figure(figsize=(4.6 * len(clouds), 4.8), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(len(clouds), 1, (4.6, 4.8))
     panels = figure.subplots(1, len(clouds), squeeze=False)[0]
     for axes, (title, cloud) in zip(panels, clouds.items(), strict=True):
         slab = np.abs(cloud.points[:, 0]) < _SLAB

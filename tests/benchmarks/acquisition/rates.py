@@ -1,32 +1,37 @@
-"""Steps a second and bytes a second of the acquisition, beside what wires and disk allow."""
+"""Steps and bytes a second of the acquisition, beside what wires and disk allow.
+
+Leaves `acquisition.json`.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import socket
 import statistics
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.acquisition.writing import measure
+from benchmarks.command import Benchmark
+from benchmarks.results import save
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.report.report import Progress, silent
 from stage_service.acquisition.sequencer import Sequencer
-from stage_service.config import RigFile
+from stage_service.cli.support.children import Children
+from stage_service.config import RigFile, load_rig_file
 from stage_service.devices.device_set import Stage
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 from stage_service.plan.stepping import period_s
 
-Simulate = Callable[[str], AbstractContextManager[RigFile]]
-"""Runs the simulated stage of a rig file's text, wires paced by their baud rates."""
-
-LAMPS, STEPS = 331, 150
+LIGHTS, STEPS = 331, 150
 BAUD = 115200
 RTU_BITS = 11
 """Bits on the wire for a byte: start, 8 data, parity, stop."""
@@ -37,31 +42,46 @@ SIZES: tuple[dict[str, int], ...] = (
 """Frames that are written: a megapixel rig's, and the demonstration's."""
 RTU_SILENCE_S = 1.75e-3
 """Between frames above 19200 baud (Modbus over serial line 1.02, 2.5.1.1)."""
-DMX_S = (92e-6 + 12e-6) + (1 + LAMPS) * 44e-6
+DMX_S = (92e-6 + 12e-6) + (1 + LIGHTS) * 44e-6
 """Break, mark after break, start code and a slot for each lamp (ANSI E1.11)."""
 
 
-def run(out: Path, simulate: Simulate, progress: Progress = silent) -> dict[str, Any]:
+@contextmanager
+def simulated(rig: str) -> Iterator[RigFile]:
+    """Run the simulated stage of a rig file's text, wires paced by their baud rates."""
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        (folder / "rig.toml").write_text(rig)
+        command = [sys.executable, "-m", "simulators", "--rig", str(folder / "rig.toml")]
+        command += ["--state", str(folder), "--ports", "auto", "--spp", "1", "--paced"]
+        with Children(folder / "logs") as children:
+            children.ready("simulators", command, 120)
+            yield load_rig_file(folder / "rig.toml", folder / "devices.toml")
+
+
+def run(out: Path, *, quick: bool = False, progress: Progress = silent) -> dict[str, Any]:
     """Measure everything and write `out/acquisition.json`; returns what it holds."""
-    result: dict[str, Any] = {"lamps": [], "captures": [], "writing": []}
+    result: dict[str, Any] = {"lights": [], "captures": [], "writing": []}
     for i, kind in enumerate(_LIMITS):
-        progress(f"lamps on {kind}", 0.1 * i)
-        result["lamps"].append(_lamps(kind, simulate))
-    for i, stepping in enumerate(("software", "hardware")):
+        progress(f"lights on {kind}", 0.1 * i)
+        result["lights"].append(_lights(kind))
+        save(out / "acquisition.json", result)
+    for i, stepping in enumerate(() if quick else ("software", "hardware")):
         progress(f"captures, {stepping}-stepped", 0.3 + 0.2 * i)
         with TemporaryDirectory(dir=out) as folder:
-            result["captures"].append(_capture(Path(folder), stepping, simulate))
-    for i, size in enumerate(SIZES):
+            result["captures"].append(_capture(Path(folder), stepping))
+        save(out / "acquisition.json", result)
+    for i, size in enumerate(SIZES[1:] if quick else SIZES):
         progress("writing", 0.7 + 0.15 * i)
         with TemporaryDirectory(dir=out) as folder:
             result["writing"].append(measure(Path(folder), **size))
-    (out / "acquisition.json").write_text(json.dumps(result, indent=1) + "\n")
+        save(out / "acquisition.json", result)
     return result
 
 
-def _lamps(kind: str, simulate: Simulate) -> dict[str, Any]:
+def _lights(kind: str) -> dict[str, Any]:
     """Steps of one lamp on and off again, each confirmed as the link allows."""
-    with simulate(_rig(kind)) as rig_file:
+    with simulated(_rig(kind)) as rig_file:
         lights = Stage.of(rig_file).lights
         lights.connect()
         lights.set_level(1.0)
@@ -124,13 +144,13 @@ _LIMITS: dict[str, Callable[[], float]] = {
 """Seconds that the link needs for a step, at best."""
 
 
-def _capture(out: Path, stepping: str, simulate: Simulate) -> dict[str, Any]:
+def _capture(out: Path, stepping: str) -> dict[str, Any]:
     """Captures of all lamps, the second of which finds every picture made already.
 
     `service_ms_per_step_median` is what a step takes beyond the calls to devices; the processor's
     time has the drivers' and the writer's work in it, on all threads.
     """
-    with simulate(_rig("modbus_tcp")) as rig_file:
+    with simulated(_rig("modbus_tcp")) as rig_file:
         asked = CapturePlan(stepping="hardware" if stepping == "hardware" else "software")
         plan = resolve(asked, rig_file)
         steps, cost = plan.steps, plan.cost
@@ -181,7 +201,7 @@ height = 32
     return f"""
 name = "bench"
 [dome]
-lights = {LAMPS}
+lights = {LIGHTS}
 radius = 1.2
 intensity = [8.0, 8.0, 8.0]
 {cameras}
@@ -204,3 +224,10 @@ dark = 0.005
 all_on = 0.005
 olat = 0.005
 """
+
+
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    return run(args.out, quick=args.quick, progress=progress)
+
+
+BENCHMARK = Benchmark(_bench)

@@ -1,10 +1,14 @@
-"""Benchmark: the fit's ablations beside baselines, on subjects of known appearance."""
+"""Inverse rendering and its ablations beside baselines, on subjects of known appearance.
+
+And on the frames that Cycles rendered, where they are. Leaves `appearance.json`, `appearance.md`,
+`appearance_cycles.json` and `appearance_cycles_from_afar.json`.
+"""
 
 from __future__ import annotations
 
-import json
+import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +19,17 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.loop import Stage1Options, run
 from appearance.inverse_rendering.problem import Effort, Problem
 from appearance.observations import Observed
-from appearance.scene.hair_appearance import HairAppearance
-from benchmarks.appearance.known_subjects import SUBJECTS, Captured, Rig, on_bent, subject
-from benchmarks.appearance.table import GROUPS, Table, named
+from benchmarks.appearance.known_subjects import SUBJECTS, Captured, Rig, known_subject
+from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
+from benchmarks.results import markdown, save, spread
+from benchmarks.subjects import Subject, simulated
+from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
+from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
+from benchmarks.appearance.table import GROUPS, Table
 from reconstruction.arrays import Array
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, silent
 
-QUICK = Stage1Options(
+OPTIONS = Stage1Options(
     steps=30,
     check_every=30,
     shape=(6, 24, 24),
@@ -43,54 +49,45 @@ PLAIN = Effort(spp=16, gradient_spp=16)
 
 def run_bench(
     out: Path,
-    strands: Strands,
-    head: Mesh | None,
-    hair: HairAppearance,
-    skin: Array,
+    subject: Subject,
     *,
-    names: Sequence[str] = SUBJECTS,
     seeds: int = 1,
-    options: Stage1Options = QUICK,
+    options: Stage1Options = OPTIONS,
     rig: Rig = STAGE,
-    plain: bool = True,
-    progress: Progress = silent,
     seed: int = 0,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """The table of every subject; recovery, also from afar, on (a); error against time on (b).
 
-    The rows up to "spatial" of (b) for all `seeds`. Writes `appearance.json` and `appearance.md`
-    into `out`, as far as it is, and returns the former.
+    The variants up to "spatial" of (b) for all `seeds`, with their spread. Writes what there is so
+    far into `out`, and returns what `appearance.json` holds.
     """
     result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
-    made: dict[str, Captured] = {}
-    for name in names:
-        if name == "c" and "b" in made:
-            captured = on_bent(made["b"], strands, head, seed)
-        else:
-            captured = subject(name, strands, head, hair, skin, rig, seed)
-        made[name] = captured
-        rows = Table(captured, options, progress=named(progress, name), seed=seed).run()
+    captured: Captured | None = None
+    for name in SUBJECTS:
+        captured = known_subject(name, subject, rig, seed, captured)
+        rows = Table(captured, options, progress=within(progress, f"({name})"), seed=seed).run()
         result["subjects"][name] = rows
         _write(out, result)
         if name == "a":
-            result["recovery"] = recovery(captured, rows, options, named(progress, name), seed)
-            result["starts"] = from_afar(captured, options, named(progress, name), seed)
+            result["recovery"] = recovery(captured, rows, options, within(progress, f"({name})"), seed)
+            result["starts"] = from_afar(captured, options, within(progress, f"({name})"), seed)
         if name == "b":
-            result["seeds"] = [
-                _final(Table(captured, options, seed=seed + k).run(("original", "spatial")))
-                for k in range(1, seeds)
-            ]
-            if plain:
-                result["time"] = error_against_time(captured, options, progress, seed)
+            found = [_final(rows)]
+            for k in range(1, seeds):
+                table = Table(captured, options, progress=within(progress, f"({name})"), seed=seed + k)
+                found.append(_final(table.run(("original", "spatial"))))
+            shared = [n for n in found[0] if all(n in f for f in found)]
+            result["seeds"] = {n: spread([f[n] for f in found]) for n in shared}
+            _write(out, result)
+            result["time"] = error_against_time(captured, options, progress, seed)
         _write(out, result)
     return result
 
 
 def _write(out: Path, result: dict[str, Any]) -> None:
-    """What there is so far: a benchmark of an hour may be interrupted."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "appearance.json").write_text(json.dumps(result, indent=1) + "\n")
-    (out / "appearance.md").write_text(markdown(result))
+    save(out / "appearance.json", result)
+    (out / "appearance.md").write_text(report(result))
 
 
 def recovery(
@@ -100,10 +97,10 @@ def recovery(
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """What is recovered from frames with noise, and with lamps 2 mm and 3 % off their calibration.
+    """What is recovered from frames with noise, and with lights 2 mm and 3 % off their calibration.
 
-    `rows` are those of the table of the frames as they are. The row "original" (lamps as
-    calibrated) and, with lamps off, "lights" (lamps fitted too).
+    `rows` are those of the table of the frames as they are. The variant "original" (lights
+    as calibrated) and, with lights off, "lights" (lights fitted too).
     """
     rng = np.random.default_rng([seed, 9])
     lights = captured.views[0].lights
@@ -131,23 +128,23 @@ def recovery(
     out = {"as captured": _recovered(rows)}
     name = "noise of 2 % of white and 500 electrons at white"
     table = Table(
-        replace(captured, views=tuple(noisy)), options, progress=named(progress, name), seed=seed
+        replace(captured, views=tuple(noisy)), options, progress=within(progress, f"({name})"), seed=seed
     )
     out[name] = _recovered(table.run(("original",)))
-    name = "lamps 2 mm and 3 % off"
-    table = Table(captured, options, lights=off, progress=named(progress, name), seed=seed)
+    name = "lights 2 mm and 3 % off"
+    table = Table(captured, options, lights=off, progress=within(progress, f"({name})"), seed=seed)
     out[name] = _recovered(table.run(("original", "lights")))
     true = np.array([lights[i].intensity[0] for i in captured.train_lights])
     known = np.array([off[i].intensity[0] for i in captured.train_lights])
-    out[name]["original"]["lamps_off"] = _relative_spread(known / true)
-    out[name]["lights"]["lamps_off"] = _relative_spread(known * table.found[1].gain / true)
+    out[name]["original"]["lights_off"] = _relative_spread(known / true)
+    out[name]["lights"]["lights_off"] = _relative_spread(known * table.found[1].gain / true)
     return out
 
 
 def from_afar(
     captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """What the row "original" finds of one colour from `STARTS`, and in how many CPU seconds."""
+    """What the variant "original" finds of one colour from `STARTS`, and in how many CPU seconds."""
     true, out = captured.truth.mean(), []
     problem = Problem(captured.mapped, captured.training(), captured.exposure.scale, captured.skin)
     for beta_m, beta_n, eta, (r, g, b) in STARTS:
@@ -183,7 +180,7 @@ def _recovered(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def _relative_spread(ratio: Array) -> float:
-    """RMS of what lamps differ by from each other: all of them together is the hair's colour."""
+    """RMS of what lights differ by from each other: all of them together is the hair's colour."""
     return float(np.std(ratio / ratio.mean()))
 
 
@@ -259,47 +256,84 @@ def _final(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
     return {name: row[GROUPS[1]]["psnr_clean"] for name, row in rows.items()}
 
 
-def markdown(result: dict[str, Any]) -> str:
+def report(result: dict[str, Any]) -> str:
     """The tables, for people."""
+    head = [
+        "variant",
+        f"{GROUPS[1]}: PSNR without noise",
+        "PSNR",
+        "SSIM",
+        f"{GROUPS[0]}: PSNR without noise",
+        "β_M off",
+        "β_N off",
+        "most σ off",
+        "s",
+    ]
+    errors = ("beta_m_error", "beta_n_error", "sigma_a_error")
     lines = []
     for name, rows in result["subjects"].items():
-        lines += [
-            f"## Subject ({name})",
-            "",
-            "| row | held-out views, lights: PSNR without noise | PSNR | SSIM | training views, "
-            "held-out lights: PSNR without noise | β_M off | β_N off | mean σ off | s |",
-            "|---|---|---|---|---|---|---|---|---|",
-        ]
+        cells = []
         for row, figures in rows.items():
             held, train = figures[GROUPS[1]], figures[GROUPS[0]]
-            off = [
-                f"{100 * figures[k]:+.1f} %" if k in figures else ""
-                for k in ("beta_m_error", "beta_n_error", "sigma_a_error")
-            ]
-            lines.append(
-                f"| {row} | {held['psnr_clean']:.2f} | {held['psnr']:.2f} | {held['ssim']:.3f} | "
-                f"{train['psnr_clean']:.2f} | {' | '.join(off)} | "
-                f"{figures.get('seconds', 0):.0f} |"
-            )
-        lines.append("")
+            scores = [f"{held['psnr_clean']:.2f}", f"{held['psnr']:.2f}", f"{held['ssim']:.3f}"]
+            off = [f"{100 * figures[k]:+.1f} %" if k in figures else "" for k in errors]
+            seconds = f"{figures.get('seconds', 0):.0f}"
+            cells.append([row, *scores, f"{train['psnr_clean']:.2f}", *off, seconds])
+        lines += [f"## Subject ({name})", "", markdown(head, cells)]
+    for name, found in result.get("seeds", {}).items():
+        sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
+        lines.append(f"- (b), {name}: {found['mean']:.2f}{sd} dB over {found['seeds']} seeds")
     for case, rows in result.get("recovery", {}).items():
         for row, found in rows.items():
-            lamps = f", lamps {100 * found['lamps_off']:.1f} % off" if "lamps_off" in found else ""
-            lines.append(
-                f"- {case}, {row}: {found['psnr_clean']:.2f} dB, "
-                f"β_M {100 * found['beta_m_error']:+.1f} %, "
-                f"β_N {100 * found['beta_n_error']:+.1f} %, "
-                f"σ {100 * found['sigma_a_error']:.1f} %{lamps}"
-            )
+            lights = f", lights {100 * found['lights_off']:.1f} % off" * ("lights_off" in found)
+            lines.append(f"- {case}, {row}: {found['psnr_clean']:.2f} dB, {_off(found)}{lights}")
     for row in result.get("starts", []):
         start = row["start"]
-        sigma_a = ", ".join(f"{100 * e:+.1f}" for e in row["sigma_a_error"])
         lines.append(
             f"- from β_M {start['beta_m']:g}, β_N {start['beta_n']:g}, η {start['eta']:g}: "
-            f"β_M {100 * row['beta_m_error']:+.1f} %, β_N {100 * row['beta_n_error']:+.1f} %, "
-            f"η {row['eta']:.3f}, σ {sigma_a} %, {row['cpu_seconds']:.0f} CPU s"
+            f"{_off(row)}, η {row['eta']:.3f}, {row['cpu_seconds']:.0f} CPU s"
         )
     for name, curve in result.get("time", {}).items():
         points = ", ".join(f"{p['cpu_seconds']:.0f} s: {p['psnr_clean']:.2f}" for p in curve)
         lines.append(f"- {name}: {points}")
     return "\n".join(lines) + "\n"
+
+
+def _off(found: dict[str, Any]) -> str:
+    sigma_a = ", ".join(f"{100 * e:+.1f}" for e in np.atleast_1d(found["sigma_a_error"]))
+    beta_m, beta_n = (100 * found[f"beta_{x}_error"] for x in "mn")
+    return f"β_M {beta_m:+.1f} %, β_N {beta_n:+.1f} %, σ {sigma_a} %"
+
+
+QUICK = Stage1Options(
+    steps=2,
+    check_every=2,
+    shape=(2, 2, 2),
+    effort=Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4),
+)
+SMALL = Rig(size=14, cameras=3, lights=6, spp=64, max_depth=4)
+
+
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    subject = simulated(args.rig, args.subject, args.head, args.seed)
+    effort: dict[str, Any] = {"options": QUICK, "rig": SMALL} if args.quick else {}
+    seeds = min(args.seeds, 1) if args.quick else args.seeds
+    result = run_bench(
+        args.out, subject, seeds=seeds, seed=args.seed, progress=progress, **effort
+    )
+    try:
+        folder = cycles_folder(args.capture)
+    except LeftOut as error:
+        return {**result, "cycles": {"left_out": str(error)}}
+    for name, start in (("cycles", None), ("cycles_from_afar", AFAR)):
+        frames = CyclesFrames.read(folder, pixels=40 if args.quick else 600, seed=args.seed)
+        found = fit_cycles(frames, start, options=QUICK if args.quick else CYCLES_OPTIONS, progress=progress)
+        save(args.out / f"appearance_{name}.json", found)
+        result[name] = found
+    return result
+
+
+BENCHMARK = Benchmark(
+    _bench,
+    (*SUBJECT, CAPTURE, option("--seeds", "of the spread on subject (b)", type=int, default=3)),
+)

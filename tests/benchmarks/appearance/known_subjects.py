@@ -19,10 +19,10 @@ from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
+from benchmarks.subjects import Subject
 from reconstruction.arrays import Array, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 
 SUBJECTS = ("a", "b", "c")
@@ -33,7 +33,7 @@ _BEND = 0.1
 
 @dataclass(frozen=True)
 class Rig:
-    """A small stage: cameras on a ring, lamps on a dome; every other lamp is held out.
+    """A small stage: cameras on a ring, lights on a dome; every other one is held out.
 
     Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`.
     """
@@ -88,22 +88,19 @@ class Captured:
         ]
 
 
-def subject(
-    name: str,
-    strands: Strands,
-    head: Mesh | None,
-    hair: HairAppearance,
-    skin: Array,
-    rig: Rig | None = None,
-    seed: int = 0,
+def known_subject(
+    name: str, subject: Subject, rig: Rig, seed: int = 0, before: Captured | None = None
 ) -> Captured:
-    """Subject `name` of `SUBJECTS`, its base colour and roughness those of `hair`."""
+    """Subject `name` of `SUBJECTS`, its base colour and roughness those of `subject`.
+
+    (c) has the frames of `before`, which is (b); None captures them.
+    """
     if name not in SUBJECTS:
         raise ValueError(f"there is no subject {name!r}; there are {SUBJECTS}")
     if name == "c":
-        return on_bent(subject("b", strands, head, hair, skin, rig, seed), strands, head, seed)
-    rig = rig or Rig()
-    scene = build_scene(strands, head, hair=hair, skin=skin)
+        return _on_bent(before or known_subject("b", subject, rig, seed), subject, seed)
+    strands, head, hair = subject.strands, subject.head, subject.hair
+    scene = subject.scene()
     mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, head))
     truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed)
     shown = mapped.painted(truth)
@@ -133,7 +130,7 @@ def subject(
         mapped,
         mapped,
         truth,
-        skin,
+        np.array(subject.skin),
         tuple(views),
         tuple(halves),
         held_views,
@@ -144,11 +141,11 @@ def subject(
     )
 
 
-def on_bent(captured: Captured, strands: Strands, head: Mesh | None, seed: int = 0) -> Captured:
-    """The frames of `captured`, whose strands are `strands`, to be fitted on bent ones."""
+def _on_bent(captured: Captured, subject: Subject, seed: int) -> Captured:
+    """The frames of `captured`, to be fitted on bent strands."""
     uv = captured.mapped.root_uv
-    noisy = bent(strands, uv, TANGENT_NOISE_DEG, seed)
-    scene = build_scene(noisy, head, hair=captured.truth.mean(), skin=captured.skin)
+    noisy = bent(subject.strands, uv, TANGENT_NOISE_DEG, seed)
+    scene = build_scene(noisy, subject.head, hair=captured.truth.mean(), skin=captured.skin)
     return replace(captured, mapped=MappedStrands.of(scene, noisy, uv))
 
 

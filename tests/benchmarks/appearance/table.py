@@ -19,6 +19,7 @@ from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.sun_fit.fit import FitOptions
 from benchmarks.appearance.known_subjects import Captured
+from benchmarks.command import within
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.lights import Light
 from reconstruction.report.report import Progress, Stage, silent
@@ -55,11 +56,9 @@ class Table:
         self._score(
             "three nearest",
             [
-                (
-                    self._nearest(views[k], captured.halves[k][0], i),
-                    self._nearest(views[k], captured.halves[k][1], i),
-                )
+                (self._nearest(views[k], one, i), self._nearest(views[k], other, i))
                 for k, i in pairs
+                for one, other in [captured.halves[k]]
             ],
         )
         begun = time.perf_counter()
@@ -83,7 +82,7 @@ class Table:
                 lamps,
                 options=replace(self.options, row=row),
                 seed=self.seed,
-                progress=named(self.progress, row),
+                progress=within(self.progress, f"({row})"),
             )
             maps, lamps = found.maps, found.lamps
             self.score_maps(row, maps, captured.mapped, time.perf_counter() - begun)
@@ -179,7 +178,3 @@ def _image(values: Array, pixels: Ints, size: tuple[int, int]) -> Array:
     out[pixels] = values
     return out.reshape(*size, 3)
 
-
-def named(progress: Progress, name: str) -> Progress:
-    """`progress` that says first what it is about."""
-    return lambda what, share: progress(f"({name}) {what}", share)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from math import pi
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf import reference as ref
@@ -47,17 +49,12 @@ class Case:
 
 def array_types(double: bool) -> tuple[Any, Any]:
     """(float, vector of 3) Dr.Jit types of the back end that Mitsuba's variant has."""
-    import drjit as dr
-    import mitsuba as mi
-
     module: Any = dr.cuda.ad if str(mi.variant()).startswith("cuda") else dr.llvm.ad
     return (module.Float64, module.Array3f64) if double else (module.Float, module.Array3f)
 
 
 def fibre(case: Case, double: bool) -> Fibre:
     """The fibre of `case`, in variables that kernels read from memory: one kernel for all cases."""
-    import drjit as dr
-
     number, vector = array_types(double)
     values = {name: dr.opaque(number, value) for name, value in case.optics.items()}
     return Fibre(vector(dr.opaque(number, case.sigma_a)), **values)
@@ -65,8 +62,6 @@ def fibre(case: Case, double: bool) -> Fibre:
 
 def known_direction(case: Case, double: bool) -> Any:
     """`wi` of `case`, in variables that kernels read from memory."""
-    import drjit as dr
-
     number, vector = array_types(double)
     return vector(*(dr.opaque(number, float(x)) for x in case.wi))
 

@@ -1,22 +1,31 @@
-"""Our hair BSDF beside Mitsuba's stock `hair`: the tables of docs/bsdf.md.
+"""Our hair BSDF beside Mitsuba's stock `hair`: tables and pictures of docs/bsdf.md.
 
-`python -m benchmarks.bsdf.mitsuba_comparison` prints them; a test holds both to what they say.
+Leaves `bsdf.json`, `bsdf.md`, `bsdf_sheet.png` and `bsdf_furnace.png`; a test holds both BSDFs to
+what the tables say.
 """
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.special import i0e
 
 from appearance.bsdf import lobes, reference
 from appearance.bsdf.bessel import scaled_i0
 from appearance.scene.backend import ensure_backend
+from benchmarks.bsdf import pictures
 from benchmarks.bsdf.integrals import Case, array_types, fibre, sphere, uniforms
+from benchmarks.command import Benchmark
+from benchmarks.results import markdown, save
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
+from reconstruction.report.report import Progress
 
 SAMPLES = 200_000
 CASES = [
@@ -57,9 +66,6 @@ class Measured:
 
 def measured(bsdf: Any, case: Case) -> Measured:
     """`bsdf` (a Mitsuba BSDF) at the direction of `case`, in float32."""
-    import drjit as dr
-    import mitsuba as mi
-
     def interaction(lanes: int) -> Any:
         si: Any = dr.zeros(mi.SurfaceInteraction3f, lanes)
         si.wi = mi.Vector3f(*map(float, case.wi))
@@ -87,10 +93,8 @@ def measured(bsdf: Any, case: Case) -> Measured:
     )
 
 
-def both(case: Case) -> tuple[Measured, Measured]:
+def compare(case: Case) -> tuple[Measured, Measured]:
     """Ours and the stock plugin in one case, made from the same dictionary."""
-    import mitsuba as mi
-
     shared = {
         "longitudinal_roughness": case.beta_m,
         "azimuthal_roughness": case.beta_n,
@@ -109,8 +113,6 @@ def bessel_errors(x: float) -> tuple[float, float]:
     Mitsuba's is read off its longitudinal lobe where both directions are across the fibre: there
     the lobe is I0(x) exp(-x) x / (2 pi (1 - exp(-2x))).
     """
-    import mitsuba as mi
-
     single: Any = mi.Float(for_kernels(x))
     exact = float(i0e(x))
     lobe = exact * x / (2 * np.pi * -np.expm1(-2 * x))
@@ -149,42 +151,56 @@ def reciprocity_error(case: Case, pairs: int = 400, offsets: int = 200) -> float
     return float(np.mean(np.abs(there - back) / (there + back)))
 
 
-def bessel_table() -> list[str]:
+def bessel_table() -> str:
     """Rows of `bessel_errors`."""
-    rows = ["| x | ours | Mitsuba |", "|---|---|---|"]
-    for x in (0.1, 1.0, 5.0, 9.99, 10.01, 11.9, 12.1, 20.0, 100.0, 1e4, 1e6):
-        ours, stock = bessel_errors(x)
-        rows.append(f"| {x:g} | {ours:.1e} | {stock:.1e} |")
-    return rows
+    places = (0.1, 1.0, 5.0, 9.99, 10.01, 11.9, 12.1, 20.0, 100.0, 1e4, 1e6)
+    rows = [[f"{x:g}", *(f"{error:.1e}" for error in bessel_errors(x))] for x in places]
+    return markdown(["x", "ours", "Mitsuba"], rows)
 
 
-def furnace_table() -> list[str]:
-    """Rows of `both`: in each pair of columns ours is first."""
-    rows = [
-        "| β_M | β_N | θ° | h | η | tilt° | σ | sampled | | evaluated | | moment, s.e. | "
-        "| in plane | | density 0 | |",
-        "|" + "---|" * 17,
-    ]
+def furnace_table(cases: Sequence[Case] = CASES) -> str:
+    """Rows of `compare`: in each pair of columns ours is first."""
+    given = ["β_M", "β_N", "θ°", "h", "η", "tilt°", "σ"]
+    pairs = ["sampled", "evaluated", "moment, s.e.", "in plane", "density 0"]
     formats = ("{:.4f}", "{:.4f}", "{:.1f}", "{:.2%}", "{:.2%}")
-    for c in CASES:
-        pairs = zip(formats, *(astuple(m) for m in both(c)), strict=True)
-        said = [f.format(value) for f, *pair in pairs for value in pair]
-        given = [c.beta_m, c.beta_n, c.theta_deg, c.h, c.eta, c.tilt_deg, c.sigma_a]
-        rows.append("| " + " | ".join([f"{g:.6g}" for g in given] + said) + " |")
-    return rows
+    rows = []
+    for c in cases:
+        figures = zip(formats, *(astuple(m) for m in compare(c)), strict=True)
+        said = [f.format(value) for f, *pair in figures for value in pair]
+        rows.append([*case_cells(c), *said])
+    return markdown([*given, *(cell for pair in pairs for cell in (pair, ""))], rows)
 
 
-def reciprocity_table() -> list[str]:
+def case_cells(c: Case) -> list[str]:
+    """What is given in a row of the furnace table."""
+    given = [c.beta_m, c.beta_n, c.theta_deg, c.h, c.eta, c.tilt_deg, c.sigma_a]
+    return [f"{g:.6g}" for g in given]
+
+
+def reciprocity_table(roughness: Sequence[float] = (0.03, 0.1, 0.3, 0.6, 1.0)) -> str:
     """Rows of `reciprocity_error`."""
-    rows = ["| β_M = β_N | tilt° | σ = 0 | σ = 0.3 | σ = 3 |", "|---|---|---|---|---|"]
-    for beta in (0.03, 0.1, 0.3, 0.6, 1.0):
+    rows = []
+    for beta in roughness:
         for tilt in (0.0, 3.0):
             cases = [Case(beta, beta, tilt_deg=tilt, sigma_a=s) for s in (0.0, 0.3, 3.0)]
-            errors = " | ".join(f"{reciprocity_error(c):.1%}" for c in cases)
-            rows.append(f"| {beta:g} | {tilt:g} | {errors} |")
-    return rows
+            errors = [f"{reciprocity_error(c):.1%}" for c in cases]
+            rows.append([f"{beta:g}", f"{tilt:g}", *errors])
+    return markdown(["β_M = β_N", "tilt°", "σ = 0", "σ = 0.3", "σ = 3"], rows)
 
 
-if __name__ == "__main__":
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     ensure_backend()
-    print("\n".join([*bessel_table(), "", *furnace_table(), "", *reciprocity_table()]))
+    progress("tables", 0.0)
+    cases, roughness = (CASES[:1], (0.3,)) if args.quick else (CASES, (0.03, 0.1, 0.3, 0.6, 1.0))
+    tables = [bessel_table(), furnace_table(cases), reciprocity_table(roughness)]
+    (args.out / "bsdf.md").write_text("\n".join(tables))
+    progress("pictures", 0.5)
+    effort = {"size": 16, "spp": 4} if args.quick else {}
+    furnaces = pictures.furnaces(args.out / "bsdf_furnace.png", **effort)
+    pictures.sheet(args.out / "bsdf_sheet.png", **effort)
+    rows = [dict(zip(("beta_m", "ours", "mitsuba"), row, strict=True)) for row in furnaces]
+    save(args.out / "bsdf.json", {"furnace_means": rows})
+    return {"furnace_means": rows}
+
+
+BENCHMARK = Benchmark(_bench)

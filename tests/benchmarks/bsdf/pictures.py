@@ -5,15 +5,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import srgb
-from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import SCALE, build_scene
 from reconstruction.arrays import Array
@@ -21,7 +20,7 @@ from reconstruction.geometry.strands import Strands
 
 ROUGHNESS = (0.05, 0.15, 0.3, 0.6)
 ABSORPTION = (0.02, 0.1, 0.4, 2.0)
-LAMPS_DEG = (20.0, 90.0, 160.0)
+LIGHTS_DEG = (20.0, 90.0, 160.0)
 RADIUS = 0.04
 
 
@@ -44,8 +43,6 @@ def pictured(
     shape: Any, bsdf: dict[str, Any], light: dict[str, Any], size: int, spp: int, depth: int
 ) -> Array:
     """Radiance `(size, size, 3)` of the curves `shape` with a BSDF, seen from the side."""
-    import mitsuba as mi
-
     shape.set_bsdf(mi.load_dict(bsdf))
     view = mi.ScalarTransform4f().look_at([0, -40, 8], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
@@ -72,14 +69,14 @@ def fibre(plugin: str, beta: float, sigma_a: float) -> dict[str, Any]:
 
 
 def sheet(path: Path, *, size: int = 80, spp: int = 128) -> None:
-    """Roughness by absorption by the lamp's angle from the view."""
+    """Roughness by absorption by the light's angle from the view."""
     shape = _curves(wig(2500))
-    columns = [f"σ {s:g}, {a:.0f}°" for s in ABSORPTION for a in LAMPS_DEG]
+    columns = [f"σ {s:g}, {a:.0f}°" for s in ABSORPTION for a in LIGHTS_DEG]
     rows: list[Row] = []
     for beta in ROUGHNESS:
         pictures = {}
         for sigma in ABSORPTION:
-            for angle in LAMPS_DEG:
+            for angle in LIGHTS_DEG:
                 turned = np.radians(angle)
                 at = SCALE * np.array([np.sin(turned), -np.cos(turned), 0.6])
                 light = {"type": "point", "position": at.tolist(), "intensity": 5 * SCALE**2}
@@ -118,10 +115,3 @@ def furnaces(path: Path, *, size: int = 96, spp: int = 128) -> list[tuple[float,
 def _curves(strands: Strands) -> Any:
     return build_scene(strands, None, hair=HairAppearance((1, 1, 1), 0.3, 0.3)).hair_shape
 
-
-if __name__ == "__main__":
-    ensure_backend()
-    folder = Path(sys.argv[1])
-    for row in furnaces(folder / "bsdf_furnace.png"):
-        print("beta_m {:g}: ours {:.4f}, Mitsuba's hair {:.4f}".format(*row))
-    sheet(folder / "bsdf_sheet.png")

@@ -1,8 +1,12 @@
-"""Line stereo on patches whose truth is known: quality, how it falls with cameras and lights."""
+"""Line stereo with and without lightcodes, and fused, on patches of two heads.
+
+And on the capture that Cycles rendered. Captures go through the wires once and are kept. Leaves
+`light_codes/SUBJECT/` with `patch.json` and the models, and `light_codes.json`.
+"""
 
 from __future__ import annotations
 
-import json
+import argparse
 import shutil
 import time
 from collections.abc import Sequence
@@ -12,21 +16,20 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, cycles_folder, within
+from benchmarks.light_codes.rig import TARGETS, Patch, patch
 from benchmarks.light_codes.study import compare_filters, study_depths
 from benchmarks.pictures import picture_strands
-from reconstruction.arrays import AnyFloats, Bools
+from benchmarks.results import save
+from benchmarks.strand_truth import STEP, StrandTruth
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.import_folder import import_folder
-from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.matching import compare_strands
-from reconstruction.evaluation.visibility import Visibility
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import texture
 from reconstruction.light_codes.measure_segments import build_views
 from reconstruction.masks import hair_masks
@@ -35,58 +38,12 @@ from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report.plots import plot_geometry, plot_report
 from reconstruction.report.report import Progress, Report, Series, silent
-
-SUN = {
-    "Nam 2019, short hair": (6.56, 20.94, 37.32),
-    "Sun 2021, short hair": (22.42, 59.22, 79.35),
-    "Nam 2019, long hair": (6.87, 16.70, 27.95),
-    "Sun 2021, long hair": (28.22, 65.52, 80.60),
-}
-"""F in per cent of Sun's Table 1 at 1 mm/10°, 2 mm/20° and 3 mm/30°."""
+from stage_service.cli.support.tables import geometry_table
 
 METHODS: tuple[Method, ...] = ("lmvs", "photometric", "fused")
 CAMERAS, LIGHTS = (12, 6), (18, 9)
-
-STEP = 5e-4
-"""Metres between the points at which strands are cut at the ball's surface."""
-
-
-def cut_to_ball(strands: Strands, center: ArrayLike, radius: float) -> Strands:
-    """The pieces of the strands that lie in a ball, resampled at half a millimetre."""
-    dense = strands.resampled(STEP)
-    inside = np.linalg.norm(dense.points - np.asarray(center), axis=1) < radius
-    owner = dense.strand_of_point
-    starts = inside & ~np.r_[False, inside[:-1] & (owner[1:] == owner[:-1])]
-    piece = np.cumsum(starts)[inside]
-    points = dense.points[inside]
-    count = np.bincount(piece)[1:] if len(piece) else np.zeros(0, np.int64)
-    keep = np.repeat(count >= 2, count)
-    offsets = np.concatenate([[0], np.cumsum(count[count >= 2])]).astype(np.int64)
-    return Strands(points[keep], offsets, float(np.mean(strands.radius)))
-
-
-class PatchTruth:
-    """True strands within a ball, and what the capture's cameras see of them."""
-
-    def __init__(
-        self, capture: Capture, folder: Path, center: ArrayLike, radius: float, samples: int
-    ) -> None:
-        whole = read_strands(folder / "strands.npz")
-        self.cameras, self.head = capture.rig.cameras, capture.head
-        self.center, self.radius, self.samples = center, radius, samples
-        self.strands = cut_to_ball(whole, center, radius)
-        self.visibility = Visibility(self.cameras, whole, self.head)
-
-    def score(self, strands: Strands) -> dict[str, Any]:
-        """`compare_strands` of what lies in the ball, over visible and all."""
-        return compare_strands(
-            cut_to_ball(strands, self.center, self.radius),
-            self.strands,
-            cameras=self.cameras,
-            head=self.head,
-            samples=self.samples,
-            visibility=self.visibility,
-        )
+OPTIONS = ReconstructOptions(explicit_seconds=0.0)
+"""Without the parts of a report that cost time and tell nothing here."""
 
 
 def write_hair_masks(capture: Capture, truth_folder: Path) -> None:
@@ -125,69 +82,53 @@ def _every(items: Sequence[Any], count: int | None) -> list[Any]:
 
 def run_patch(
     out: Path,
-    capture_folder: Path,
-    truth_folder: Path,
-    center: ArrayLike,
-    radius: float,
+    here: Patch,
+    cache: Path,
     *,
-    options: ReconstructOptions | None = None,
     thinner: bool = True,
     samples: int = 10_000,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """All methods and both baselines in a ball about `center (3,)` of `radius` metres.
+    """All methods and both baselines on a patch.
 
     `thinner` also runs `photometric` with fewer cameras and with fewer lights, and `study`. Models
     are left in `OUT/<method>`, figures in `OUT/patch.json` as they come.
     """
-    options = options or ReconstructOptions()
-    capture = Capture(capture_folder)
+    folder, truth_folder = here.capture.make(cache, progress)
+    capture = Capture(folder)
     write_hair_masks(capture, truth_folder)
-    truth = PatchTruth(capture, truth_folder, center, radius, samples)
+    truth = StrandTruth(capture, truth_folder, here.ball, samples)
     runs: list[tuple[str, Method, Capture]] = [(m, m, capture) for m in METHODS]
     if thinner:
         for n in CAMERAS:
             runs.append((f"photometric, {n} cameras", "photometric", part_of(capture, cameras=n)))
         for n in LIGHTS:
             runs.append((f"photometric, {n} lights", "photometric", part_of(capture, lights=n)))
-    results: dict[str, Any] = {"rows": {}, "sun": SUN}
+    results: dict[str, Any] = {"variants": {}}
+    part = 1 / (len(runs) + 1)
     for k, (name, method, some) in enumerate(runs):
-        model = out / name.replace(", ", "_").replace(" ", "_")
+        model = Model(out / name.replace(", ", "_").replace(" ", "_"))
         begin = time.perf_counter(), time.process_time()
-        report = reconstruct(
-            some,
-            Model(model),
-            method=method,
-            options=options,
-            progress=lambda what, share, k=k, n=name: progress(  # type: ignore[misc]
-                f"{n}: {what}", (k + share) / (len(runs) + 1)
-            ),
-        )
-        row = truth.score(read_strands(model / "strands.npz"))
-        results["rows"][name] = {
-            **row,
+        tell = within(progress, name, k * part, part)
+        report = reconstruct(some, model, method=method, options=OPTIONS, progress=tell)
+        results["variants"][name] = {
+            **truth.score(model.strands()),
             "seconds": time.perf_counter() - begin[0],
             "cpu_seconds": time.process_time() - begin[1],
-            "stages": _stages(report),
+            "stages": {s.name: s.seconds for s in report.stages},
         }
-        _save(out / "patch.json", results)
+        save(out / "patch.json", results)
     if thinner:
-        progress("error against run time", len(runs) / (len(runs) + 1))
-        results["study"], results["filters"] = study(capture, truth.strands, options, out)
-        _save(out / "patch.json", results)
-    progress("baselines", len(runs) / (len(runs) + 1))
-    ball = (center, radius + options.grid)
-    for name, strands in baselines(capture, out / "photometric", options.grid, ball).items():
-        results["rows"][name] = truth.score(strands)
-    _save(out / "patch.json", results)
-    plot_geometry(results["rows"], out / "patch.png")
-    found: dict[str, Strands] = {m: read_strands(out / m / "strands.npz") for m in METHODS}
-    everything: dict[str, Strands] = {"true": truth.strands, **found}
-    picture_strands(
-        out / "strands.png",
-        capture.rig.cameras[0],
-        {k: cut_to_ball(s, center, radius) for k, s in everything.items()},
-    )
+        progress("error against run time", 1 - part)
+        results["study"], results["filters"] = study(capture, truth.strands, OPTIONS, out)
+        save(out / "patch.json", results)
+    progress("baselines", 1 - part)
+    results["variants"] |= truth.baselines(Model(out / "photometric"), OPTIONS.grid)
+    save(out / "patch.json", results)
+    plot_geometry(results["variants"], out / "patch.png")
+    found = {m: here.ball.cut(Model(out / m).strands()) for m in METHODS}
+    sets = {"true": truth.strands, **found}
+    picture_strands(out / "strands.png", capture.rig.cameras[0], sets)
     return results
 
 
@@ -215,94 +156,59 @@ def study(
 
 
 def run_imported(
-    out: Path,
-    folder: Path,
-    *,
-    options: ReconstructOptions | None = None,
-    samples: int = 10_000,
-    progress: Progress = silent,
+    out: Path, folder: Path, *, samples: int = 10_000, progress: Progress = silent
 ) -> dict[str, Any]:
     """All methods on a folder that `import_folder` reads, with true strands `strands_gt.npz`.
 
-    A method that needs what the capture lacks has its reason under "left_out" and no row.
+    A method that needs what the capture lacks has its reason under "left_out" and no scores.
     """
-    options = options or ReconstructOptions()
     shutil.rmtree(out / "capture", ignore_errors=True)
     capture = import_folder(folder, out / "capture")
     truth = read_strands(folder / "strands_gt.npz")
-    results: dict[str, Any] = {"rows": {}, "left_out": {}}
+    results: dict[str, Any] = {"variants": {}, "left_out": {}}
     for method in METHODS:
+        model = Model(out / method)
         try:
-            reconstruct(
-                capture, Model(out / method), method=method, options=options, progress=progress
-            )
+            reconstruct(capture, model, method=method, options=OPTIONS, progress=progress)
         except CaptureError as error:
             results["left_out"][method] = str(error)
             continue
-        results["rows"][method] = compare_strands(
-            read_strands(out / method / "strands.npz"),
+        results["variants"][method] = compare_strands(
+            model.strands(),
             truth,
             cameras=capture.rig.cameras,
             head=capture.head,
             samples=samples,
         )
-    _save(out / "imported.json", results)
+    save(out / "imported.json", results)
     return results
 
 
-def baselines(
-    capture: Capture, model: Path, spacing: float, ball: tuple[ArrayLike, float]
-) -> dict[str, Strands]:
-    """The baselines that use no method, in the masks that the reconstruction had.
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Every patch of `TARGETS`, or one; fewer cameras and lights, and `study`, on Sintel's only."""
+    from rich.console import Console
 
-    Only in the `ball`, its centre and radius: cameras that see a patch bound no hull elsewhere.
-    """
-    masks: dict[str, Bools] = {}
-    for camera in capture.rig.cameras:
-        file = model / "masks" / f"{camera.name}_hair.png"
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise FileNotFoundError(f"{file}: no mask that the reconstruction had")
-        masks[camera.name] = np.asarray(image > 127)
-    hull = within_ball(
-        baseline_hull(capture.rig.cameras, masks, capture.head, spacing=spacing), *ball
-    )
-    return {
-        "hull_vertical": hull_vertical(hull),
-        "hull_smooth_field": hull_smooth_field(hull, capture.head),
-    }
-
-
-def within_ball(hull: VoxelGrid, center: ArrayLike, radius: float) -> VoxelGrid:
-    """The voxels whose centres lie in a ball, on a grid no larger than it."""
-    c = np.asarray(center, float)
-    low, high = hull.index(np.stack([c - radius, c + radius]))
-    low, high = np.maximum(low, 0), np.minimum(high + 1, hull.inside.shape)
-    part = hull.inside[tuple(slice(a, max(a, b)) for a, b in zip(low, high, strict=True))]
-    out = VoxelGrid(hull.origin + low * hull.spacing, hull.spacing, part.copy())
-    out.inside[out.inside] = np.linalg.norm(out.centers() - c, axis=1) <= radius
-    return out
+    if args.only not in (None, *TARGETS):
+        raise LeftOut(f"no subject {args.only!r}; there are {', '.join(TARGETS)}")
+    names = ["wavy"] if args.quick else [n for n in TARGETS if args.only in (None, n)]
+    results: dict[str, Any] = {}
+    out = args.out / "light_codes"
+    for name in [*names, *["imported"] * (args.only is None and not args.quick)]:
+        try:
+            if name == "imported":
+                results[name] = run_imported(out / name, cycles_folder(None), progress=progress)
+            else:
+                here = patch(name, side=64, spp=2) if args.quick else patch(name)
+                thinner = name == "sintel"
+                results[name] = run_patch(
+                    out / name, here, args.cache, thinner=thinner, progress=progress
+                )
+        except LeftOut as error:
+            results[name] = {"left_out": str(error)}
+            continue
+        Console(stderr=True).print(geometry_table(results[name]["variants"]))
+        save(args.out / "light_codes.json", results)
+    return results
 
 
-def quick(options: ReconstructOptions) -> ReconstructOptions:
-    """Without the parts of a report that cost time and tell nothing here."""
-    return replace(options, explicit_seconds=0.0)
-
-
-def _stages(report: Report) -> dict[str, float]:
-    return {s.name: s.seconds for s in report.stages}
-
-
-def _save(path: Path, results: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
-    part.replace(path)
-
-
-def thresholds_met(row: dict[str, Any], sun: AnyFloats) -> dict[str, list[bool]]:
-    """For visible and all, at which thresholds F is above Sun's `(3,)` per cent."""
-    return {
-        over: [100 * s["f"] > f for s, f in zip(row[over].values(), sun, strict=True)]
-        for over in ("visible", "all")
-    }
+BENCHMARK = Benchmark(run, (CACHE, ONLY))

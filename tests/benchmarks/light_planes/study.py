@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
-
-import cv2
-import numpy as np
 
 from benchmarks.light_planes.growth_study import compare_growth
 from benchmarks.light_planes.motion_errors import motion_errors, true_motion
 from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangulation
 from benchmarks.pictures import picture_model, picture_motion
-from reconstruction.arrays import AnyFloats, Floats
+from benchmarks.results import save
+from benchmarks.strand_truth import StrandTruth
+from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture
-from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
-from reconstruction.evaluation.matching import compare_strands
-from reconstruction.evaluation.visibility import Visibility
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.strands import Strands
 from reconstruction.growth.field import field_system, solve_field
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.laplace import compare_solvers
@@ -29,7 +22,6 @@ from reconstruction.head.scalp import find_scalp, sample_roots
 from reconstruction.light_planes import (
     Motion,
     MotionOptions,
-    PointCloud,
     solve_motion,
     sweep_peaks,
     triangulate,
@@ -48,11 +40,8 @@ PAPER = {
 }
 """Photobooth's own shares (§3.1, §3.3)."""
 
-SUN = {"short": (22.4, 59.2, 79.4), "long": (28.2, 65.5, 80.6)}
-"""F in per cent that Sun et al. 2021 print for their method, at the three thresholds."""
-
-
 METHODS: tuple[Literal["registered", "direct"], ...] = ("registered", "direct")
+KINDS: tuple[Literal["hair", "skin"], ...] = ("hair", "skin")
 
 
 @dataclass(frozen=True)
@@ -63,31 +52,7 @@ class Case:
     drifting: tuple[Path, Path] | None = None
 
 
-class Truth:
-    """What strands are scored against: true strands, head, and what the cameras see of them."""
-
-    def __init__(self, capture: Capture, folder: Path) -> None:
-        self._strands = read_strands(folder / "strands.npz")
-        self._capture = capture
-        self._visibility = Visibility(capture.rig.cameras, self._strands, capture.head)
-
-    @property
-    def points(self) -> Floats:
-        """Of the true strands `(N, 3)`."""
-        return self._strands.points
-
-    def score(self, strands: Strands) -> dict[str, Any]:
-        """`compare_strands` over visible and all."""
-        return compare_strands(
-            strands,
-            self._strands,
-            cameras=self._capture.rig.cameras,
-            head=self._capture.head,
-            visibility=self._visibility,
-        )
-
-
-def subject(
+def study(
     out: Path,
     case: Case,
     options: ReconstructOptions,
@@ -95,48 +60,66 @@ def subject(
     studies: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """One subject, still and drifting, and the baselines; leaves models and `OUT/result.json`.
+    """One subject, still and drifting, and baselines; leaves models and `OUT/result.json`.
 
     `studies` adds what one subject is enough for: the motion's worth in strands, error against run
     time of motion, field and growth, and how stages grow.
     """
     capture = Capture(case.still[0])
-    truth = Truth(capture, case.still[1])
-    rows: dict[str, Any] = {}
-    rows["still"], report = _ours(capture, truth, out / "still", options, progress)
-    picture_model(
-        out / "still.png",
-        capture,
-        PointCloud.load(out / "still" / "points.npz"),
-        read_strands(out / "still" / "strands.npz"),
-    )
-    for name, baseline in _baselines(capture, out / "still").items():
-        rows[name] = truth.score(baseline)
+    truth = StrandTruth(capture, case.still[1])
+    still = Model(out / "still")
+    runs = _Runs(truth, out, options, progress)
+    report = runs.add("still", capture)
+    picture_model(out / "still.png", capture, still.points(), still.strands())
+    runs.scores |= truth.baselines(still)
     result: dict[str, Any] = {
-        "scores": rows,
+        "scores": runs.scores,
         "shares": _shares(report),
         "stages": {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb} for s in report.stages},
     }
+    save(out / "result.json", result)
     if case.drifting is not None:
         moving = Capture(case.drifting[0])
         known = true_motion(moving, case.drifting[1])
         # the simulator moves its subject at tracking frames only
-        held = replace(options, motion=replace(options.motion, between="hold"))
-        rows["drifting"], _ = _ours(moving, truth, out / "drifting", held, progress)
+        runs.options = replace(options, motion=replace(options.motion, between="hold"))
+        runs.add("drifting", moving)
         if studies:
-            none = Motion.none(known.steps)
-            for name, motion in (("true motion", known), ("no motion", none)):
-                model = out / name.replace(" ", "_")
-                rows[name], _ = _ours(moving, truth, model, held, progress, motion)
+            runs.add("true motion", moving, known)
+            runs.add("no motion", moving, Motion.none(known.steps))
             models = {"no compensation": "no_motion", "compensated": "drifting", "still": "still"}
-            clouds = {k: PointCloud.load(out / v / "points.npz") for k, v in models.items()}
+            clouds = {k: Model(out / v).points() for k, v in models.items()}
             picture_motion(out / "motion.png", clouds)
-        result["motion"] = motion_study(moving, truth.points[::50], known, progress)
+        save(out / "result.json", result)
+        points = truth.strands.points[::50]
+        result["motion"] = motion_study(moving, points, known, progress)
+        save(out / "result.json", result)
     if studies:
-        result["series"], result["growth"] = _studies(capture, out / "still", options, progress)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "result.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+        result["series"], result["growth"] = _studies(capture, still, options, progress)
+        save(out / "result.json", result)
     return result
+
+
+@dataclass
+class _Runs:
+    """Reconstructions, one after the other, and their scores."""
+
+    truth: StrandTruth
+    out: Path
+    options: ReconstructOptions
+    progress: Progress
+    scores: dict[str, Any] = field(default_factory=dict)
+
+    def add(self, name: str, capture: Capture, motion: Motion | None = None) -> Report:
+        """Reconstruct into a model of that name."""
+        model = Model(self.out / name.replace(" ", "_"))
+        begin = time.perf_counter()
+        report = reconstruct(
+            capture, model, options=self.options, motion=motion, progress=self.progress
+        )
+        seconds = time.perf_counter() - begin
+        self.scores[name] = {**self.truth.score(model.strands()), "seconds": seconds}
+        return report
 
 
 def motion_study(
@@ -158,14 +141,16 @@ def motion_study(
 
 
 def _studies(
-    capture: Capture, model: Path, options: ReconstructOptions, progress: Progress
+    capture: Capture, model: Model, options: ReconstructOptions, progress: Progress
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Error against run time of solvers and growth, and the stages' growth, in `model`'s hair."""
     progress("studies", 0.0)
     head = capture.head
     assert head is not None
-    cloud = PointCloud.load(model / "points.npz")
-    masks = {c.name: _mask(model, c.name) for c in capture.rig.cameras}
+    cloud, masks = model.points(), {}
+    for camera in capture.rig.cameras:
+        hair, skin = (model.mask(camera.name, kind, capture) for kind in KINDS)
+        masks[camera.name] = HairMask(hair | skin, hair, skin, "user", 1.0)
     stage = Stage("study")
     envelope, depths = build_envelope(
         capture, cloud, masks, head, grid=options.grid, margin=options.margin, stage=stage
@@ -187,37 +172,12 @@ def _studies(
     series = {"solvers": solvers, "growth": growth}
     plot_report(
         Report([Stage(name, series=list(curves)) for name, curves in series.items()]),
-        model.parent / "plots",
+        model.path.parent / "plots",
     )
     return (
         {name: [asdict(s) for s in curves] for name, curves in series.items()},
         [cost.to_dict() for cost in costs],
     )
-
-
-def _ours(
-    capture: Capture,
-    truth: Truth,
-    model: Path,
-    options: ReconstructOptions,
-    progress: Progress,
-    motion: Motion | None = None,
-) -> tuple[dict[str, Any], Report]:
-    begin = time.perf_counter()
-    report = reconstruct(capture, Model(model), options=options, motion=motion, progress=progress)
-    seconds = time.perf_counter() - begin
-    scores = truth.score(read_strands(model / "strands.npz"))
-    return {**scores, "seconds": seconds}, report
-
-
-def _baselines(capture: Capture, model: Path) -> dict[str, Strands]:
-    """The baselines that use no method, in the masks that the reconstruction had."""
-    masks = {c.name: _mask(model, c.name).hair for c in capture.rig.cameras}
-    hull = baseline_hull(capture.rig.cameras, masks, capture.head)
-    return {
-        "hull_vertical": hull_vertical(hull),
-        "hull_smooth_field": hull_smooth_field(hull, capture.head),
-    }
 
 
 def _shares(report: Report) -> dict[str, float]:
@@ -229,12 +189,3 @@ def _shares(report: Report) -> dict[str, float]:
         "filled_in": field["unknowns"] / max(field["unknowns"] + field["measured_voxels"], 1),
     }
 
-
-def _mask(model: Path, camera: str) -> HairMask:
-    """A camera's mask as the reconstruction left it."""
-    hair, skin = (
-        np.asarray(cv2.imread(str(model / "masks" / f"{camera}_{kind}.png"), cv2.IMREAD_GRAYSCALE))
-        > 127
-        for kind in ("hair", "skin")
-    )
-    return HairMask(hair | skin, hair, skin, "user", 1.0)

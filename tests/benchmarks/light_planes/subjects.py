@@ -1,7 +1,12 @@
-"""`bench lightplanes`: its three subjects, framed by one rig, still and drifting."""
+"""The light-plane method on three subjects, still and drifting, beside baselines.
+
+Sintel and a ponytail come from the folder of data; curls are procedural. Captures go through the
+wires once and are kept. Leaves `light_planes/SUBJECT/` and `light_planes.json`.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import tempfile
@@ -11,7 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.captures import SimulatedCapture
+from benchmarks.captures import Optics, SimulatedCapture, levels, rig_file
+from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, within
+from benchmarks.light_planes.study import PAPER, Case, study
+from benchmarks.results import save
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import write_obj
 from reconstruction.geometry.strands import Strands
@@ -54,6 +62,8 @@ class Framing:
     width: float
     longest: float
     rows: int = 128
+    coarser: int = 1
+    """How many of the usual pixels and rows are one."""
 
 
 FRAMINGS = {
@@ -65,47 +75,29 @@ FRAMINGS = {
 
 def rig_text(framing: Framing, tracking_every: int = 64) -> str:
     """A rig file: 8 cameras of 320×400 around, every other one raised, 3 projectors of 256 rows."""
-    target = list(framing.target)
-    fov_deg = math.degrees(2 * math.atan(framing.width / 2 / _DISTANCE))
-    text = [
-        'name = "lightplanes"',
-        f"[dome]\nlights = {LIGHTS}\nradius = 1.2\nlowest_deg = -50.0",
-        "intensity = [8.0, 8.0, 8.0]\nbeside_cameras_at = 0.05",
-    ]
 
     def place(azimuth_deg: float, elevation_deg: float, distance: float) -> list[float]:
         a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
         on_sphere = (math.sin(a) * math.cos(e), -math.cos(a) * math.cos(e), math.sin(e))
-        return [round(distance * x + t, 4) for x, t in zip(on_sphere, target, strict=True)]
+        return [distance * x + t for x, t in zip(on_sphere, framing.target, strict=True)]
 
-    for k in range(CAMERAS):
-        position = place(360 / CAMERAS * k, (8, 30)[k % 2], _DISTANCE)
-        text.append(
-            f'[[cameras]]\nname = "cam_{k:02d}"\nposition = {position}\ntarget = {target}\n'
-            f"fov_deg = {fov_deg:.3f}\nwidth = {WIDTH}\nheight = {HEIGHT}"
-        )
-    across = math.degrees(2 * math.atan(0.625 * framing.width / 1.1))
-    for k, (azimuth, elevation) in enumerate([(180, 15), (300, 35), (60, 15)]):
-        text.append(
-            f'[[projectors]]\nname = "proj_{k}"\nposition = {place(azimuth, elevation, 1.1)}\n'
-            f"target = {target}\nfov_deg = {across:.3f}\nroll_deg = 90.0\nwidth = {ROWS * 5 // 4}\n"
-            f"height = {ROWS}\nintensity = [20.0, 20.0, 20.0]\nline_sigma = 0.6"
-        )
-    text.append(
-        "[devices]\nheartbeat_s = 0.5\nwatchdog_s = 2.0\n"
-        '[devices.lights]\nkind = "modbus_tcp"\nhost = "127.0.0.1"\nport = 15020\n'
-        '[devices.trigger]\nkind = "serial"\nport = "trigger"\n'
-        '[devices.projectors]\nkind = "serial"\nport = "projectors"\n'
-        '[devices.cameras]\nkind = "link"\nhost = "127.0.0.1"\nport = 15021\n'
-        "timeout_s = 60.0\nbusy_s = 1800.0\n"
-        "[safety]\nliving_subject = false"
-    )
-    exposure = ", ".join(f"{k} = 0.02" for k in ("dark", "all_on", "olat", "scanline", "tracking"))
-    text.append(
-        f"[capture]\ntracking_every = {tracking_every}\nretries = 2\nexposure = {{{exposure}}}\n"
-        "level = {all_on = 0.05, olat = 1.0, scanline = 1.0, tracking = 0.4}"
-    )
-    return "\n\n".join(text) + "\n"
+    width, height, rows = (n // framing.coarser for n in (WIDTH, HEIGHT, ROWS))
+    optics = Optics(framing.target, math.degrees(2 * math.atan(framing.width / 2 / _DISTANCE)))
+    dome = f"lights = {LIGHTS}\nradius = 1.2\nlowest_deg = -50.0\nbeside_cameras_at = 0.05"
+    cameras = [
+        optics.device("cameras", k, place(360 / CAMERAS * k, (8, 30)[k % 2], _DISTANCE))
+        + f"width = {width}\nheight = {height}"
+        for k in range(CAMERAS)
+    ]
+    wide = Optics(framing.target, math.degrees(2 * math.atan(0.625 * framing.width / 1.1)))
+    projectors = [
+        wide.device("projectors", k, place(azimuth, elevation, 1.1))
+        + f"roll_deg = 90.0\nwidth = {rows * 5 // 4}\nheight = {rows}\n"
+        "intensity = [20.0, 20.0, 20.0]\nline_sigma = 0.6"
+        for k, (azimuth, elevation) in enumerate([(180, 15), (300, 35), (60, 15)])
+    ]
+    capture = f"tracking_every = {tracking_every}\n" + levels(all_on=0.05)
+    return rig_file("light_planes", dome, [*cameras, *projectors], capture)
 
 
 def ponytail(source: Path, folder: Path) -> tuple[Path, Path]:
@@ -122,10 +114,10 @@ def ponytail(source: Path, folder: Path) -> tuple[Path, Path]:
 
 
 def subject_capture(
-    name: str, data: Path, cache: Path, drift_mm: float, spp: int = 16
+    name: str, framing: Framing, cache: Path, drift_mm: float, spp: int = 16
 ) -> SimulatedCapture:
-    """The capture of a subject of `FRAMINGS`; `data` has the ones that others made."""
-    subject, head = name, None
+    """The capture of a subject of `FRAMINGS`."""
+    subject, head, data = name, None, data_folder() or Path()
     if name == "sintel":
         subject, head = (str(data / "sintel" / f) for f in ("sintel.npz", "sintel_head.obj"))
     elif name == "ponytail":
@@ -137,34 +129,34 @@ def subject_capture(
                     file.replace(made / file.name)
         subject, head = (str(made / f) for f in ("ponytail.npz", "ponytail_head.obj"))
     label = f"{name}-{'still' if drift_mm == 0 else 'drifting'}"
-    framing = FRAMINGS[name]
-    rig = rig_text(framing, framing.rows if drift_mm > 0 else 64)
+    rig = rig_text(framing, framing.rows if drift_mm > 0 else 64 // framing.coarser)
     return SimulatedCapture(label, rig, subject, head, drift_mm, spp)
 
 
-def run(
-    out: Path, data: Path | None, cache: Path, only: str | None, progress: Progress
-) -> dict[str, Any]:
-    """Each subject that there is data for (`only` one of them); see `bench_light_planes.subject`.
-
-    Captures are kept in `cache`. Leaves `OUT/<subject>/` and `OUT/lightplanes.json`.
-    """
-    from benchmarks.light_planes.study import PAPER, SUN, Case, subject
-
-    for k, (name, framing) in enumerate(FRAMINGS.items()):
-        if only not in (None, name) or (name != "curly" and data is None):
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Each subject that there is data for; see `study`."""
+    folder = args.out / "light_planes"
+    framings = {k: v for k, v in FRAMINGS.items() if args.only in (None, k)}
+    if not framings:
+        raise LeftOut(f"no subject {args.only!r}; there are {', '.join(FRAMINGS)}")
+    if args.quick:
+        framings = {"curly": replace(FRAMINGS["curly"], rows=32, coarser=4)}
+    for k, (name, framing) in enumerate(framings.items()):
+        if name != "curly" and data_folder() is None:
             continue
-
-        def tell(what: str, share: float, k: int = k, name: str = name) -> None:
-            progress(f"{name}: {what}", (k + share) / len(FRAMINGS))
-
+        tell = within(progress, name, k / len(framings), 1 / len(framings))
         captures = [
-            subject_capture(name, data or Path(), cache, drift).make(cache, tell)
+            subject_capture(name, framing, args.cache, drift).make(args.cache, tell)
             for drift in (0.0, DRIFT_MM)
         ]
         options = replace(OPTIONS, max_length=framing.longest)
-        subject(out / name, Case(*captures), options, studies=name == "sintel", progress=tell)
-    done = {f.parent.name: json.loads(f.read_text()) for f in sorted(out.glob("*/result.json"))}
-    results = {"paper": PAPER, "sun": SUN, "subjects": done}
-    (out / "lightplanes.json").write_text(json.dumps(results, indent=1) + "\n")
+        if args.quick:
+            options = replace(options, grid=4e-3, roots=500)
+        study(folder / name, Case(*captures), options, studies=name == "sintel", progress=tell)
+    done = {f.parent.name: json.loads(f.read_text()) for f in sorted(folder.glob("*/result.json"))}
+    results = {"paper": PAPER, "subjects": done}
+    save(args.out / "light_planes.json", results)
     return results
+
+
+BENCHMARK = Benchmark(run, (CACHE, ONLY))

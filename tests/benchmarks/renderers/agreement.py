@@ -1,8 +1,8 @@
-"""Benchmark: a capture that Blender Cycles rendered, rendered again from its true strands."""
+"""A capture that Blender Cycles rendered, rendered again from its true strands."""
 
 from __future__ import annotations
 
-import json
+import argparse
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,23 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import Exposure
 from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import HairScene, build_scene
+from appearance.scene.hair_scene import HairScene
+from benchmarks.command import CAPTURE, Benchmark, cycles_folder
 from benchmarks.renderers.path_reference import PathReference
+from benchmarks.results import markdown, save
+from benchmarks.subjects import cycles_subject
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.import_folder import import_folder
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, silent
-from reconstruction.tangents.line_evidence import half_sphere
 
 CYCLES, OURS, STOCK = "Cycles", "ours", "Mitsuba"
 PAIRS = ((OURS, CYCLES), (STOCK, CYCLES), (OURS, STOCK))
@@ -62,7 +60,10 @@ def agreement(
     """
     if seeds < 2:
         raise ValueError(f"a standard error needs at least two seeds, got {seeds}")
-    scene, depth = _scene(folder)
+    subject, params = cycles_subject(folder)
+    scene = subject.scene()
+    # a camera's own segment of the path is one of Mitsuba's depth, but no vertex
+    depth = int(params["equivalent_mitsuba"]["max_depth"]) - 1
     with tempfile.TemporaryDirectory() as scratch:
         progress("reading the capture", 0.0)
         capture = import_folder(folder, Path(scratch) / "capture")
@@ -80,8 +81,7 @@ def agreement(
         "max_depth": depth,
         "pairs": {f"{a} / {b}": compare(views, a, b, seed) for a, b in PAIRS},
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "agreement.json").write_text(json.dumps(result, indent=2) + "\n")
+    save(out / "agreement.json", result)
     (out / "agreement.md").write_text(table(result))
     _picture(out / "agreement.png", views)
     return result
@@ -115,22 +115,6 @@ class _Tiles:
     count: Array
     one: Array
     other: Array
-
-
-def _scene(folder: Path) -> tuple[HairScene, int]:
-    """The scene, and the number of vertices of its longest paths."""
-    params = json.loads((folder / "params.json").read_text())
-    truth = np.load(folder / "strands_gt.npz")
-    hair = HairAppearance(
-        params["sigma_a"], params["beta_m"], params["beta_n"], params["ior"], params["tilt_deg"]
-    )
-    directions = np.concatenate([half_sphere(8000), -half_sphere(8000)])
-    faces = ConvexHull(directions).simplices.astype(np.int64)
-    head = Mesh(truth["head_center"] + truth["head_axes"] * directions, faces)
-    strands = Strands(truth["points"], truth["offsets"], float(truth["radius"]))
-    scene = build_scene(strands, head, hair=hair, skin=params["head_albedo"])
-    # a camera's own segment of the path is one of Mitsuba's depth, but no vertex
-    return scene, int(params["equivalent_mitsuba"]["max_depth"]) - 1
 
 
 def _view(
@@ -228,10 +212,8 @@ def _correlation(tiles: Sequence[_Tiles], times: Sequence[Array]) -> Array:
 
 def table(result: Mapping[str, Any]) -> str:
     """The figures of `agreement` as a table in Markdown; ± from runs, ± from tiles."""
-    lines = [
-        "| | channel | mean radiance, ratio | in single pictures | correlation of tiles |",
-        "|---|---|---|---|---|",
-    ]
+    head = ["", "channel", "mean radiance, ratio", "in single pictures", "correlation of tiles"]
+    rows = []
     for pair, figures in result["pairs"].items():
         low, high = figures["pictures"]
         for c, channel in enumerate("RGB"):
@@ -240,9 +222,8 @@ def table(result: Mapping[str, Any]) -> str:
                 f"± {figures[n + '_tiles'][c]:.4f}"
                 for n in ("ratio", "correlation")
             )
-            span = f"{low[c]:.3f} to {high[c]:.3f}"
-            lines.append(f"| {pair} | {channel} | {ratio} | {span} | {correlation} |")
-    return "\n".join(lines) + "\n"
+            rows.append((pair, channel, ratio, f"{low[c]:.3f} to {high[c]:.3f}", correlation))
+    return markdown(head, rows)
 
 
 def _picture(path: Path, views: Sequence[View]) -> None:
@@ -260,3 +241,22 @@ def _picture(path: Path, views: Sequence[View]) -> None:
             shown[name] = image[cut]
         rows.append((f"{v.camera.name}, {v.lights[light].name}", shown, {}))
     comparison_picture(path, rows, [CYCLES, OURS, STOCK], height=1.4)
+
+
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    folder = cycles_folder(args.capture)
+    if not args.quick:
+        return agreement(args.out, folder, seed=args.seed, progress=progress)
+    return agreement(
+        args.out,
+        folder,
+        cameras=(4,),
+        lights=(6, 9),
+        seeds=2,
+        spp=8,
+        seed=args.seed,
+        progress=progress,
+    )
+
+
+BENCHMARK = Benchmark(_bench, (CAPTURE,))

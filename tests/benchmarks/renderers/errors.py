@@ -1,61 +1,39 @@
-"""Benchmark of the renderers: error against time beside Mitsuba's `path`, and how cost grows."""
+"""Our renderers beside Mitsuba's own path integrator, and how their cost grows.
+
+Error against run time light by light and line by line. Leaves `renderers.json`, `renderers.png` and
+`renderers_growth.png`.
+"""
 
 from __future__ import annotations
 
-import json
+import argparse
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from appearance.render.bounces import bounce_limit
-from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
-from appearance.render.paths import Surface, stream, wave
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import HairScene, build_scene
+from benchmarks.command import SUBJECT, Benchmark
+from benchmarks.renderers.cost import Effort, View, growth, growth_panels, hair_pixels
 from benchmarks.renderers.path_reference import PathReference
-from benchmarks.renderers.plots import plot_errors, plot_growth
 from benchmarks.renderers.scanlines import measure_scanlines
-from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import Floats, Ints
+from benchmarks.results import Panel, draw_panels, save
+from benchmarks.subjects import Subject, simulated
+from reconstruction.arrays import Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.rig import Rig
+from reconstruction.report.report import Progress, silent
 
 DEGREE = 6
 _JUDGED = 12  # lights whose error is measured
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What is rendered."""
-
-    strands: Strands
-    head: Mesh | None
-    hair: HairAppearance
-    skin: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much the benchmark measures; the defaults take a quarter of an hour on two cores."""
-
-    lights: Sequence[int] = (8, 36, 331)
-    pixels: int = 2000
-    spp: Sequence[int] = (4, 16, 48)
-    path_spp: Sequence[int] = (4, 8)
-    reference_spp: int = 128
-    strands: Sequence[int] = (1_000, 10_000, 100_000)
-    bounces: Sequence[int] = (1, 2, 4, 8, 16, 32)
-    growth_pixels: Sequence[int] = (200, 800, 3200)
-    growth_spp: int = 32
-    rows: int = 768
+_STYLES = {"mitsuba path": "k.-", "ours": "C0o-", "ours projected": "C1s-"}
+QUICK = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2, 16)
 
 
 def run(
@@ -65,9 +43,9 @@ def run(
     *,
     effort: Effort | None = None,
     seed: int = 0,
-    progress: Callable[[str, float], None] = lambda text, share: None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure all; write `light.json`, `light.png` and `light_growth.png` into `out`.
+    """Measure all; write the results into `out` and return what its JSON file holds.
 
     The error is the mean squared error over the mean square of the reference, averaged over the
     same 12 random lights of the dome for every method. The reference is Mitsuba's `path` light by
@@ -77,33 +55,26 @@ def run(
     `path` renders the judged ones and its time is scaled to all, as it does them one by one.
     """
     effort = Effort() if effort is None else effort
-    out.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"camera": [camera.width, camera.height], "subjects": {}}
     for k, (name, subject) in enumerate(subjects.items()):
         progress(name, k / (len(subjects) + 1))
-        scene = build_scene(subject.strands, subject.head, hair=subject.hair, skin=subject.skin)
-        result["subjects"][name] = _errors(scene, camera, effort, seed)
-        result["subjects"][name]["strands"] = len(subject.strands)
-    name, subject = next(iter(subjects.items()))
+        view = View.of(subject, camera, effort.pixels, seed)
+        result["subjects"][name] = {
+            **_Errors(view, effort).measured(),
+            "strands": len(subject.strands),
+        }
+        save(out / "renderers.json", result)
+    subject = next(iter(subjects.values()))
     progress("growth and scanlines", len(subjects) / (len(subjects) + 1))
-    scene = build_scene(subject.strands, subject.head, hair=subject.hair, skin=subject.skin)
-    result["growth"] = _growth(subject, scene, camera, effort, seed)
+    view = View.of(subject, camera, effort.pixels, seed)
+    result["growth"] = growth(subject, view, dome(36, seed), effort)
     projector = Projector.look_at("sweep", 1024, effort.rows, (0.5, -0.9, 0.4), (0, 0, -0.02), 24.0)
-    result["scanlines"] = measure_scanlines(
-        scene, camera, projector, hair_pixels(scene, camera, 300, seed), seed=seed
-    )
-    (out / "light.json").write_text(json.dumps(result, indent=1) + "\n")
-    plot_errors(out / "light.png", result)
-    plot_growth(out / "light_growth.png", result)
+    index = hair_pixels(view.scene, camera, 300, seed)
+    result["scanlines"] = measure_scanlines(view.scene, camera, projector, index, seed=seed)
+    save(out / "renderers.json", result)
+    draw_panels(out / "renderers.png", _panels(result))
+    draw_panels(out / "renderers_growth.png", [growth_panels(result)])
     return result
-
-
-def hair_pixels(scene: HairScene, camera: Camera, count: int, seed: int) -> Ints:
-    """At most `count` pixels that hair covers more than half, in random places, sorted."""
-    covered = np.flatnonzero(coverage(scene, camera)["hair"].ravel() > 0.5)
-    if not len(covered):
-        raise ValueError(f"{camera.name} does not see the hair: nothing to measure")
-    return np.sort(np.random.default_rng(seed).permutation(covered)[:count])
 
 
 def dome(count: int, seed: int) -> list[Light]:
@@ -113,83 +84,82 @@ def dome(count: int, seed: int) -> list[Light]:
     return [Light(f"lamp_{i:03d}", places[i], np.full(3, 8.0)) for i in order]
 
 
-def _errors(scene: HairScene, camera: Camera, effort: Effort, seed: int) -> dict[str, Any]:
-    """Error against time of one subject under each number of lights."""
-    index = hair_pixels(scene, camera, effort.pixels, seed)
-    limit = bounce_limit(scene, camera, pixels=index, seed=seed)
-    path = PathReference(scene, limit.depth)
-    judged = dome(_JUDGED, seed)
-    path.render(camera, judged[:1], index, spp=1, seed=seed)
-    halves = [
-        path.render(camera, judged, index, spp=effort.reference_spp // 2, seed=seed + k)
-        for k in (1, 2)
-    ]
-    entry: dict[str, Any] = {
-        "pixels": len(index),
-        "bounces": {"limit": limit.depth, "left_out": limit.left_out, "bound": limit.bound},
-        "reference_spp": effort.reference_spp,
-        "agreement": _agreement(scene, camera, judged, index, limit.depth, halves, effort, seed),
-        "lights": {},
-    }
-    for count in effort.lights:
-        lights = dome(count, seed)
-        seen = min(count, _JUDGED)
+class _Errors:
+    """Error against time of one subject."""
 
-        def ours(spp: int, seed: int, degree: int | None = None, lights: Any = lights) -> Floats:
-            return render_olat(
-                scene,
-                camera,
-                lights,
-                spp=spp,
-                seed=seed,
-                pixels=index,
-                max_depth=limit.depth,
-                degree=degree,
-            )
+    def __init__(self, view: View, effort: Effort) -> None:
+        self.view, self.effort = view, effort
+        self.limit = bounce_limit(view.scene, view.camera, pixels=view.index, seed=view.seed)
+        self.path = PathReference(view.scene, self.limit.depth)
+        self.judged = dome(_JUDGED, view.seed)
+        self._path(self.judged[:1], 1, view.seed)
+        half = effort.reference_spp // 2
+        self.halves = [self._path(self.judged, half, view.seed + k) for k in (1, 2)]
 
-        def projected(spp: int, seed: int, lights: Any = lights) -> Floats:
-            return ours(spp, seed, DEGREE, lights)
+    def measured(self) -> dict[str, Any]:
+        """The curves under each number of lights, and how far our mean is from `path`'s."""
+        limit = self.limit
+        return {
+            "pixels": len(self.view.index),
+            "bounces": {"limit": limit.depth, "left_out": limit.left_out, "bound": limit.bound},
+            "reference_spp": self.effort.reference_spp,
+            "agreement": self._agreement(),
+            "lights": {str(count): self._curves(count) for count in self.effort.lights},
+        }
 
-        def theirs(spp: int, seed: int, seen: int = seen) -> Floats:
-            return path.render(camera, judged[:seen], index, spp=spp, seed=seed)
+    def _path(self, lights: list[Light], spp: int, seed: int) -> Floats:
+        return self.path.render(self.view.camera, lights, self.view.index, spp=spp, seed=seed)
 
+    def _ours(self, lights: list[Light], spp: int, seed: int, degree: int | None = None) -> Floats:
+        view = self.view
+        return render_olat(
+            view.scene,
+            view.camera,
+            lights,
+            spp=spp,
+            seed=seed,
+            pixels=view.index,
+            max_depth=self.limit.depth,
+            degree=degree,
+        )
+
+    def _curves(self, count: int) -> dict[str, Any]:
+        lights, seen, effort = dome(count, self.view.seed), min(count, _JUDGED), self.effort
         methods: dict[str, Callable[[int, int], Floats]] = {
-            "ours": ours,
-            "ours projected": projected,
-            "mitsuba path": theirs,
+            "ours": lambda spp, seed: self._ours(lights, spp, seed),
+            "ours projected": lambda spp, seed: self._ours(lights, spp, seed, DEGREE),
+            "mitsuba path": lambda spp, seed: self._path(self.judged[:seen], spp, seed),
         }
         for method in [*methods.values()] * 2:  # a second call may compile a second variant
-            method(min(effort.spp), seed)
+            method(min(effort.spp), self.view.seed)
         series = []
         for turn in range(max(len(effort.spp), len(effort.path_spp))):
             for name, method in methods.items():
                 counts = effort.path_spp if name == "mitsuba path" else effort.spp
                 if turn < len(counts):
+                    wall, cpu = time.perf_counter(), time.process_time()
+                    image = method(counts[turn], self.view.seed + 10 + turn)
+                    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
                     scale = count / seen if name == "mitsuba path" else 1.0
-                    point = _measure(method, counts[turn], seed + 10 + turn, halves, seen, scale)
-                    series.append({"method": name, **point})
-        entry["lights"][str(count)] = {"series": series, "gain": _gains(series)}
-    return entry
+                    series.append(
+                        {
+                            "method": name,
+                            "spp": counts[turn],
+                            "seconds": wall * scale,
+                            "cpu_seconds": cpu * scale,
+                            "rel_mse": relative_mse(image[:seen], *(h[:seen] for h in self.halves)),
+                        }
+                    )
+        return {"series": series, "gain": _gains(series)}
 
-
-def _measure(
-    method: Callable[[int, int], Floats],
-    spp: int,
-    seed: int,
-    halves: list[Floats],
-    seen: int,
-    scale: float,
-) -> dict[str, float]:
-    """One point of a curve."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    image = method(spp, seed)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return {
-        "spp": spp,
-        "seconds": wall * scale,
-        "cpu_seconds": cpu * scale,
-        "rel_mse": relative_mse(image[:seen], halves[0][:seen], halves[1][:seen]),
-    }
+    def _agreement(self) -> dict[str, float]:
+        """Mean radiance over lights and pixels, ours / `path`, and the ratio's standard error."""
+        half, seed = self.effort.reference_spp // 2, self.view.seed
+        ours = [self._ours(self.judged, half, seed + k) for k in (3, 4)]
+        mine, theirs = (np.mean(pair, (0, 2, 3), float) for pair in (ours, self.halves))  # by light
+        ratio = mine.sum() / theirs.sum()
+        error = (mine - ratio * theirs).std(ddof=1) / theirs.mean() / np.sqrt(len(mine))
+        return {"ratio": float(ratio), "standard_error": float(error)}
 
 
 def relative_mse(image: Floats, first: Floats, second: Floats) -> float:
@@ -225,120 +195,41 @@ def _gains(series: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     return gains
 
 
-def _agreement(
-    scene: HairScene,
-    camera: Camera,
-    lights: Sequence[Light],
-    index: Ints,
-    depth: int,
-    halves: list[Floats],
-    effort: Effort,
-    seed: int,
-) -> dict[str, float]:
-    """Mean radiance over lights and pixels, ours / `path`, and the ratio's standard error."""
-    ours = [
-        render_olat(
-            scene,
-            camera,
-            lights,
-            spp=effort.reference_spp // 2,
-            seed=seed + k,
-            pixels=index,
-            max_depth=depth,
-        )
-        for k in (3, 4)
+def _panels(result: dict[str, Any]) -> list[list[Panel]]:
+    """A row for each subject, a column for each number of lights."""
+
+    def panel(name: str, count: str, series: list[dict[str, Any]]) -> Panel:
+        curves = {
+            method: [(p["cpu_seconds"], p["rel_mse"]) for p in series if p["method"] == method]
+            for method in _STYLES
+        }
+        return Panel(f"{name}, {count} lights", curves, styles=_STYLES)
+
+    return [
+        [panel(name, count, entry["series"]) for count, entry in subject["lights"].items()]
+        for name, subject in result["subjects"].items()
     ]
-    mine, theirs = (np.mean(pair, (0, 2, 3), float) for pair in (ours, halves))  # by light
-    ratio = mine.sum() / theirs.sum()
-    error = (mine - ratio * theirs).std(ddof=1) / theirs.mean() / np.sqrt(len(mine))
-    return {"ratio": float(ratio), "standard_error": float(error)}
 
 
-def _growth(
-    subject: Subject, scene: HairScene, camera: Camera, effort: Effort, seed: int
-) -> dict[str, Any]:
-    """Cost over strands, bounces and pixels under 36 lights, and beside the bare rays'."""
-    lights = dome(36, seed)
-
-    def cost(scene: HairScene, index: Ints, depth: int | None) -> dict[str, float]:
-        spp = effort.growth_spp
-        render_olat(scene, camera, lights, spp=spp, pixels=index, max_depth=depth)
-        start = time.process_time()
-        render_olat(scene, camera, lights, spp=spp, pixels=index, max_depth=depth, seed=seed)
-        seconds = time.process_time() - start
-        return {"cpu_seconds": seconds, "us_per_path": 1e6 * seconds / spp / len(index)}
-
-    found: dict[str, Any] = {"lights": len(lights), "strands": {}, "bounces": {}, "pixels": {}}
-    for count in effort.strands:
-        strands = with_count(subject.strands, count, seed)
-        other = build_scene(strands, subject.head, hair=subject.hair, skin=subject.skin)
-        index = hair_pixels(other, camera, effort.pixels, seed)
-        bare = bare_rays(other, camera, index, seed)
-        one = cost(other, index, None)
-        rays = one["us_per_path"] / bare["shadow_us"]
-        found["strands"][str(count)] = {**one, **bare, "path_in_shadow_rays": rays}
-    index = hair_pixels(scene, camera, effort.pixels, seed)
-    for depth in effort.bounces:
-        found["bounces"][str(depth)] = cost(scene, index, depth)
-    for pixels in effort.growth_pixels:
-        part = hair_pixels(scene, camera, pixels, seed)
-        found["pixels"][str(len(part))] = cost(scene, part, None)
-    return found
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    camera = Rig.load(args.rig).cameras[0]
+    fov_deg = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0])))
+    ahead = camera.center + camera.R[2]
+    small = Camera.look_at(camera.name, 128, 128, camera.center, ahead, fov_deg)
+    progress("making the subjects", 0.0)
+    subjects = {
+        Path(args.subject).stem: simulated(args.rig, args.subject, args.head, args.seed),
+    }
+    # eumelanin of pbrt's table: 0.3 and 8
+    for name, groom, sigma_a in (
+        ("straight blond", "straight", (0.126, 0.209, 0.411)),
+        ("black curls", "curly", (3.35, 5.58, 10.96)),
+    ):
+        if not args.quick:
+            made = simulated(args.rig, groom, None, args.seed)
+            subjects[name] = replace(made, hair=replace(made.hair, sigma_a=sigma_a))
+    effort = QUICK if args.quick else None
+    return run(args.out, subjects, small, effort=effort, seed=args.seed, progress=progress)
 
 
-def with_count(strands: Strands, count: int, seed: int) -> Strands:
-    """`count` of the strands, or copies of them a few millimetres aside, at the same coverage."""
-    rng = np.random.default_rng(seed)
-    whole, rest = divmod(count, len(strands))
-    chosen = np.r_[np.tile(np.arange(len(strands)), whole), rng.permutation(len(strands))[:rest]]
-    pieces = [strands.points[strands.offsets[i] : strands.offsets[i + 1]] for i in chosen]
-    aside = rng.normal(scale=0.001, size=(count, 3)).astype(np.float32)
-    if whole:
-        aside[: len(strands)] = 0
-    radius = float(np.mean(strands.radius)) * len(strands) / count
-    moved = Strands.from_list([p + a for p, a in zip(pieces, aside, strict=True)])
-    return replace(moved, radius=radius)
-
-
-def bare_rays(
-    scene: HairScene, camera: Camera, index: Ints, seed: int, rounds: int = 64
-) -> dict[str, float]:
-    """Microseconds of CPU a ray of the scene takes when nothing else is done.
-
-    From each pixel's first hit towards random directions: `closest_us` with the surface's answer
-    (`ray_intersect`), `shadow_us` (`ray_test`).
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    surface = Surface(scene)
-    pixel = mi.UInt32(for_kernels(index, np.uint32))
-    camera_paths = wave(camera, pixel, len(index), 0, 1, 1, seed)
-    start = surface.interact(camera_paths.rays, mi.Bool(True))
-    found = {}
-    for name in ("closest_us", "shadow_us"):
-        for _ in range(2):  # the first compiles
-            rng = stream(len(index), seed)
-            count = dr.zeros(mi.UInt32, len(index))
-            dr.eval(start, count)
-            begun = time.process_time()
-
-            def body(i: Any, count: Any, rng: Any, name: str = name) -> Any:
-                towards = mi.warp.square_to_uniform_sphere(
-                    mi.Point2f(rng.next_float32(), rng.next_float32())
-                )
-                ray = start.spawn_ray(towards)
-                if name == "shadow_us":
-                    hit = scene.mi_scene.ray_test(ray)
-                else:
-                    hit = surface.interact(ray, mi.Bool(True)).t < 1
-                return i + 1, count + dr.select(hit, mi.UInt32(1), 0), rng
-
-            _, count, _ = dr.while_loop(
-                (mi.UInt32(0), count, rng), lambda i, count, rng: i < rounds, body, label="rays"
-            )
-            dr.eval(count)
-            dr.sync_thread()
-            seconds = time.process_time() - begun
-        found[name] = 1e6 * seconds / rounds / len(index)
-    return found
+BENCHMARK = Benchmark(_bench, SUBJECT)

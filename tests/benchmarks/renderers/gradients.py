@@ -5,28 +5,31 @@
 
 from __future__ import annotations
 
-import json
-import sys
+import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from appearance.render.differentiable import DifferentiableOlat
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
+from benchmarks.command import Benchmark
+from benchmarks.results import Panel, draw_panels, save
 from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
+from reconstruction.report.report import Progress
 
 STEP = 0.01
-"""Metres that the lamp is moved by, either way, for a finite difference."""
+"""Metres that the light is moved by, either way, for a finite difference."""
 HAIR = HairAppearance((0.06, 0.1, 0.2), 0.3, 0.3)
 SUBJECTS = ("bare floor", "floor under a wall's edge", "tuft of hair on the floor")
 
@@ -57,23 +60,21 @@ def _camera() -> Camera:
     return Camera.look_at("c", 24, 24, (-0.12, -0.02, 0.2), (0, 0, 0.01), 22)
 
 
-def _lamp(x: float) -> Light:
+def _light(x: float) -> Light:
     return Light("l", np.array([x, 0.0, 1.0]), np.full(3, 8.0))
 
 
-def moved_lamp(scene: HairScene, places: Array, spp: int, runs: int) -> dict[str, list[float]]:
-    """Derivatives of the picture's mean by the lamp's x at `places (N,)`, in two ways.
+def moved_light(scene: HairScene, places: Array, spp: int, runs: int) -> dict[str, list[float]]:
+    """Derivatives of the picture's mean by the light's x at `places (N,)`, in two ways.
 
     Means and standard errors over `runs` seeds; both sides of a difference share their seed.
     """
-    import drjit as dr
-
     camera = _camera()
     pixels = np.arange(camera.width * camera.height)
     found: dict[str, list[float]] = {k: [] for k in _CURVES}
     for x in places:
         ops = {
-            d: DifferentiableOlat(scene, camera, [_lamp(x + d)], pixels, spp=spp, max_depth=4)
+            d: DifferentiableOlat(scene, camera, [_light(x + d)], pixels, spp=spp, max_depth=4)
             for d in (-STEP, 0.0, STEP)
         }
         replayed, difference = [], []
@@ -98,11 +99,9 @@ _CURVES = ("replayed", "replayed error", "difference", "difference error")
 
 def cost(depths: tuple[int, ...], spp: int) -> list[dict[str, float]]:
     """Seconds and bytes of a picture and of all its gradients, by the limit of bounces."""
-    import drjit as dr
-
     scene, camera = subject(SUBJECTS[2]), _camera()
     rows = []
-    lights = [replace(_lamp(x), name=str(x)) for x in (-0.3, 0.0, 0.3)]
+    lights = [replace(_light(x), name=str(x)) for x in (-0.3, 0.0, 0.3)]
     for depth in depths:
         op = DifferentiableOlat(
             scene, camera, lights, np.arange(576), spp=spp, max_depth=depth, rr_depth=depth
@@ -130,8 +129,6 @@ def cost(depths: tuple[int, ...], spp: int) -> list[dict[str, float]]:
 
 def _measured(work: Callable[[], None]) -> dict[str, float]:
     """Seconds and most bytes held, the second time: kernels are compiled by then."""
-    import drjit as dr
-
     work()
     dr.sync_thread()
     detail: Any = dr.detail
@@ -143,36 +140,46 @@ def _measured(work: Callable[[], None]) -> dict[str, float]:
     return {"seconds": seconds, "bytes": float(detail.malloc_watermark(dr.JitBackend.LLVM))}
 
 
-def run(out: Path, *, spp: int = 1024, runs: int = 4) -> dict[str, Any]:
+def run(
+    out: Path, *, spp: int = 1024, runs: int = 4, depths: tuple[int, ...] = (2, 4, 8, 16, 32)
+) -> dict[str, Any]:
     """Measure, write `gradients.json` and `gradients.png` into `out`, return the former."""
     ensure_backend()
-    places = np.linspace(-0.2, 0.2, 9)
-    result: dict[str, Any] = {
-        "lamp_x": places.tolist(),
-        "subjects": {n: moved_lamp(subject(n), places, spp, runs) for n in SUBJECTS},
-        "cost": cost((2, 4, 8, 16, 32), 256),
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "gradients.json").write_text(json.dumps(result, indent=1))
-    _plot(result, out / "gradients.png")
+    places = np.linspace(-0.2, 0.2, 9 if runs > 2 else 2)
+    result: dict[str, Any] = {"light_x": places.tolist(), "subjects": {}, "seeds": runs}
+    for name in SUBJECTS:
+        result["subjects"][name] = moved_light(subject(name), places, spp, runs)
+        save(out / "gradients.json", result)
+    result["cost"] = cost(depths, spp // 4)
+    save(out / "gradients.json", result)
+    labels = {"difference": "finite difference", "replayed": "path replay"}
+    draw_panels(
+        out / "gradients.png",
+        [
+            [
+                Panel(
+                    name,
+                    {
+                        label: list(zip(places, found[k], found[f"{k} error"], strict=True))
+                        for k, label in labels.items()
+                    },
+                    "the light's x (m)",
+                    "d mean radiance / dx",
+                    ("linear", "linear"),
+                    {"finite difference": "o", "path replay": "-"},
+                )
+                for name, found in result["subjects"].items()
+            ]
+        ],
+    )
     return result
 
 
-def _plot(result: dict[str, Any], path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 3.2), layout="constrained")
-    for axes, (name, found) in zip(figure.subplots(1, 3), result["subjects"].items(), strict=True):
-        for curve, style in (("difference", "o"), ("replayed", "-")):
-            label = {"difference": "finite difference", "replayed": "path replay"}[curve]
-            axes.errorbar(
-                result["lamp_x"], found[curve], found[f"{curve} error"], fmt=style, label=label
-            )
-        axes.set(title=name, xlabel="lamp's x (m)", ylabel="d mean radiance / dx")
-        axes.grid(alpha=0.3)
-        axes.legend()
-    figure.savefig(path, dpi=110)
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    progress("gradients", 0.0)
+    if args.quick:
+        return run(args.out, spp=16, runs=2, depths=(2, 4))
+    return run(args.out)
 
 
-if __name__ == "__main__":
-    run(Path(sys.argv[1]))
+BENCHMARK = Benchmark(_bench)

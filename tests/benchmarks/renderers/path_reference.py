@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.paths import passes, wave
@@ -24,8 +26,6 @@ class PathReference:
     """
 
     def __init__(self, scene: HairScene, max_depth: int, rr_depth: int = 4) -> None:
-        import mitsuba as mi
-
         light = {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": 1}}
         self._scene = mi.load_dict({"type": "scene", **scene.material_shapes(), "light": light})
         self._parameters = mi.traverse(self._scene)
@@ -57,16 +57,11 @@ class PathReference:
         return out
 
     def _move(self, position: Floats, intensity: Floats) -> None:
-        import mitsuba as mi
-
         self._parameters["light.position"] = mi.Point3f(*(float(p) for p in position))
         self._parameters["light.intensity.value"] = mi.Color3f(*(float(c) for c in intensity))
         self._parameters.update()
 
     def _light(self, camera: Camera, pixels: Ints, spp: int, seed: tuple[int, int]) -> Floats:
-        import drjit as dr
-        import mitsuba as mi
-
         index = mi.UInt32(for_kernels(pixels, np.uint32))
         film = dr.zeros(mi.Float, 3 * len(pixels))
         for first, count in passes(spp, max(1, _LANES // len(pixels))):

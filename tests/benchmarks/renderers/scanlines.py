@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from appearance.render.bounces import bounce_limit
@@ -94,8 +96,6 @@ class _Lines:
     """The scene under Mitsuba's `projector`, which shows one row at a time."""
 
     def __init__(self, scene: HairScene, projector: Projector, depth: int) -> None:
-        import mitsuba as mi
-
         self._rows = projector
         to_world = np.eye(4)
         # Mitsuba's cameras and projectors look along +z with x to the left and y up
@@ -126,9 +126,6 @@ class _Lines:
 
     def render(self, camera: Camera, index: Ints, row: int, spp: int, seed: int) -> Floats:
         """Radiance `(P, 3)` under one row, in the emitter's own unit."""
-        import drjit as dr
-        import mitsuba as mi
-
         self._parameters["lamp.irradiance.data"] = mi.TensorXf(for_kernels(self._picture(row)))
         self._parameters.update()
         pixels = mi.UInt32(for_kernels(index, np.uint32))

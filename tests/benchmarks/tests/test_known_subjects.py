@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.appearance.ablations import from_afar, markdown, recovery
-from benchmarks.appearance.known_subjects import Rig, bent, dyed, subject
+from benchmarks.appearance.ablations import QUICK, SMALL, from_afar, recovery, report
+from benchmarks.appearance.known_subjects import bent, dyed, known_subject
 from benchmarks.appearance.table import GROUPS, Table
+from benchmarks.subjects import Subject
 
 from appearance.bsdf.maps import scalp_coordinates
-from appearance.inverse_rendering.loop import Stage1Options
-from appearance.inverse_rendering.problem import Effort
 from appearance.scene.hair_appearance import HairAppearance
+from reconstruction.geometry.strands import Strands
 
 HAIR = HairAppearance((0.1, 0.2, 0.4), 0.28, 0.3)
-SKIN = np.full(3, 0.3)
+SKIN = (0.3, 0.3, 0.3)
 
 
 def test_bent_strands_turn_by_five_degrees_and_keep_their_roots(small):
@@ -35,21 +35,12 @@ def test_dyed_hair_is_lighter_at_the_tips_and_has_wisps_of_other_hues():
     np.testing.assert_allclose(usual[-1], 0.25 * np.array(HAIR.sigma_a))
     assert (maps.sigma_a[0, ..., 0] > 1).any()
     with pytest.raises(ValueError, match="no subject 'd'"):
-        subject("d", None, None, HAIR, SKIN)
-
-
-QUICK = Stage1Options(
-    steps=2,
-    check_every=2,
-    shape=(2, 2, 2),
-    effort=Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4),
-)
+        known_subject("d", Subject(Strands.from_list([]), None, HAIR, SKIN), SMALL)
 
 
 @pytest.fixture(scope="module")
 def captured(small):
-    rig = Rig(size=14, cameras=3, lights=6, spp=64, max_depth=4)
-    return subject("a", small.tuft(150), None, HAIR, SKIN, rig)
+    return known_subject("a", Subject(small.tuft(150), None, HAIR, SKIN), SMALL)
 
 
 def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
@@ -66,7 +57,7 @@ def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
     ]
     clean = {k: v[GROUPS[1]]["psnr_clean"] for k, v in rows.items()}
     assert clean["truth, fresh numbers"] > max(clean["mean colour"], clean["three nearest"])
-    assert "| HairInverse |" in markdown({"subjects": {"a": rows}})
+    assert "| HairInverse |" in report({"subjects": {"a": rows}})
 
 
 def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
@@ -75,14 +66,14 @@ def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
     as_is, noisy, off = found.values()
     assert list(as_is) == list(off) == ["HairInverse", "original", "lights"]
     assert list(noisy) == ["HairInverse", "original"]
-    # three training lamps of one seed are this far off each other; two steps learn no gain
-    assert off["original"]["lamps_off"] == pytest.approx(0.03, abs=0.02)
-    assert off["lights"]["lamps_off"] < 1.5 * off["original"]["lamps_off"]
+    # three training lights of one seed are this far off each other; two steps learn no gain
+    assert off["original"]["lights_off"] == pytest.approx(0.03, abs=0.02)
+    assert off["lights"]["lights_off"] < 1.5 * off["original"]["lights_off"]
     assert as_is["original"] != noisy["original"]
     starts = from_afar(captured, QUICK)
     assert [x["start"]["beta_m"] for x in starts] == [0.4, 0.9, 0.02, 0.15]
     assert all(abs(x["beta_m_error"]) <= abs(x["start"]["beta_m"] / 0.28 - 1) for x in starts)
-    text = markdown({"subjects": {}, "recovery": found, "starts": starts})
+    text = report({"subjects": {}, "recovery": found, "starts": starts})
     assert text.count("CPU s") == 4
     assert text.count("dB") == 8
-    assert text.count("lamps") == 5
+    assert text.count(", lights ") == 2

@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from benchmarks.light_codes.patches import cut_to_ball, part_of, within_ball
+from benchmarks.light_codes.patches import part_of
+from benchmarks.strand_truth import Ball
 
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.evaluation.matching import compare_strands
@@ -117,11 +118,11 @@ def test_strands_are_cut_at_the_balls_surface() -> None:
     line = np.stack([np.linspace(-0.05, 0.05, 11), np.zeros(11), np.zeros(11)], axis=1)
     outside = line + np.array([0, 0.5, 0])
     bent = np.array([[-0.05, 0, 0], [0, 0, 0], [0, 0.05, 0], [0.005, 0.05, 0], [0.005, 0, 0]])
-    found = cut_to_ball(Strands.from_list([line, outside, bent]), (0, 0, 0), 0.02)
+    found = Ball((0, 0, 0), 0.02).cut(Strands.from_list([line, outside, bent]))
     assert len(found) == 3
     assert np.linalg.norm(found.points, axis=1).max() < 0.02
     np.testing.assert_allclose(found.lengths()[0], 0.04, atol=1.1e-3)
-    assert len(cut_to_ball(Strands.from_list([outside]), (0, 0, 0), 0.02)) == 0
+    assert len(Ball((0, 0, 0), 0.02).cut(Strands.from_list([outside]))) == 0
 
 
 def test_part_of_a_capture_keeps_what_was_asked(shot: Capture) -> None:
@@ -134,9 +135,9 @@ def test_part_of_a_capture_keeps_what_was_asked(shot: Capture) -> None:
 def test_a_hull_is_cut_to_a_ball_and_its_grid_with_it() -> None:
     hull = VoxelGrid(np.array([-0.05, -0.05, -0.05]), 2e-3, np.ones((60, 50, 50), bool))
     center, radius = np.array([0.0, 0.01, -0.01]), 0.02013  # no centre lies on its surface
-    part = within_ball(hull, center, radius)
+    part = Ball(tuple(center), radius).within(hull, 0.0)
     assert max(part.inside.shape) <= 22
     distance = np.linalg.norm(part.centers() - center, axis=1)
     assert distance.max() <= radius
     assert len(distance) == (np.linalg.norm(hull.centers() - center, axis=1) <= radius).sum()
-    assert not within_ball(hull, (1.0, 0.0, 0.0), 0.02).inside.any()
+    assert not Ball((1.0, 0.0, 0.0), 0.02).within(hull, 0.0).inside.any()

@@ -1,0 +1,93 @@
+"""What strands are scored against, and the baselines that use no method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from reconstruction.arrays import Array
+from reconstruction.capture.folder import Capture
+from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
+from reconstruction.evaluation.matching import compare_strands
+from reconstruction.evaluation.visibility import Visibility
+from reconstruction.files.strands import read_strands
+from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.model import Model
+
+STEP = 5e-4
+"""Metres between the points at which strands are cut at a ball's surface."""
+
+
+@dataclass(frozen=True)
+class Ball:
+    """The part of space that is judged, metres."""
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def holds(self, points: ArrayLike, margin: float = 0.0) -> Array:
+        """Whether each of `points (N, 3)` lies in it, or within `margin` of it."""
+        return np.linalg.norm(np.asarray(points) - self.center, axis=1) < self.radius + margin
+
+    def cut(self, strands: Strands) -> Strands:
+        """The pieces of the strands that lie in it, resampled at half a millimetre."""
+        dense = strands.resampled(STEP)
+        inside = self.holds(dense.points)
+        owner = dense.strand_of_point
+        starts = inside & ~np.r_[False, inside[:-1] & (owner[1:] == owner[:-1])]
+        piece = np.cumsum(starts)[inside]
+        points = dense.points[inside]
+        count = np.bincount(piece)[1:] if len(piece) else np.zeros(0, np.int64)
+        keep = np.repeat(count >= 2, count)
+        offsets = np.concatenate([[0], np.cumsum(count[count >= 2])]).astype(np.int64)
+        return Strands(points[keep], offsets, float(np.mean(strands.radius)))
+
+    def within(self, hull: VoxelGrid, margin: float) -> VoxelGrid:
+        """The voxels whose centres it holds, on a grid no larger than it."""
+        c, reach = np.asarray(self.center, float), self.radius + margin
+        low, high = hull.index(np.stack([c - reach, c + reach]))
+        low, high = np.maximum(low, 0), np.minimum(high + 1, hull.inside.shape)
+        part = hull.inside[tuple(slice(a, max(a, b)) for a, b in zip(low, high, strict=True))]
+        out = VoxelGrid(hull.origin + low * hull.spacing, hull.spacing, part.copy())
+        out.inside[out.inside] = self.holds(out.centers(), margin)
+        return out
+
+
+class StrandTruth:
+    """True strands, of a `ball` only where one is given, and what the cameras see of them."""
+
+    def __init__(
+        self, capture: Capture, folder: Path, ball: Ball | None = None, samples: int = 40_000
+    ) -> None:
+        whole = read_strands(folder / "strands.npz")
+        self._capture, self._ball, self._samples = capture, ball, samples
+        self.strands = whole if ball is None else ball.cut(whole)
+        self._visibility = Visibility(capture.rig.cameras, whole, capture.head)
+
+    def score(self, strands: Strands) -> dict[str, Any]:
+        """`compare_strands` of what lies in the ball, over visible and all."""
+        return compare_strands(
+            strands if self._ball is None else self._ball.cut(strands),
+            self.strands,
+            cameras=self._capture.rig.cameras,
+            head=self._capture.head,
+            samples=self._samples,
+            visibility=self._visibility,
+        )
+
+    def baselines(self, model: Model, spacing: float = 2e-3) -> dict[str, dict[str, Any]]:
+        """Scores of what uses no method, in the masks that `model`'s reconstruction had."""
+        capture = self._capture
+        masks = {c.name: model.mask(c.name, "hair", capture) for c in capture.rig.cameras}
+        hull = baseline_hull(capture.rig.cameras, masks, capture.head, spacing=spacing)
+        if self._ball is not None:  # cameras that see a patch bound no hull elsewhere
+            hull = self._ball.within(hull, spacing)
+        return {
+            "hull_vertical": self.score(hull_vertical(hull)),
+            "hull_smooth_field": self.score(hull_smooth_field(hull, capture.head)),
+        }
