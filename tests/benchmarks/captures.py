@@ -90,9 +90,9 @@ class Optics:
 
     def device(self, kind: str, number: int, position: Sequence[float]) -> str:
         """The start of a device's table in a rig file."""
-        place = [round(p, 5) for p in position]
+        name = f"{'cam' if kind == 'cameras' else 'proj'}_{number:02d}"
         return (
-            f'[[{kind}]]\nname = "{kind[:3] if kind == "cameras" else "proj"}_{number:02d}"\nposition = {place}\n'
+            f'[[{kind}]]\nname = "{name}"\nposition = {[round(p, 5) for p in position]}\n'
             f"target = {list(self.target)}\nfov_deg = {self.fov_deg:.5f}\n"
         )
 

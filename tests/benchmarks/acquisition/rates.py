@@ -9,9 +9,9 @@ import argparse
 import json
 import socket
 import statistics
+import sys
 import threading
 import time
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -19,13 +19,13 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.loop import Stage1Options, run
 from appearance.inverse_rendering.problem import Effort, Problem
 from appearance.observations import Observed
+from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
+from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
 from benchmarks.appearance.known_subjects import SUBJECTS, Captured, Rig, known_subject
+from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
-from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
-from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
-from benchmarks.appearance.table import GROUPS, Table
 from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, silent
 
@@ -70,12 +70,16 @@ def run_bench(
         result["subjects"][name] = rows
         _write(out, result)
         if name == "a":
-            result["recovery"] = recovery(captured, rows, options, within(progress, f"({name})"), seed)
+            result["recovery"] = recovery(
+                captured, rows, options, within(progress, f"({name})"), seed
+            )
             result["starts"] = from_afar(captured, options, within(progress, f"({name})"), seed)
         if name == "b":
             found = [_final(rows)]
             for k in range(1, seeds):
-                table = Table(captured, options, progress=within(progress, f"({name})"), seed=seed + k)
+                table = Table(
+                    captured, options, progress=within(progress, f"({name})"), seed=seed + k
+                )
                 found.append(_final(table.run(("original", "spatial"))))
             shared = [n for n in found[0] if all(n in f for f in found)]
             result["seeds"] = {n: spread([f[n] for f in found]) for n in shared}
@@ -128,7 +132,10 @@ def recovery(
     out = {"as captured": _recovered(rows)}
     name = "noise of 2 % of white and 500 electrons at white"
     table = Table(
-        replace(captured, views=tuple(noisy)), options, progress=within(progress, f"({name})"), seed=seed
+        replace(captured, views=tuple(noisy)),
+        options,
+        progress=within(progress, f"({name})"),
+        seed=seed,
     )
     out[name] = _recovered(table.run(("original",)))
     name = "lights 2 mm and 3 % off"
@@ -144,7 +151,7 @@ def recovery(
 def from_afar(
     captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """What the variant "original" finds of one colour from `STARTS`, and in how many CPU seconds."""
+    """What the variant "original" finds of one colour from `STARTS`, and in what time."""
     true, out = captured.truth.mean(), []
     problem = Problem(captured.mapped, captured.training(), captured.exposure.scale, captured.skin)
     for beta_m, beta_n, eta, (r, g, b) in STARTS:
@@ -285,7 +292,8 @@ def report(result: dict[str, Any]) -> str:
         lines.append(f"- (b), {name}: {found['mean']:.2f}{sd} dB over {found['seeds']} seeds")
     for case, rows in result.get("recovery", {}).items():
         for row, found in rows.items():
-            lights = f", lights {100 * found['lights_off']:.1f} % off" * ("lights_off" in found)
+            off = found.get("lights_off")
+            lights = "" if off is None else f", lights {100 * off:.1f} % off"
             lines.append(f"- {case}, {row}: {found['psnr_clean']:.2f} dB, {_off(found)}{lights}")
     for row in result.get("starts", []):
         start = row["start"]
@@ -318,16 +326,16 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     subject = simulated(args.rig, args.subject, args.head, args.seed)
     effort: dict[str, Any] = {"options": QUICK, "rig": SMALL} if args.quick else {}
     seeds = min(args.seeds, 1) if args.quick else args.seeds
-    result = run_bench(
-        args.out, subject, seeds=seeds, seed=args.seed, progress=progress, **effort
-    )
+    result = run_bench(args.out, subject, seeds=seeds, seed=args.seed, progress=progress, **effort)
     try:
         folder = cycles_folder(args.capture)
     except LeftOut as error:
         return {**result, "cycles": {"left_out": str(error)}}
     for name, start in (("cycles", None), ("cycles_from_afar", AFAR)):
         frames = CyclesFrames.read(folder, pixels=40 if args.quick else 600, seed=args.seed)
-        found = fit_cycles(frames, start, options=QUICK if args.quick else CYCLES_OPTIONS, progress=progress)
+        found = fit_cycles(
+            frames, start, options=QUICK if args.quick else CYCLES_OPTIONS, progress=progress
+        )
         save(args.out / f"appearance_{name}.json", found)
         result[name] = found
     return result

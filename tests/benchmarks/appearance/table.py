@@ -177,4 +177,3 @@ def _image(values: Array, pixels: Ints, size: tuple[int, int]) -> Array:
     out = np.zeros((size[0] * size[1], 3))
     out[pixels] = values
     return out.reshape(*size, 3)
-

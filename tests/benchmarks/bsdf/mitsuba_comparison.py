@@ -66,6 +66,7 @@ class Measured:
 
 def measured(bsdf: Any, case: Case) -> Measured:
     """`bsdf` (a Mitsuba BSDF) at the direction of `case`, in float32."""
+
     def interaction(lanes: int) -> Any:
         si: Any = dr.zeros(mi.SurfaceInteraction3f, lanes)
         si.wi = mi.Vector3f(*map(float, case.wi))

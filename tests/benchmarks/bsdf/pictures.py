@@ -114,4 +114,3 @@ def furnaces(path: Path, *, size: int = 96, spp: int = 128) -> list[tuple[float,
 
 def _curves(strands: Strands) -> Any:
     return build_scene(strands, None, hair=HairAppearance((1, 1, 1), 0.3, 0.3)).hair_shape
-

@@ -10,7 +10,6 @@ import argparse
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,8 +125,9 @@ def run_patch(
     results["variants"] |= truth.baselines(Model(out / "photometric"), OPTIONS.grid)
     save(out / "patch.json", results)
     plot_geometry(results["variants"], out / "patch.png")
-    found = {m: here.ball.cut(Model(out / m).strands()) for m in METHODS}
-    sets = {"true": truth.strands, **found}
+    sets = {"true": truth.strands}
+    for m in METHODS:
+        sets[m] = here.ball.cut(Model(out / m).strands())
     picture_strands(out / "strands.png", capture.rig.cameras[0], sets)
     return results
 

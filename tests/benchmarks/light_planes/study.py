@@ -188,4 +188,3 @@ def _shares(report: Report) -> dict[str, float]:
         "culled_by_hull": 1 - points["inside_hull"] / max(points["well_conditioned"], 1),
         "filled_in": field["unknowns"] / max(field["unknowns"] + field["measured_voxels"], 1),
     }
-

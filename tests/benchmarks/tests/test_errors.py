@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from benchmarks.renderers.errors import Effort, Subject, relative_mse, run, with_count
+from benchmarks.renderers.cost import with_count
+from benchmarks.renderers.errors import QUICK, relative_mse, run
+from benchmarks.subjects import Subject
 
 from appearance.scene.hair_appearance import HairAppearance
 
@@ -29,10 +31,11 @@ def test_a_small_run_writes_figures_and_plots(tmp_path, small):
     subject = Subject(
         small.tuft(100), small.plane(), HairAppearance((0.5, 0.6, 0.8), 0.3, 0.3), (0.3, 0.3, 0.3)
     )
-    effort = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2, 16)
-    result = run(tmp_path, {"tuft": subject}, small.camera(), effort=effort)
-    assert json.loads((tmp_path / "light.json").read_text()) == result
-    assert all((tmp_path / f).stat().st_size > 5000 for f in ("light.png", "light_growth.png"))
+    result = run(tmp_path, {"tuft": subject}, small.camera(), effort=QUICK)
+    assert json.loads((tmp_path / "renderers.json").read_text()) == result
+    assert all(
+        (tmp_path / f).stat().st_size > 5000 for f in ("renderers.png", "renderers_growth.png")
+    )
     tuft = result["subjects"]["tuft"]
     assert tuft["agreement"]["ratio"] == pytest.approx(1, abs=0.1)
     errors = [p["rel_mse"] for p in tuft["lights"]["3"]["series"] if p["method"] == "ours"]

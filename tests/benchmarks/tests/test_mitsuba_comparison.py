@@ -4,7 +4,13 @@ from pathlib import Path
 
 import pytest
 from benchmarks.bsdf.integrals import Case
-from benchmarks.bsdf.mitsuba_comparison import CASES, bessel_errors, case_cells, compare, reciprocity_error
+from benchmarks.bsdf.mitsuba_comparison import (
+    CASES,
+    bessel_errors,
+    case_cells,
+    compare,
+    reciprocity_error,
+)
 
 TABLE = Path(__file__).parents[3] / "docs" / "bsdf.md"
 
