@@ -43,7 +43,7 @@ class GatedProjectors(Gated, Protocol):
         """Whether the pattern is up."""
 
 
-class Stage(Protocol):
+class Wiring(Protocol):
     """What the trigger box is wired to."""
 
     @property
@@ -90,8 +90,8 @@ class TriggerBox:
     End with `stop`. The lock is held while the table acts and released while it waits.
     """
 
-    def __init__(self, stage: Stage, faults: Faults) -> None:
-        self._stage = stage
+    def __init__(self, wiring: Wiring, faults: Faults) -> None:
+        self._wiring = wiring
         self._faults = faults
         self._changed = threading.Condition()
         self._ended = threading.Event()
@@ -132,13 +132,13 @@ class TriggerBox:
                 self._refuse_unsafe()
                 return f"OK {self._fire()}"
             case ["COUNT?"]:
-                return f"COUNT {self._stage.pulses}"
+                return f"COUNT {self._wiring.pulses}"
             case ["RESET"]:
                 self._refuse_while_running()
-                self._stage.reset()
+                self._wiring.reset()
                 return "OK 0"
             case ["STATUS?"]:
-                interlock, estop = self._stage.safety()
+                interlock, estop = self._wiring.safety()
                 return f"STATUS interlock={int(interlock)} estop={int(estop)}"
             case ["TABLE", count]:
                 self._refuse_while_running()
@@ -205,7 +205,7 @@ class TriggerBox:
             raise Refusal(NOT_NOW, "a table runs")
 
     def _refuse_unsafe(self) -> None:
-        interlock, estop = self._stage.safety()
+        interlock, estop = self._wiring.safety()
         if interlock or estop:
             raise Refusal(UNSAFE, "emergency stop pressed" if estop else "interlock open")
 
@@ -229,7 +229,7 @@ class TriggerBox:
         if "P" in row.gates:
             self._until_pattern(True)
         self._until(time.monotonic() + row.settle)
-        late = self._faults.at("trigger", "late_trigger", self._stage.pulses + 1)
+        late = self._faults.at("trigger", "late_trigger", self._wiring.pulses + 1)
         if late is not None:
             self._until(time.monotonic() + late.seconds)
         self._fire()
@@ -239,23 +239,23 @@ class TriggerBox:
         self._steps += 1
 
     def _fire(self) -> int:
-        due = self._stage.pulses + 1
+        due = self._wiring.pulses + 1
         if self._faults.once("trigger", "double", due):
-            return self._stage.pulse(fires=2)
+            return self._wiring.pulse(fires=2)
         if self._faults.once("trigger", "dropped", due):
-            return self._stage.pulse(fires=0)
+            return self._wiring.pulse(fires=0)
         if self._faults.once("trigger", "uncounted", due):
-            return self._stage.pulse(counts=0)
-        return self._stage.pulse()
+            return self._wiring.pulse(counts=0)
+        return self._wiring.pulse()
 
     def _delay(self) -> None:
-        late = self._faults.at("trigger", "late_trigger", self._stage.pulses + 1)
+        late = self._faults.at("trigger", "late_trigger", self._wiring.pulses + 1)
         if late is not None:
             self._ended.wait(late.seconds)
 
     def _until_pattern(self, up: bool) -> None:
         deadline = time.monotonic() + _TRIGGER_OUT_S
-        while self._stage.projectors.trigger_out != up:
+        while self._wiring.projectors.trigger_out != up:
             if time.monotonic() >= deadline:
                 self._end("no-pattern")
             self._until(time.monotonic() + _LOOK_S)
@@ -263,7 +263,7 @@ class TriggerBox:
     def _until(self, moment: float) -> None:
         """Wait, looking at what may end the table; raises `_Stopped` when it has ended."""
         while True:
-            interlock, estop = self._stage.safety()
+            interlock, estop = self._wiring.safety()
             if estop or interlock:
                 self._end("estop" if estop else "interlock")
             elif time.monotonic() - self._fed > self._watchdog:
@@ -283,7 +283,7 @@ class TriggerBox:
             self._changed.notify_all()
 
     def _set_gates(self, gates: str) -> None:
-        wires: dict[str, Gated] = {"L": self._stage.lamps, "P": self._stage.projectors}
+        wires: dict[str, Gated] = {"L": self._wiring.lamps, "P": self._wiring.projectors}
         for gate, device in wires.items():
             if (gate in gates) != (gate in self._open):
                 device.gate(gate in gates)

@@ -11,7 +11,7 @@ from stage_service.acquisition.capture_status import CaptureStatus, read_status
 from stage_service.acquisition.flash_watch import FlashWatch
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
 from stage_service.records.events import EventLog
@@ -28,7 +28,7 @@ class CaptureRun:
         self,
         capture_id: str,
         plan: ResolvedPlan,
-        stage: Stage,
+        devices: DeviceSet,
         writer: CaptureWriter,
         events: EventLog,
         *,
@@ -42,7 +42,7 @@ class CaptureRun:
         living = plan.rig_file.safety.living_subject
         free = not living or (plan.plan.consent is not None and consented)
         watch = _any_rate if free else FlashWatch()
-        self.sequencer = Sequencer(stage, writer, plan, watch=watch, notify=self._notify)
+        self.sequencer = Sequencer(devices, writer, plan, watch=watch, notify=self._notify)
 
     def status(self) -> CaptureStatus:
         """Where it is now."""

@@ -22,7 +22,7 @@ from stage_service.acquisition.latch import Latch
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
 from stage_service.acquisition.states import WrongState, possible
 from stage_service.config import RigFile
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.lights.limited import LitTimes
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.flash import SLOW_HZ, FlashRefusal
@@ -126,11 +126,11 @@ class CaptureManager:
                 "armed_by": armed_by,
                 "request": extra or {},
             }
-            stage = Stage.of(self.rig_file, self._lit)
+            devices = DeviceSet.of(self.rig_file, self._lit)
             writer = CaptureWriter.create(
                 self.folder / capture_id, self.rig_file.rig, description, masks=masks, head=head
             )
-            self._begin(capture_id, resolved, stage, writer, armed_by)
+            self._begin(capture_id, resolved, devices, writer, armed_by)
         return capture_id
 
     def _continue(self, capture_id: str, armed_by: str | None) -> None:
@@ -143,8 +143,8 @@ class CaptureManager:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
             _check_flashing(plan, armed_by)
-            stage = Stage.of(self.rig_file, self._lit)
-            self._begin(capture_id, plan, stage, CaptureWriter.reopen(path), armed_by)
+            devices = DeviceSet.of(self.rig_file, self._lit)
+            self._begin(capture_id, plan, devices, CaptureWriter.reopen(path), armed_by)
             del self._done[capture_id]
 
     def _check_free(self) -> None:
@@ -160,11 +160,11 @@ class CaptureManager:
         self,
         capture_id: str,
         plan: ResolvedPlan,
-        stage: Stage,
+        devices: DeviceSet,
         writer: CaptureWriter,
         armed_by: str | None,
     ) -> None:
-        run = CaptureRun(capture_id, plan, stage, writer, self.events, consented=bool(armed_by))
+        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=bool(armed_by))
         run.thread = threading.Thread(
             target=self._run, args=(run,), name=f"capture-{capture_id}", daemon=True
         )
@@ -226,12 +226,12 @@ class CaptureManager:
             run = self._running
             if run is not None:
                 lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
-                return {**run.sequencer.stage.status(connect=False), "safety": lit}
-            stage = Stage.of(self.rig_file, self._lit)
+                return {**run.sequencer.devices.status(connect=False), "safety": lit}
+            devices = DeviceSet.of(self.rig_file, self._lit)
             try:
-                return {**stage.status(connect=True), "safety": self.darkness()}
+                return {**devices.status(connect=True), "safety": self.darkness()}
             finally:
-                stage.close()
+                devices.close()
 
     def darkness(self) -> dict[str, Any]:
         """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
@@ -247,11 +247,11 @@ class CaptureManager:
         if self.rig_file.devices is None:
             return
         with self._talking:
-            stage = Stage.of(self.rig_file, self._lit)
+            devices = DeviceSet.of(self.rig_file, self._lit)
             try:
-                self._learn(blackout(stage, attempts=1), stage)
+                self._learn(blackout(devices, attempts=1), devices)
             finally:
-                stage.close()
+                devices.close()
 
     def blackout(self) -> dict[str, Any]:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
@@ -276,13 +276,15 @@ class CaptureManager:
         """The blackout with which the run has ended, or one of our own."""
         if run is not None and run.sequencer.blackout is not None:
             return run.sequencer.blackout
-        stage = run.sequencer.stage if run is not None else Stage.of(self.rig_file, self._lit)
+        devices = (
+            run.sequencer.devices if run is not None else DeviceSet.of(self.rig_file, self._lit)
+        )
         try:
-            result = blackout(stage)
-            self._learn(result, stage)
+            result = blackout(devices)
+            self._learn(result, devices)
             return result
         finally:
-            stage.close()
+            devices.close()
 
     def close(self) -> None:
         """Stop what runs, lights off, wait for the thread; the manager starts nothing any more."""
@@ -290,7 +292,7 @@ class CaptureManager:
             self._closed = True
         run = self._stop()
         if run is not None and run.sequencer.blackout is None:  # its thread is stuck somewhere
-            self._learn(blackout(run.sequencer.stage), run.sequencer.stage)
+            self._learn(blackout(run.sequencer.devices), run.sequencer.devices)
         self._stay_on_exit()
         self._root_lock.release()
 
@@ -323,7 +325,7 @@ class CaptureManager:
             # `devices` may have opened the links once more after the sequencer closed them.
             with self._talking, self._lock:
                 try:
-                    run.sequencer.stage.close()
+                    run.sequencer.devices.close()
                 finally:
                     status = self._ended(run)
         if status.outcome == "completed" and self._on_complete is not None:
@@ -339,15 +341,15 @@ class CaptureManager:
         status = run.status()
         self._done[run.id] = status
         if run.sequencer.blackout is not None:
-            self._learn(run.sequencer.blackout, run.sequencer.stage)
+            self._learn(run.sequencer.blackout, run.sequencer.devices)
         result = status.outcome or status.state
         self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
         return status
 
-    def _learn(self, result: Blackout, stage: Stage) -> None:
+    def _learn(self, result: Blackout, devices: DeviceSet) -> None:
         """Keep what a blackout came to, and latch or unlatch."""
-        beams = stage.projectors
-        reads_back = stage.lights.capabilities.reads_back and (
+        beams = devices.projectors
+        reads_back = devices.lights.capabilities.reads_back and (
             beams is None or beams.capabilities.reads_back
         )
         self._dark = result

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from reconstruction.capture.folder import Step
-from stage_service.acquisition.timings import Spent
-from stage_service.devices.device_set import Stage
+from stage_service.acquisition.timings import Timings
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError
 
 
@@ -23,7 +23,7 @@ class Pulse:
 
 
 class Exposing:
-    """Exposes a step on a connected stage, at most `rate_hz` times a second.
+    """Exposes a step on connected devices, at most `rate_hz` times a second.
 
     `watch` is called right before a step's light, and raises what forbids it. Raises `DeviceError`
     where a device fails, `Cancelled` when `cancel` is set meanwhile.
@@ -31,38 +31,38 @@ class Exposing:
 
     def __init__(
         self,
-        stage: Stage,
+        devices: DeviceSet,
         lamp: dict[str, int],
         cancel: threading.Event,
-        spent: Spent,
+        timings: Timings,
         *,
         rate_hz: float | None,
         watch: Callable[[Step], None],
     ) -> None:
         self._watch = watch
-        self._stage, self._lamp, self._cancel, self._spent = stage, lamp, cancel, spent
+        self._devices, self._lamp, self._cancel, self._timings = devices, lamp, cancel, timings
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
 
     def expose(self, step: Step) -> Pulse:
         """Make one pulse in the step's light."""
-        spent = self._spent
-        with spent.on("rate limit"):
+        timings = self._timings
+        with timings.on("rate limit"):
             self._sleep(self._next - time.monotonic())
         self._next = time.monotonic() + self._period
         self._watch(step)
-        with spent.on("lights"):
+        with timings.on("lights"):
             self._light(step)
-        with spent.on("settle"):
-            self._sleep(self._stage.config.lights.settle_s)
-        with spent.on("trigger"):
+        with timings.on("settle"):
+            self._sleep(self._devices.config.lights.settle_s)
+        with timings.on("trigger"):
             asked = time.monotonic()
-            count = self._stage.trigger.pulse(step.exposure)
+            count = self._devices.trigger.pulse(step.exposure)
             pulse = Pulse(count, asked, time.monotonic())
         # From the box's answer, which never comes before the pulse: the light stays long enough.
-        with spent.on("exposure"):
+        with timings.on("exposure"):
             self._sleep(step.exposure)
-        with spent.on("lights"):
+        with timings.on("lights"):
             self._check_lamps(step)
             self._check_projectors(step)
             self.dark(step)
@@ -71,13 +71,13 @@ class Exposing:
     def dark(self, step: Step | None = None) -> None:
         """Put off what the step lit; without a step, everything."""
         if step is None or step.kind in ("olat", "all_on"):
-            self._stage.lights.off()
+            self._devices.lights.off()
         projected = step is None or step.kind in ("scanline", "tracking")
-        if projected and self._stage.projectors is not None:
-            self._stage.projectors.off()
+        if projected and self._devices.projectors is not None:
+            self._devices.projectors.off()
 
     def _light(self, step: Step) -> None:
-        lights = self._stage.lights
+        lights = self._devices.lights
         if step.kind in ("olat", "all_on"):
             lights.set_level(step.level)
         if step.light is not None:
@@ -90,7 +90,7 @@ class Exposing:
             self._project(step)
 
     def _project(self, step: Step) -> None:
-        projectors = self._stage.projectors
+        projectors = self._devices.projectors
         if projectors is None:
             raise RuntimeError(f"step {step.index} ({step.kind}): the stage has no projectors")
         if step.kind == "tracking":
@@ -102,7 +102,7 @@ class Exposing:
 
     def _check_lamps(self, step: Step) -> None:
         """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
-        lights = self._stage.lights
+        lights = self._devices.lights
         if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
             return
         lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
@@ -117,7 +117,7 @@ class Exposing:
 
     def _check_projectors(self, step: Step) -> None:
         """The same for projectors, which go dark when nobody feeds their watchdog."""
-        beams = self._stage.projectors
+        beams = self._devices.projectors
         projected = step.kind in ("scanline", "tracking")
         if projected and beams is not None and beams.capabilities.reads_back and beams.is_dark():
             raise DeviceError(

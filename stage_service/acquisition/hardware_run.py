@@ -11,7 +11,7 @@ from typing import Literal
 from reconstruction.capture.folder import Step
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera, Frame
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, IndexShift, SafetyRefusal
 from stage_service.devices.lights.interface import LightBank, Lit
 from stage_service.devices.projectors.interface import Pattern, ProjectorController
@@ -44,16 +44,16 @@ class HardwareRun:
 
     def __init__(
         self,
-        stage: Stage,
+        devices: DeviceSet,
         steps: Sequence[Step],
         lamp: dict[str, int],
         *,
         rate_hz: float | None,
     ) -> None:
-        self._stage, self._steps, self._lamp = stage, steps, lamp
-        settle = stage.config.lights.settle_s
+        self._devices, self._steps, self._lamp = devices, steps, lamp
+        settle = devices.config.lights.settle_s
         each = [
-            TableRow(1, _gate(s), settle, s.exposure, period_s(s, stage.config, rate_hz))
+            TableRow(1, _gate(s), settle, s.exposure, period_s(s, devices.config, rate_hz))
             for s in steps
         ]
         self._rows = [
@@ -71,7 +71,11 @@ class HardwareRun:
         Raises `DeviceError` where a device fails, `IndexShift` where lamps or projectors did not
         step with the box; `Cancelled` where `cancel` was set.
         """
-        lights, beams, trigger = self._stage.lights, self._stage.projectors, self._stage.trigger
+        lights, beams, trigger = (
+            self._devices.lights,
+            self._devices.projectors,
+            self._devices.trigger,
+        )
         lit = [_entry(s, self._lamp) for s in self._steps if _gate(s) == "L"]
         shown = [_pattern(s) for s in self._steps if _gate(s) == "P"]
         if lit:
@@ -79,8 +83,8 @@ class HardwareRun:
         if shown:
             assert beams is not None
             beams.load_sequence(shown)
-        trigger.load_table(self._rows, self._stage.config.watchdog_s)
-        watch = _Watch(self._stage, stop_asked)
+        trigger.load_table(self._rows, self._devices.config.watchdog_s)
+        watch = _Watch(self._devices, stop_asked)
         try:
             trigger.go()
             watch.start()
@@ -117,7 +121,7 @@ class HardwareRun:
 
     def _check_stepped(self, progress: TableProgress) -> None:
         """Raise `DeviceError` unless lamps and projectors stepped as far as the box."""
-        lights, beams = self._stage.lights, self._stage.projectors
+        lights, beams = self._devices.lights, self._devices.projectors
         lit, shown = (self._gates(gate, len(self._steps)) for gate in "LP")
         if lit and lights.capabilities.reads_back and lights.status().watchdog_tripped:
             raise DeviceError(
@@ -127,10 +131,10 @@ class HardwareRun:
                 received="a tripped one: frames of this run may be dark",
                 todo="Check the load of the host and the link; raise watchdog_s.",
             )
-        devices: list[tuple[str, LightBank | ProjectorController]] = [("L", lights)] if lit else []
+        stepped: list[tuple[str, LightBank | ProjectorController]] = [("L", lights)] if lit else []
         if shown and beams is not None:
-            devices.append(("P", beams))
-        for gate, device in devices:
+            stepped.append(("P", beams))
+        for gate, device in stepped:
             # Where a table is stopped in a step, that step's gate may have been open, too; in the
             # exposure it was, but a bank that interlock or watchdog stopped no longer counts.
             least, most = (self._gates(gate, progress.steps + more) for more in (0, 1))
@@ -155,7 +159,7 @@ class HardwareRun:
     def _early(self, progress: TableProgress) -> DeviceError:
         kind = SafetyRefusal if progress.reason in ("interlock", "estop") else DeviceError
         return kind(
-            self._stage.trigger.name,
+            self._devices.trigger.name,
             f"running a table of {len(self._steps)} steps",
             expected="all of them",
             received=f"{progress.state} after {progress.pulses} pulses ({progress.reason})",
@@ -174,10 +178,10 @@ _TODO = {
 class _Watch:
     """Asks the box how far it is, which feeds its watchdog, until the table is over."""
 
-    def __init__(self, stage: Stage, stop_asked: Callable[[], bool]) -> None:
+    def __init__(self, devices: DeviceSet, stop_asked: Callable[[], bool]) -> None:
         self.over = threading.Event()
         self._progress: TableProgress | None = None
-        self._trigger, self._stop_asked = stage.trigger, stop_asked
+        self._trigger, self._stop_asked = devices.trigger, stop_asked
         self._error: Exception | None = None
         self._leave = threading.Event()
         self._thread = threading.Thread(target=self._run, name="table-watch", daemon=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import DeviceError, SafetyRefusal
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus
 from stage_service.devices.projectors.interface import ProjectorCapabilities
@@ -57,19 +57,19 @@ class _Dark(Protocol):
     def off(self) -> None: ...
 
 
-def blackout(stage: Stage, attempts: int = ATTEMPTS) -> Blackout:
+def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
     """Put lamps and projectors off and read it back; never raises for a device.
 
     A device that fails is tried again on a new connection. What cannot be verified is reported
     as "unknown, unsafe".
     """
-    lights, beams, config = stage.lights, stage.projectors, stage.config
+    lights, beams, config = devices.lights, devices.projectors, devices.config
     problems = unread = ""
-    devices: list[tuple[_Dark, LightCapabilities | ProjectorCapabilities, Callable[[], bool]]]
-    devices = [(lights, lights.capabilities, lambda: lights.status().lit == 0)]
+    lit: list[tuple[_Dark, LightCapabilities | ProjectorCapabilities, Callable[[], bool]]]
+    lit = [(lights, lights.capabilities, lambda: lights.status().lit == 0)]
     if beams is not None:
-        devices.append((beams, beams.capabilities, beams.is_dark))
-    for device, can, is_dark in devices:
+        lit.append((beams, beams.capabilities, beams.is_dark))
+    for device, can, is_dark in lit:
         problem = _darken(device, is_dark if can.reads_back else None, attempts)
         if problem and can.dead_man:
             problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
@@ -101,13 +101,13 @@ def _darken(device: _Dark, is_dark: Callable[[], bool] | None, attempts: int) ->
     return problem
 
 
-def check_interlocks(stage: Stage) -> None:
+def check_interlocks(devices: DeviceSet) -> None:
     """Raise `SafetyRefusal` while an interlock is open or the emergency stop is pressed."""
     inputs: list[tuple[str, TriggerStatus | LightStatus]] = [
-        (stage.trigger.name, stage.trigger.status())
+        (devices.trigger.name, devices.trigger.status())
     ]
-    if stage.lights.capabilities.reads_back:
-        inputs.append((stage.lights.name, stage.lights.status()))
+    if devices.lights.capabilities.reads_back:
+        inputs.append((devices.lights.name, devices.lights.status()))
     for name, status in inputs:
         for seen, text in (
             (status.estop_pressed, "emergency stop pressed"),

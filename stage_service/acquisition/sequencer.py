@@ -17,10 +17,10 @@ from stage_service.acquisition.hardware_run import HardwareRun, Shots
 from stage_service.acquisition.safety import Blackout, blackout, check_interlocks
 from stage_service.acquisition.sentinels import check_sentinels
 from stage_service.acquisition.states import Machine, Outcome, State, WrongState
-from stage_service.acquisition.timings import Spent
+from stage_service.acquisition.timings import Timings
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera, Frame
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.plan.resolved import ResolvedPlan
@@ -56,14 +56,14 @@ class Sequencer:
 
     def __init__(
         self,
-        stage: Stage,
+        devices: DeviceSet,
         writer: CaptureWriter,
         plan: ResolvedPlan,
         *,
         watch: Callable[[Step], None] = lambda _step: None,
         notify: Notify = lambda _kind, _data: None,
     ) -> None:
-        self.stage = stage
+        self.devices = devices
         self.error: str | None = None
         self.blackout: Blackout | None = None
         self.steps_done = 0
@@ -81,17 +81,17 @@ class Sequencer:
         self._armed: float | None = None
         self._doubtful = False
         # By camera: frames since its queue was last found empty, and those that it put in doubt.
-        self._unchecked: dict[str, list[Step]] = {c.name: [] for c in stage.cameras}
+        self._unchecked: dict[str, list[Step]] = {c.name: [] for c in devices.cameras}
         self._withdrawn: dict[str, list[Step]] = {}
         self._clocked = 0  # steps of the hardware-stepped run that is under way
         self._unclear: dict[str, str] = {}
-        self._spent = Spent()
+        self._timings = Timings()
         self._exposing = Exposing(
-            stage, self._lamp, self._cancel, self._spent, rate_hz=self._rate_hz, watch=watch
+            devices, self._lamp, self._cancel, self._timings, rate_hz=self._rate_hz, watch=watch
         )
-        self._pulses = PulseAccount(stage.trigger.name)
+        self._pulses = PulseAccount(devices.trigger.name)
         self._accounts = {
-            c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in stage.cameras
+            c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in devices.cameras
         }
 
     @property
@@ -173,8 +173,8 @@ class Sequencer:
         extra: dict[str, Any] = {
             "seconds": self.seconds,
             "error": self.error,
-            "seconds_by_cause": dict(self._spent.seconds),
-            "service_s_per_step_median": self._spent.own_median_s,
+            "seconds_by_cause": dict(self._timings.seconds),
+            "service_s_per_step_median": self._timings.own_median_s,
             "sentinels_unclear": self._unclear,
         }
         if self.blackout is not None:
@@ -190,32 +190,32 @@ class Sequencer:
         self._move("finish")
 
     def _session(self) -> None:
-        stage = self.stage
+        devices = self.devices
         with ExitStack() as stack:
-            frames = FrameWriter(self._writer, QUEUED_STEPS * len(stage.cameras))
+            frames = FrameWriter(self._writer, QUEUED_STEPS * len(devices.cameras))
             stack.callback(frames.close)
-            stack.callback(stage.close)
+            stack.callback(devices.close)
             # The heartbeat ends before the blackout begins: should that fail, the bank's own
             # watchdog puts the lamps off.
             stack.callback(self._black_out)
-            stage.connect()
-            check_interlocks(stage)
+            devices.connect()
+            check_interlocks(devices)
             if any(s.kind in ("scanline", "tracking") for s in self._writer.steps):
-                stage.require_power()
-            if stage.trigger.table_rows:
-                stage.trigger.stop()  # a table that a service which died has started
-            stage.trigger.reset()
-            cameras = FanOut(stage.cameras)
+                devices.require_power()
+            if devices.trigger.table_rows:
+                devices.trigger.stop()  # a table that a service which died has started
+            devices.trigger.reset()
+            cameras = FanOut(devices.cameras)
             stack.callback(cameras.close)
             watched = [
                 device
-                for device in (stage.lights, stage.projectors)
+                for device in (devices.lights, devices.projectors)
                 if device is not None and device.capabilities.dead_man
             ]
             for device in watched:
-                device.set_watchdog(stage.config.watchdog_s)
+                device.set_watchdog(devices.config.watchdog_s)
             beats = [
-                stack.enter_context(Heartbeat(device, stage.config.heartbeat_s))
+                stack.enter_context(Heartbeat(device, devices.config.heartbeat_s))
                 for device in watched
             ]
             self._exposing.dark()
@@ -228,7 +228,7 @@ class Sequencer:
                 for step, wanted in todo.items():
                     self._boundary(beats)
                     if wanted:
-                        with self._spent.step():
+                        with self._timings.step():
                             self._shoot(step, wanted, cameras, frames)
                     self.steps_done += 1
                     self._notify("capture.step", {"steps_done": self.steps_done, **step.to_dict()})
@@ -238,7 +238,7 @@ class Sequencer:
 
     def _wanted(self, step: Step) -> set[str]:
         records = self._writer.records
-        names = (c.name for c in self.stage.cameras)
+        names = (c.name for c in self.devices.cameras)
         return {
             name
             for name in names
@@ -248,20 +248,20 @@ class Sequencer:
     def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
         """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
         steps = list(todo)
-        run = HardwareRun(self.stage, steps, self._lamp, rate_hz=self._rate_hz)
+        run = HardwareRun(self.devices, steps, self._lamp, rate_hz=self._rate_hz)
         self._clocked = len(steps)
         try:
-            with self._spent.on("arm"):
+            with self._timings.on("arm"):
                 self._arm(steps[0].exposure, cameras)
-            with self._spent.on("hardware run"):
+            with self._timings.on("hardware run"):
                 shots = run.shoot(cameras, self._cancel, lambda: self._abort_asked)
                 self._exposing.dark()
         finally:
             self._clocked = 0
         first = self._pulses.count + 1
-        self._pulses.ran(shots.progress.pulses, self.stage.trigger.count())
+        self._pulses.ran(shots.progress.pulses, self.devices.trigger.count())
         places = self._place(shots, run)
-        for camera in self.stage.cameras:
+        for camera in self.devices.cameras:
             for place, frame in zip(
                 places[camera.name] or (), shots.frames[camera.name], strict=False
             ):
@@ -292,13 +292,13 @@ class Sequencer:
         """One step; cameras without a frame get more pulses, only their frames are kept then."""
         for attempt in range(self._retries + 1):
             if self._doubtful or self._armed != step.exposure:
-                with self._spent.on("arm"):
+                with self._timings.on("arm"):
                     self._arm(step.exposure, cameras)
             pulse = self._exposing.expose(step)
             self._pulses.fired(pulse.count)
-            with self._spent.on("cameras"):
+            with self._timings.on("cameras"):
                 shot = cameras(lambda camera: camera.read(self._cancel))
-            for camera in self.stage.cameras:
+            for camera in self.devices.cameras:
                 frame = shot[camera.name]
                 self._account(camera, frame, pulse)
                 if frame is not None and camera.name in wanted:
@@ -316,7 +316,7 @@ class Sequencer:
             )
 
     def _put(self, frames: FrameWriter, shot: Shot) -> None:
-        with self._spent.on("storage"):
+        with self._timings.on("storage"):
             frames.put(shot)
         self._unchecked[shot.camera].append(shot.step)
 
@@ -368,18 +368,18 @@ class Sequencer:
         if not self._pause_asked:
             return
         self._move("pause")
-        dark = blackout(self.stage)
+        dark = blackout(self.devices)
         if dark.blocks:
             raise RuntimeError(f"pausing: {dark.detail}")
         with self._changed:
             self._changed.wait_for(lambda: self._abort_asked or not self._pause_asked)
         if self._abort_asked:
             raise Cancelled("aborted while paused")
-        check_interlocks(self.stage)
+        check_interlocks(self.devices)
         self._move("resume")
 
     def _black_out(self) -> None:
-        self.blackout = blackout(self.stage)
+        self.blackout = blackout(self.devices)
 
     def _require(self, action: str) -> None:
         if not self._machine.allows(action) or (self._abort_asked and action != "abort"):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from statistics import median
 
 
-class Spent:
+class Timings:
     """Seconds by cause, and what is left of each step for the service's own work.
 
     One thread uses it. Causes must not be nested.

@@ -39,7 +39,7 @@ Device = LightBank | TriggerBox | ProjectorController | Camera
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class DeviceSet:
     """The drivers of a stage; `projectors` is None where it has none.
 
     `powers` are the projectors whose power can be asked for.

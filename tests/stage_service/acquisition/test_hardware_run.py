@@ -17,7 +17,7 @@ from simulators.peers.faults import Fault
 from simulators.peers.pjlink_projector import PjLinkServer, SimulatedProjector
 from stage_service.acquisition.safety import blackout
 from stage_service.acquisition.sequencer import CannotPause, Sequencer
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -26,7 +26,9 @@ def sequencer(rig_file: Any, path: Path, heard: list[Any], **plan: Any) -> Seque
     wanted = resolve(CapturePlan(**plan), rig_file)
     writer = CaptureWriter.create(path, rig_file.rig, {"steps": wanted.steps})
     assert "hardware" in {r.stepping for r in wanted.runs}
-    return Sequencer(Stage.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event))
+    return Sequencer(
+        DeviceSet.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event)
+    )
 
 
 def expected(step: Any, pose: int) -> float | None:
@@ -136,7 +138,7 @@ def test_a_sweep_needs_projectors_that_are_on(simulated, small_rig, tmp_path):
     try:
         (tmp_path / "password").rename(tmp_path / "elsewhere")
         world.lamps.select(3)
-        stage = Stage.of(rig_file)
+        stage = DeviceSet.of(rig_file)
         assert blackout(stage).safe  # whatever becomes of a password
         assert is_dark(world)
         power = stage.status(connect=True)["projector_power"]["left"]
@@ -149,10 +151,10 @@ def test_a_sweep_needs_projectors_that_are_on(simulated, small_rig, tmp_path):
         assert "left (PJLink" in str(run.error)
         assert "expected power on, received standby" in str(run.error)
         assert world.pulses == 0
-        (projector,) = Stage.of(rig_file).powers
+        (projector,) = DeviceSet.of(rig_file).powers
         projector.switch(True)
         now[0] = 61.0
-        stage = Stage.of(rig_file)
+        stage = DeviceSet.of(rig_file)
         power = stage.status(connect=True)["projector_power"]["left"]
         stage.close()
         assert (power["state"], power["power"]) == ("ok", "ON")

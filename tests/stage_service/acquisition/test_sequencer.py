@@ -14,7 +14,7 @@ from reconstruction.capture.verify import verify
 from reconstruction.capture.writer import CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import ResolvedPlan, resolve
 
@@ -29,7 +29,9 @@ def sequencer(
     wanted = in_software(rig_file, **plan)
     writer = CaptureWriter.create(path, rig_file.rig, {"steps": wanted.steps})
     heard: list[Any] = [] if events is None else events
-    return Sequencer(Stage.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event))
+    return Sequencer(
+        DeviceSet.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event)
+    )
 
 
 def in_software(rig_file: RigFile, **plan: Any) -> ResolvedPlan:
@@ -115,7 +117,7 @@ def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world,
 
     world.double = set()
     writer = CaptureWriter.reopen(tmp_path / "c")
-    assert Sequencer(Stage.of(rig_file), writer, in_software(rig_file)).run() == "completed"
+    assert Sequencer(DeviceSet.of(rig_file), writer, in_software(rig_file)).run() == "completed"
     assert verify(tmp_path / "c") == []
     capture = Capture(tmp_path / "c")
     for step, light in zip((2, 3, 4), LIGHTS, strict=True):
@@ -153,7 +155,7 @@ def test_trouble_fails_the_capture_dark_and_named(rig_file, world, tmp_path, fau
 
 def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, tmp_path):
     run = sequencer(rig_file, tmp_path / "c")
-    pulse = run.stage.trigger.pulse
+    pulse = run.devices.trigger.pulse
 
     def cut(exposure: float) -> int:
         count = pulse(exposure)
@@ -161,7 +163,7 @@ def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, 
             world.lit = set()
         return count
 
-    run.stage.trigger.pulse = cut  # type: ignore[method-assign]
+    run.devices.trigger.pulse = cut  # type: ignore[method-assign]
     assert run.run() == "failed"
     assert "after the exposure of step 2: expected 1 lamps lit, received 0 lit" in str(run.error)
     assert max(step for step, _ in Capture(tmp_path / "c").records) == 1
@@ -204,7 +206,7 @@ def test_abort_keeps_what_is_finished_and_reopening_shoots_the_rest(rig_file, wo
     assert len(Capture(tmp_path / "c").records) == 15
     pulses = len(Capture(tmp_path / "c").steps) - 5
     again = Sequencer(
-        Stage.of(rig_file), CaptureWriter.reopen(tmp_path / "c"), in_software(rig_file)
+        DeviceSet.of(rig_file), CaptureWriter.reopen(tmp_path / "c"), in_software(rig_file)
     )
     assert again.run() == "completed"
     assert world.pulses == pulses

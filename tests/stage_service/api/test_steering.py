@@ -20,7 +20,7 @@ from reconstruction.capture.verify import verify
 from stage_service.api.app import create_app
 from stage_service.cli import main
 from stage_service.config import RigFile, SafetyLimits
-from stage_service.devices.device_set import Stage as Devices
+from stage_service.devices.device_set import DeviceSet
 from stage_service.service import Stage
 
 SHORT = {"lights": ["light_003", "light_000"], "projectors": []}
@@ -306,7 +306,7 @@ def test_a_capture_is_not_continued_on_another_stage(
 
 
 def test_the_stage_keeps_the_limits_of_the_rig_file(rig_file):
-    lights = Devices.of(replace(rig_file, safety=SafetyLimits(max_lamps=5))).lights
+    lights = DeviceSet.of(replace(rig_file, safety=SafetyLimits(max_lamps=5))).lights
     with pytest.raises(RuntimeError, match="max_lamps"):
         lights.all_on()
     lights.close()

@@ -16,7 +16,7 @@ from waiting import until
 
 from stage_service.acquisition.safety import blackout
 from stage_service.config import RigFile, load_rig_file
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 NEVER = threading.Event()
@@ -78,10 +78,10 @@ def simulators(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigFile]:
 
 
 @pytest.fixture(params=["the tests' peers", "simulators"])
-def stage(request: pytest.FixtureRequest) -> Iterator[Stage]:
+def stage(request: pytest.FixtureRequest) -> Iterator[DeviceSet]:
     own = request.param != "simulators"
     rig_file: Any = request.getfixturevalue("rig_file" if own else "simulators")
-    one = Stage.of(rig_file)
+    one = DeviceSet.of(rig_file)
     one.connect()
     yield one
     blackout(one)

@@ -13,7 +13,7 @@ from waiting import until
 from stage_service.config import RigFile, SerialConfig
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.link import LinkCamera
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import (
     Cancelled,
     DeviceError,
@@ -30,8 +30,8 @@ NEVER = threading.Event()
 
 
 @pytest.fixture
-def stage(rig_file: RigFile) -> Iterator[Stage]:
-    one = Stage.of(rig_file)
+def stage(rig_file: RigFile) -> Iterator[DeviceSet]:
+    one = DeviceSet.of(rig_file)
     one.connect()
     yield one
     one.close()
