@@ -15,7 +15,7 @@ from reconstruction.geometry.cameras import Camera as Geometry
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.interface import Camera
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError
 
 NEVER = threading.Event()
@@ -33,7 +33,7 @@ class Rig:
 @pytest.fixture
 def link(simulated) -> Iterator[Rig]:
     rig_file, world = simulated()
-    camera = Stage.of(rig_file).cameras[0]
+    camera = DeviceSet.of(rig_file).cameras[0]
     yield Rig(camera, world.pulse)
     camera.close()
 

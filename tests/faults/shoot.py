@@ -16,7 +16,7 @@ from typing import Any
 from reconstruction.capture.writer import CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -50,4 +50,4 @@ if (Path(capture) / "plan.json").exists():
     writer = CaptureWriter.reopen(capture)
 else:
     writer = CaptureWriter.create(capture, rig_file.rig, {"steps": wanted.steps})
-Sequencer(Stage.of(rig_file), writer, wanted).run()
+Sequencer(DeviceSet.of(rig_file), writer, wanted).run()

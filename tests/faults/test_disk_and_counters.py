@@ -12,7 +12,7 @@ from reconstruction.capture.verify import verify
 from reconstruction.capture.writer import CaptureWriter
 from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.sequencer import Sequencer
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -29,7 +29,7 @@ def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monke
     )
     plan = resolve(CapturePlan(stepping=stepping), rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
-    run = Sequencer(Stage.of(rig_file), writer, plan)
+    run = Sequencer(DeviceSet.of(rig_file), writer, plan)
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
     assert world.pulses == len(plan.steps) > 2 * 21
@@ -52,7 +52,7 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
 
     if stepping == "hardware":
         writer.reserve = 2 * shutil.disk_usage(tmp_path).total
-    run = Sequencer(Stage.of(rig_file), writer, plan, notify=notify)
+    run = Sequencer(DeviceSet.of(rig_file), writer, plan, notify=notify)
     assert run.run() == "failed"
     assert "bytes are needed and a reserve" in str(run.error)
     assert not world.lamps.power().any()
@@ -63,7 +63,7 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     told("disk: no room left", stepping, "failed", 0, run.error)
 
     again = CaptureWriter.reopen(tmp_path / "c")
-    run = Sequencer(Stage.of(rig_file), again, plan)
+    run = Sequencer(DeviceSet.of(rig_file), again, plan)
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
 

@@ -18,14 +18,14 @@ from reconstruction.capture.writer import CaptureWriter
 from simulators.peers.devices import DEVICES_FILE
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
 STAGES = [
-    ("connecting", "after stage_service.devices.device_set:Stage.connect", 1, "software"),
+    ("connecting", "after stage_service.devices.device_set:DeviceSet.connect", 1, "software"),
     ("arming", "after stage_service.acquisition.sequencer:Sequencer._arm", 1, "software"),
     ("a lamp lit", "after stage_service.acquisition.exposing:Exposing._light", 6, "software"),
     ("all lamps lit", "after stage_service.acquisition.exposing:Exposing._light", 2, "software"),
@@ -94,7 +94,7 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, t
     seconds = time.monotonic() - killed
     kept = frames(tmp_path / "c")
     writer = CaptureWriter.reopen(tmp_path / "c")
-    again = Sequencer(Stage.of(rig_file), writer, resolve(plan, rig_file))
+    again = Sequencer(DeviceSet.of(rig_file), writer, resolve(plan, rig_file))
     assert again.run() == "completed", again.error
     assert verify(tmp_path / "c") == []
     assert kept.items() <= frames(tmp_path / "c").items(), "a finished frame was shot again"
@@ -129,7 +129,7 @@ def test_sigkill_of_the_devices(simulated, tmp_path, told):
                 peers.kill()
                 peers.wait()
 
-        run = Sequencer(Stage.of(there), writer, plan, notify=notify)
+        run = Sequencer(DeviceSet.of(there), writer, plan, notify=notify)
         assert run.run() == "failed"
     finally:
         peers.kill()

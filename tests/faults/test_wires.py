@@ -14,7 +14,7 @@ from reconstruction.capture.verify import verify
 from reconstruction.capture.writer import CaptureWriter
 from simulators.peers.faults import Fault
 from stage_service.acquisition.sequencer import Sequencer
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -261,7 +261,7 @@ def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, slack, t
     rig_file, world = simulated(*one.faults, rig=rig)
     plan = resolve(CapturePlan(lights=LIGHTS, stepping=stepping), rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
-    run = Sequencer(Stage.of(rig_file), writer, plan)
+    run = Sequencer(DeviceSet.of(rig_file), writer, plan)
     run.run()
     assert run.outcome == one.outcome, run.error
     if one.dark:

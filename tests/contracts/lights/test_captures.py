@@ -13,7 +13,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.capture.writer import CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import LightBankConfig
-from stage_service.devices.device_set import Stage
+from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -44,7 +44,7 @@ def test_a_capture_over_a_bank_without_read_back(wire, simulated, small_rig, tmp
     wanted = CapturePlan(lights=("light_003", "light_004"), stepping="software")
     plan = resolve(wanted, rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
-    stage = Stage.of(rig_file)
+    stage = DeviceSet.of(rig_file)
     run = Sequencer(stage, writer, plan)
     run.run()
     assert run.outcome == "completed", run.error
