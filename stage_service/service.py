@@ -1,8 +1,9 @@
-"""What the routes call: captures, jobs and devices of one root folder. Knows no HTTP."""
+"""The one seam between the routes and the rest of the service. Knows no HTTP."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable
 from importlib.metadata import version
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ValidationError
 
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import read_obj
@@ -27,10 +28,24 @@ from stage_service.jobs.slots import worker_is_alive
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
 from stage_service.plan.resolved import resolve
+from stage_service.records.audit import Action
 from stage_service.records.events import EventLog
+from stage_service.records.lease import Lease
+from stage_service.service_models import (
+    AcknowledgeRequest,
+    Artifact,
+    CaptureRequest,
+    CaptureView,
+    Health,
+    JobRequest,
+    LeaseGrant,
+    LeaseRequest,
+    LeaseView,
+    RenewRequest,
+)
 
 T = TypeVar("T")
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$"
+log = logging.getLogger("hairstage.service")
 
 
 class BadInput(ValueError):
@@ -49,116 +64,19 @@ class NotFinished(RuntimeError):
     """What was asked for needs a capture or job that is done."""
 
 
-class CaptureRequest(BaseModel):
-    """A capture to make, and the job that follows it by itself when it completes.
-
-    `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine.
-    `armed_by` says who at the stage answers for flashes that the plan has consent for.
-    """
-
-    model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        json_schema_extra={
-            "examples": [
-                {"plan": {}},
-                {
-                    "plan": {"projectors": [], "exposure": {"olat": 0.01}},
-                    "head": "/data/subject/head.obj",
-                    "pipeline": {
-                        "name": "light_planes",
-                        "options": {"held_out_cameras": ["cam_03"], "environment": "studio"},
-                    },
-                },
-            ]
-        },
-    )
-
-    plan: CapturePlan = CapturePlan()
-    head: Path | None = None
-    masks: Path | None = None
-    pipeline: PipelineRequest | None = None
-    armed_by: str | None = Field(default=None, min_length=1, max_length=100)
-
-
-class JobRequest(BaseModel):
-    """A pipeline to run on a capture; `model` names the model folder (default: a new one)."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        json_schema_extra={
-            "examples": [{"capture": "20261121-093000", "pipeline": {"name": "light_planes"}}]
-        },
-    )
-
-    capture: str
-    pipeline: PipelineRequest
-    model: str | None = Field(default=None, pattern=NAME)
-
-
-class CaptureView(CaptureStatus):
-    """A capture's status and the job that its completion enqueued."""
-
-    model_config = ConfigDict(
-        frozen=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "id": "20261121-093000-1f2e",
-                    "state": "done",
-                    "outcome": "completed",
-                    "error": None,
-                    "path": "/data/stage/captures/20261121-093000-1f2e",
-                    "steps": 545,
-                    "step": 545,
-                    "frames_planned": 4360,
-                    "frames_written": 4360,
-                    "frames_missing": 0,
-                    "seconds_predicted": 29.6,
-                    "seconds": 31.2,
-                    "left_out": [],
-                    "started": "2026-11-21T09:30:00.123+00:00",
-                    "request": {"pipeline": {"name": "light_planes", "options": {}}},
-                    "job": "job-20261121-093000-1f2e",
-                }
-            ]
-        },
-    )
-
-    job: str | None
-
-
-class Artifact(BaseModel):
-    """A file of a model folder; `path` is relative to it."""
-
-    path: str
-    bytes: int
-
-
-class Health(BaseModel):
-    """Whether the service and its worker run; says nothing of the devices."""
-
-    status: str
-    version: str
-    rig: str
-    root: str
-    worker: bool
-    capture: str | None
-
-
-class Stage:
-    """The captures, jobs and devices of one root folder.
+class Service:
+    """The captures, jobs and devices of one root folder, for routes and whoever else shows them.
 
     `start()` puts the lights off and watches jobs for the event log; `close()` puts them off again
-    and may be called more than once, from any thread. `control` steers in a caller's name.
+    and may be called more than once, from any thread. What steers the stage is done in a caller's
+    name, recorded, and refused (`Leased`) while somebody else holds the lease.
     """
 
     def __init__(self, rig_file: RigFile, root: Path) -> None:
         self.rig_file, self.root = rig_file, root
-        self.captures = CaptureManager(rig_file, root, on_complete=self._enqueue_pipeline)
-        self.control = Control(self.captures)
-        self.queue = JobQueue(root)
+        self._captures = CaptureManager(rig_file, root, on_complete=self._enqueue_pipeline)
+        self._control = Control(self._captures)
+        self._queue = JobQueue(root)
         self._closing = threading.Lock()
         self._closed = threading.Event()
         self._watcher = threading.Thread(target=self._watch_jobs, name="job-events", daemon=True)
@@ -166,12 +84,12 @@ class Stage:
     @property
     def events(self) -> EventLog:
         """Everything that happened to captures and jobs since the service started."""
-        return self.captures.events
+        return self._captures.events
 
     def start(self) -> None:
         """Lights off; enqueue what a crash kept from being enqueued, and follow the jobs."""
-        self.captures.darken()
-        for status in self.captures.list():
+        self._captures.darken()
+        for status in self._captures.list():
             if status.outcome == "completed":
                 self._enqueue_pipeline(status)
         self._watcher.start()
@@ -182,12 +100,12 @@ class Stage:
             if self._closed.is_set():
                 return
             try:
-                self.captures.close()
+                self._captures.close()
             finally:
                 self._closed.set()
         if self._watcher.is_alive():
             self._watcher.join(timeout=5)
-        self.queue.close()
+        self._queue.close()
 
     def validate(self, plan: CapturePlan) -> PlanCost:
         """Cost a plan without touching a device. Raises `PlanError`."""
@@ -212,7 +130,7 @@ class Stage:
                 head = read_obj(request.head)
             except (OSError, ValueError) as error:
                 raise BadInput(f"head: {error}") from error
-        capture = self.control.start(
+        capture = self._control.start(
             by,
             request.plan,
             armed_by=request.armed_by,
@@ -226,15 +144,31 @@ class Stage:
 
     def capture(self, capture_id: str) -> CaptureView:
         """A capture's status. Raises `UnknownCapture`."""
-        return self.view(self.captures.get(capture_id))
+        return self._view(self._captures.get(capture_id))
 
-    def view(self, status: CaptureStatus) -> CaptureView:
+    def captures(self) -> list[CaptureView]:
+        """All captures, oldest first."""
+        return [self._view(status) for status in self._captures.list()]
+
+    def pause(self, capture_id: str, by: Caller) -> CaptureView:
+        """Pause at the next step boundary. Raises `UnknownCapture`, `WrongState`, `Leased`."""
+        return self._view(self._control.pause(by, capture_id))
+
+    def resume(self, capture_id: str, by: Caller, armed_by: str | None = None) -> CaptureView:
+        """Go on after a pause; of a capture that did not complete, shoot the frames it lacks."""
+        return self._view(self._control.resume(by, capture_id, armed_by=armed_by))
+
+    def abort(self, capture_id: str, by: Caller) -> CaptureView:
+        """Abort at the next step boundary; anybody may. Raises `UnknownCapture`, `WrongState`."""
+        return self._view(self._control.abort(by, capture_id))
+
+    def _view(self, status: CaptureStatus) -> CaptureView:
         """The status together with the job that follows it."""
         job = None
         if status.outcome == "completed" and status.request.get("pipeline") is not None:
             job = job_of(status.id)
             try:
-                self.queue.get(job)
+                self._queue.get(job)
             except NoSuchJob:  # the capture's own thread is just about to enqueue it
                 self._enqueue_pipeline(status)
         return CaptureView(**status.model_dump(), job=job)
@@ -257,7 +191,7 @@ class Stage:
     def capture_path(self, capture_id: str) -> Path:
         """The capture's folder; one that was put there by hand or by `import` counts too."""
         try:
-            return self.captures.path(capture_id)
+            return self._captures.path(capture_id)
         except UnknownCapture:
             with contextlib.suppress(UnknownArtifact):
                 path = inside(self.root / "captures", capture_id)
@@ -279,7 +213,7 @@ class Stage:
                 f"model: {request.pipeline.name!r} needs a model with strands: name one that "
                 "'reconstruct' made"
             )
-        return self.queue.submit(
+        return self._queue.submit(
             request.pipeline.name,
             path,
             model,
@@ -287,27 +221,71 @@ class Stage:
             job=job,
         )
 
-    def report(self, job_id: str) -> Path:
-        """The job's `report.json`. Raises `NoSuchJob`, `UnknownArtifact`."""
-        return self.artifact(job_id, "report.json")
+    def jobs(self, limit: int) -> list[Job]:
+        """The latest `limit` jobs, newest first."""
+        return self._queue.all(limit=limit)
+
+    def job(self, job_id: str) -> Job:
+        """A job's present state. Raises `NoSuchJob`."""
+        return self._queue.get(job_id)
+
+    def cancel_job(self, job_id: str) -> Job:
+        """Cancel a job: a queued one at once, a running one at its next progress call."""
+        return self._queue.cancel(job_id)
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
-        model = Model(self.queue.get(job_id).model)
+        model = Model(self._queue.get(job_id).model)
         return [
             Artifact(path=str(p), bytes=(model.path / p).stat().st_size) for p in model.listing()
         ]
 
     def artifact(self, job_id: str, path: str) -> Path:
         """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
-        file = inside(Path(self.queue.get(job_id).model), path)
+        file = inside(Path(self._queue.get(job_id).model), path)
         if not file.is_file():
             raise UnknownArtifact(f"job {job_id} has no file {path!r}")
         return file
 
+    def devices(self) -> dict[str, Any]:
+        """Each device and whether it answers; "safety": whether the lamps are known to be off."""
+        return self._captures.devices()
+
+    def blackout(self, by: Caller) -> dict[str, Any]:
+        """All lamps and projectors off, verified; aborts a running capture. Anybody may."""
+        return self._control.blackout(by)
+
+    def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:
+        """Take a person's word that the lamps are off. Raises `CannotAcknowledge`."""
+        return self._control.acknowledge(by, request.name, request.note)
+
+    def lease(self) -> LeaseView:
+        """Who steers, if anybody in particular."""
+        held = self._control.leases.current
+        if held is None:
+            return LeaseView(holder=None, expires=None)
+        return LeaseView(holder=held.holder, expires=held.expires)
+
+    def take_lease(self, request: LeaseRequest, by: Caller) -> LeaseGrant:
+        """Steer alone for some time. Raises `Leased`."""
+        return _grant(self._control.take_lease(by, request.holder, request.seconds))
+
+    def renew_lease(self, request: RenewRequest, by: Caller) -> LeaseGrant:
+        """Let the caller's lease end so many seconds from now. Raises `NoLease`."""
+        return _grant(self._control.renew_lease(by, request.seconds))
+
+    def release_lease(self, by: Caller) -> LeaseView:
+        """End the caller's lease. Raises `NoLease`."""
+        self._control.release_lease(by)
+        return self.lease()
+
+    def audit(self, limit: int) -> list[Action]:
+        """The newest actions on the stage, refused ones too; the oldest of them first."""
+        return self._control.audit.latest(limit)
+
     def health(self) -> Health:
         """Whether service and worker run."""
-        running = [c.id for c in self.captures.list() if c.state != "done"]
+        running = [c.id for c in self._captures.list() if c.state != "done"]
         return Health(
             status="ok",
             version=version("hairstage"),
@@ -338,9 +316,13 @@ class Stage:
         asked = status.request.get("pipeline")
         if asked is None:
             return
-        pipeline = PipelineRequest(**asked)
+        try:
+            pipeline = PipelineRequest.model_validate(asked)
+        except ValidationError as error:  # a capture of another version must not stop this one
+            log.warning("%s: its pipeline cannot be run: %s", status.path, error)
+            return
         # One id per capture: enqueuing again after a crash is not a second job.
-        self.queue.submit(
+        self._queue.submit(
             pipeline.name,
             Path(status.path),
             self.root / "models" / status.id,
@@ -351,7 +333,7 @@ class Stage:
     def _watch_jobs(self) -> None:
         seen: dict[str, Job] = {}
         while not self._closed.wait(0.5):
-            for job in self.queue.all(limit=50):
+            for job in self._queue.all(limit=50):
                 before = seen.get(job.id)
                 seen[job.id] = job
                 if before is None or (before.state, before.outcome) != (job.state, job.outcome):
@@ -360,6 +342,10 @@ class Stage:
                 if job.progress is not None and (before is None or before.progress != job.progress):
                     data = {"job": job.id, **job.progress.model_dump(mode="json")}
                     self.events.publish("job.progress", data)
+
+
+def _grant(lease: Lease) -> LeaseGrant:
+    return LeaseGrant(token=lease.token, holder=lease.holder, expires=lease.expires)
 
 
 def job_of(capture_id: str) -> str:

@@ -1,1 +1,1 @@
-"""The HTTP face of the service: thin routes over `stage.Stage`, which knows no HTTP."""
+"""The HTTP face of the service: thin routes over `service.Service`, which knows no HTTP."""

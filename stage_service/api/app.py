@@ -24,7 +24,7 @@ from stage_service.api.problems import (
     install_problems,
     problem_response,
 )
-from stage_service.service import Stage
+from stage_service.service import Service
 
 LOOPBACK = "127.0.0.1"
 OWN_NAMES = {"127.0.0.1", "localhost", "[::1]"}
@@ -53,16 +53,16 @@ class OnlyThisMachine:
         await self._app(scope, receive, send)
 
 
-def create_app(stage: Stage) -> FastAPI:
-    """The application over `stage`; starts it, and closes it (lights off) at shutdown."""
+def create_app(service: Service) -> FastAPI:
+    """The application over `service`; starts it, and closes it (lights off) at shutdown."""
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        stage.start()
+        service.start()
         try:
             yield
         finally:
-            stage.close()
+            service.close()
 
     app = FastAPI(
         title="hairstage",
@@ -76,7 +76,7 @@ def create_app(stage: Stage) -> FastAPI:
             }
         },
     )
-    app.state.stage = stage
+    app.state.service = service
     install_problems(app)
     app.include_router(routes.router)
     app.include_router(steering.router)
@@ -93,12 +93,12 @@ def create_app(stage: Stage) -> FastAPI:
 class _Server(uvicorn.Server):
     """Puts the lights off at the signal itself, not after the last connection has closed."""
 
-    def __init__(self, config: uvicorn.Config, stage: Stage, ready: Callable[[], None]) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
         super().__init__(config)
-        self._stage, self._ready = stage, ready
+        self._service, self._ready = service, ready
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        threading.Thread(target=self._stage.close, name="lights-off").start()
+        threading.Thread(target=self._service.close, name="lights-off").start()
         super().handle_exit(sig, frame)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -106,8 +106,8 @@ class _Server(uvicorn.Server):
         self._ready()
 
 
-def serve(stage: Stage, port: int, ready: Callable[[str], Any] = lambda _url: None) -> None:
-    """Serve `stage` on 127.0.0.1:`port` (0: any free one) until SIGTERM or SIGINT.
+def serve(service: Service, port: int, ready: Callable[[str], Any] = lambda _url: None) -> None:
+    """Serve `service` on 127.0.0.1:`port` (0: any free one) until SIGTERM or SIGINT.
 
     `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
     """
@@ -122,9 +122,9 @@ def serve(stage: Stage, port: int, ready: Callable[[str], Any] = lambda _url: No
             ) from error
         url = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
         config = uvicorn.Config(
-            create_app(stage), log_level="warning", access_log=False, timeout_graceful_shutdown=3
+            create_app(service), log_level="warning", access_log=False, timeout_graceful_shutdown=3
         )
         try:
-            _Server(config, stage, lambda: ready(url)).run(sockets=[listener])
+            _Server(config, service, lambda: ready(url)).run(sockets=[listener])
         finally:
-            stage.close()
+            service.close()

@@ -32,7 +32,7 @@ async def stream_events(
     Without either, only new ones; 0 replays all that are kept. Numbers start at 1 with the service:
     a number that it has not reached yet is from before a restart, and replays everything.
     """
-    events: EventLog = request.app.state.stage.events
+    events: EventLog = request.app.state.service.events
     asked = last_event_id if last_event_id is not None else after
     newest = events.last
     start = newest if asked is None else asked

@@ -1,4 +1,4 @@
-"""The routes. Each calls one function of `Stage`; errors become problems in `problems`."""
+"""The routes. Each calls one function of `Service`; errors become problems in `problems`."""
 
 from __future__ import annotations
 
@@ -10,66 +10,68 @@ from fastapi import APIRouter, Query, Response, status
 from fastapi.responses import FileResponse
 
 from stage_service.api.frames import png_preview
-from stage_service.api.steering import By, OnStage, ResumeRequest
+from stage_service.api.steering import By, OnService
 from stage_service.jobs.records import Job
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
-from stage_service.service import (
+from stage_service.service_models import (
     Artifact,
     CaptureRequest,
     CaptureView,
     Health,
     JobRequest,
+    ResumeRequest,
 )
 
 router = APIRouter()
 
 
 @router.post("/plans:validate", tags=["captures"])
-def validate_plan(plan: CapturePlan, stage: OnStage) -> PlanCost:
+def validate_plan(plan: CapturePlan, service: OnService) -> PlanCost:
     """What a plan would take on this rig: frames, bytes, seconds, light dose. Lights nothing."""
-    return stage.validate(plan)
+    return service.validate(plan)
 
 
 @router.post("/captures", status_code=status.HTTP_202_ACCEPTED, tags=["captures"])
-def start_capture(body: CaptureRequest, stage: OnStage, by: By, response: Response) -> CaptureView:
+def start_capture(
+    body: CaptureRequest, service: OnService, by: By, response: Response
+) -> CaptureView:
     """Begin a capture. With `pipeline`, its completion enqueues that job by itself."""
-    view = stage.start_capture(body, by)
+    view = service.start_capture(body, by)
     response.headers["Location"] = f"/captures/{view.id}"
     return view
 
 
 @router.get("/captures", tags=["captures"])
-def list_captures(stage: OnStage) -> list[CaptureView]:
+def list_captures(service: OnService) -> list[CaptureView]:
     """All captures, oldest first."""
-    return [stage.view(c) for c in stage.captures.list()]
+    return service.captures()
 
 
 @router.get("/captures/{capture}", tags=["captures"])
-def get_capture(capture: str, stage: OnStage) -> CaptureView:
+def get_capture(capture: str, service: OnService) -> CaptureView:
     """Where a capture is, how it ended, and the job that follows it."""
-    return stage.capture(capture)
+    return service.capture(capture)
 
 
 @router.post("/captures/{capture}/pause", tags=["captures"])
-def pause_capture(capture: str, stage: OnStage, by: By) -> CaptureView:
+def pause_capture(capture: str, service: OnService, by: By) -> CaptureView:
     """Pause at the next step boundary, lights off."""
-    return stage.view(stage.control.pause(by, capture))
+    return service.pause(capture, by)
 
 
 @router.post("/captures/{capture}/resume", tags=["captures"])
 def resume_capture(
-    capture: str, stage: OnStage, by: By, body: ResumeRequest | None = None
+    capture: str, service: OnService, by: By, body: ResumeRequest | None = None
 ) -> CaptureView:
     """Go on after a pause; of a capture that did not complete, shoot the frames that it lacks."""
-    armed_by = None if body is None else body.armed_by
-    return stage.view(stage.control.resume(by, capture, armed_by=armed_by))
+    return service.resume(capture, by, None if body is None else body.armed_by)
 
 
 @router.post("/captures/{capture}/abort", tags=["captures"])
-def abort_capture(capture: str, stage: OnStage, by: By) -> CaptureView:
+def abort_capture(capture: str, service: OnService, by: By) -> CaptureView:
     """Abort at the next step boundary, lights off; finished frames stay."""
-    return stage.view(stage.control.abort(by, capture))
+    return service.abort(capture, by)
 
 
 @router.get(
@@ -78,9 +80,9 @@ def abort_capture(capture: str, stage: OnStage, by: By) -> CaptureView:
     responses={200: {"content": {"image/x-exr": {}}}},
     tags=["captures"],
 )
-def get_frame(capture: str, step: int, camera: str, stage: OnStage) -> Response:
+def get_frame(capture: str, step: int, camera: str, service: OnService) -> Response:
     """A frame as it was written: scene-linear radiance, W/(sr m²)."""
-    data = stage.frame(capture, step, camera, Path.read_bytes)
+    data = service.frame(capture, step, camera, Path.read_bytes)
     return Response(data, media_type="image/x-exr")
 
 
@@ -94,61 +96,61 @@ def get_preview(
     capture: str,
     step: int,
     camera: str,
-    stage: OnStage,
+    service: OnService,
     percentile: Annotated[float, Query(ge=50, le=100, description="what becomes white")] = 99.5,
 ) -> Response:
     """A picture of a frame to look at: exposed by a percentile, sRGB."""
-    picture = stage.frame(capture, step, camera, lambda file: png_preview(file, percentile))
+    picture = service.frame(capture, step, camera, lambda file: png_preview(file, percentile))
     return Response(picture, media_type="image/png")
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
-def submit_job(body: JobRequest, stage: OnStage, response: Response) -> Job:
+def submit_job(body: JobRequest, service: OnService, response: Response) -> Job:
     """Enqueue a pipeline on a finished capture."""
-    job = stage.submit(body)
+    job = service.submit(body)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job
 
 
 @router.get("/jobs", tags=["jobs"])
-def list_jobs(stage: OnStage, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> list[Job]:
+def list_jobs(service: OnService, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> list[Job]:
     """The latest jobs, newest first."""
-    return stage.queue.all(limit=limit)
+    return service.jobs(limit)
 
 
 @router.get("/jobs/{job}", tags=["jobs"])
-def get_job(job: str, stage: OnStage) -> Job:
+def get_job(job: str, service: OnService) -> Job:
     """A job's state, progress, and outcome."""
-    return stage.queue.get(job)
+    return service.job(job)
 
 
 @router.delete("/jobs/{job}", tags=["jobs"])
-def cancel_job(job: str, stage: OnStage) -> Job:
+def cancel_job(job: str, service: OnService) -> Job:
     """Cancel a job: a queued one at once, a running one at its next progress call."""
-    return stage.queue.cancel(job)
+    return service.cancel_job(job)
 
 
 @router.get("/jobs/{job}/report", response_class=FileResponse, tags=["jobs"])
-def get_report(job: str, stage: OnStage) -> Response:
+def get_report(job: str, service: OnService) -> Response:
     """The report that the job's stages filled: seconds, error against time, left out, warnings."""
-    return FileResponse(stage.report(job), media_type="application/json")
+    return FileResponse(service.artifact(job, "report.json"), media_type="application/json")
 
 
 @router.get("/jobs/{job}/artifacts", tags=["jobs"])
-def list_artifacts(job: str, stage: OnStage) -> list[Artifact]:
+def list_artifacts(job: str, service: OnService) -> list[Artifact]:
     """The files in the job's model folder."""
-    return stage.artifacts(job)
+    return service.artifacts(job)
 
 
 @router.get("/jobs/{job}/artifacts/{path:path}", response_class=FileResponse, tags=["jobs"])
-def get_artifact(job: str, path: str, stage: OnStage) -> Response:
+def get_artifact(job: str, path: str, service: OnService) -> Response:
     """One file of the model folder."""
-    file = stage.artifact(job, path)
+    file = service.artifact(job, path)
     kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
     return FileResponse(file, media_type=kind)
 
 
 @router.get("/health", tags=["service"])
-def health(stage: OnStage) -> Health:
+def health(service: OnService) -> Health:
     """Whether the service and its worker run; asks no device."""
-    return stage.health()
+    return service.health()

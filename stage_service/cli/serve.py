@@ -32,14 +32,14 @@ def run_serve(args: argparse.Namespace, output: Output) -> int:
     log_to_stderr()
     from stage_service.api.app import serve
     from stage_service.config import load_rig_file
-    from stage_service.service import Stage
+    from stage_service.service import Service
 
     exit_on_sigterm()
-    stage = Stage(load_rig_file(args.rig, args.devices), args.root)
+    service = Service(load_rig_file(args.rig, args.devices), args.root)
 
     def ready(url: str) -> None:
-        text = f"serving {stage.rig_file.rig.name} at {url} (API: {url}/docs)"
+        text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"
         output.result({"url": url, "root": str(args.root), "rig": str(args.rig)}, text)
 
-    serve(stage, args.port, ready)
+    serve(service, args.port, ready)
     return 0

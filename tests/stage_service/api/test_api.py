@@ -23,7 +23,8 @@ from stage_service.config import RigFile
 from stage_service.jobs.records import Job, JobOptions
 from stage_service.plan import resolved, steps
 from stage_service.plan.capture_plan import CapturePlan
-from stage_service.service import CaptureRequest, CaptureView, JobRequest, Stage
+from stage_service.service import Service
+from stage_service.service_models import CaptureRequest, CaptureView, JobRequest
 
 SHORT = {
     "lights": ["light_003", "light_000"],
@@ -37,9 +38,9 @@ class Server:
     """The application on a free port, in a thread."""
 
     def __init__(self, rig_file: RigFile, root: Path) -> None:
-        self.stage = Stage(rig_file, root)
+        self.service = Service(rig_file, root)
         config = uvicorn.Config(
-            create_app(self.stage), host=LOOPBACK, port=0, log_level="error", ws="none"
+            create_app(self.service), host=LOOPBACK, port=0, log_level="error", ws="none"
         )
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
@@ -114,7 +115,7 @@ def test_a_capture_its_frames_and_its_job(http, server, head):
     assert [c["id"] for c in http.get("/captures").json()] == [done["id"]]
 
     frames = f"/captures/{done['id']}/frames"
-    exr = server.stage.root / "frame.exr"
+    exr = server.service.root / "frame.exr"
     exr.write_bytes(http.get(f"{frames}/2/cam_0.exr").content)
     image, attributes = read_exr(exr)
     assert image.shape == (6, 8, 3)
@@ -162,10 +163,10 @@ def test_a_plan_is_expanded_once_for_a_capture(http, monkeypatch):
 
 def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, tmp_path, head):
     server = Server(rig_file, tmp_path)
-    server.stage.captures._on_complete = None  # as if killed right after the manifest
+    server.service._captures._on_complete = None  # as if killed right after the manifest
     body = {"plan": SHORT, "pipeline": {"name": "reconstruct"}, "head": head}
     begun = server.http.post("/captures", json=body).json()
-    until(lambda: server.stage.captures.get(begun["id"]).state == "done")
+    until(lambda: server.service._captures.get(begun["id"]).state == "done")
     assert server.http.get("/jobs").json() == []
     server.stop()
     server = Server(rig_file, tmp_path)
@@ -205,13 +206,13 @@ def test_devices_and_blackout(http, world):
 
 
 def test_artifacts_stay_inside_the_model_folder(http, server, tmp_path):
-    model = server.stage.root / "models" / "m"
+    model = server.service.root / "models" / "m"
     (model / "masks").mkdir(parents=True)
     (model / "report.json").write_text('{"stages": []}')
     (model / "masks" / "cam_0.png").write_bytes(b"png")
     (tmp_path / "secret").write_text("secret")
     (model / "way_out").symlink_to(tmp_path / "secret")
-    queue = server.stage.queue
+    queue = server.service._queue
     queue.submit("fit", tmp_path, model, JobOptions(), job="job-1")
     listed = {a["path"]: a["bytes"] for a in http.get("/jobs/job-1/artifacts").json()}
     assert listed == {"masks/cam_0.png": 3, "report.json": 14}
@@ -244,7 +245,7 @@ def read_events(http: httpx.Client, count: int, headers: dict[str, str]) -> list
 
 def test_events_are_numbered_and_replay_from_the_last_seen(http, server):
     done = capture_done(http, {"plan": SHORT})
-    newest = server.stage.events.last
+    newest = server.service.events.last
     first = read_events(http, newest, {"Last-Event-ID": "0"})
     assert [e["number"] for e in first] == list(range(1, newest + 1))
     states = [e["data"]["state"] for e in first if e["kind"] == "capture.state"]
@@ -257,8 +258,8 @@ def test_events_are_numbered_and_replay_from_the_last_seen(http, server):
 
 
 def test_job_events_follow_the_queue(http, server, tmp_path):
-    before = server.stage.events.last
-    server.stage.queue.submit("fit", tmp_path, tmp_path / "m", JobOptions(), job="job-7")
+    before = server.service.events.last
+    server.service._queue.submit("fit", tmp_path, tmp_path / "m", JobOptions(), job="job-7")
     (event,) = read_events(http, 1, {"Last-Event-ID": str(before)})
     assert (event["kind"], event["data"]["state"]) == ("job.state", "queued")
 

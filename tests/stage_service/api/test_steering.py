@@ -21,7 +21,7 @@ from stage_service.api.app import create_app
 from stage_service.cli import main
 from stage_service.config import RigFile, SafetyLimits
 from stage_service.devices.device_set import DeviceSet
-from stage_service.service import Stage
+from stage_service.service import Service
 
 SHORT = {"lights": ["light_003", "light_000"], "projectors": []}
 IN_BAND = {**SHORT, "lights": "all", "exposure": {"olat": 0.05}}
@@ -29,16 +29,16 @@ CONSENT = "N. N., 3 May 2026, flashes of 14 Hz for ten seconds"
 
 
 class Client(httpx.Client):
-    """Asks the application, which runs on a socket of its own; `stage` is behind it."""
+    """Asks the application, which runs on a socket of its own; `service` is behind it."""
 
-    stage: Stage
+    service: Service
 
 
 @contextmanager
 def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
     """The application, started and closed as the server does."""
-    stage = Stage(rig_file, root)
-    config = uvicorn.Config(create_app(stage), log_level="error", ws="none")
+    service = Service(rig_file, root)
+    config = uvicorn.Config(create_app(service), log_level="error", ws="none")
     server = uvicorn.Server(config)
     listener = socket.create_server(("127.0.0.1", 0))
     thread = threading.Thread(target=server.run, args=([listener],))
@@ -47,7 +47,7 @@ def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
     try:
         # The socket takes connections before the server does: the first answer comes when it is up.
         with Client(base_url=url, timeout=30, trust_env=False) as client:
-            client.stage = stage
+            client.service = service
             client.get("/health")
             yield client
     finally:
@@ -70,7 +70,7 @@ def refused(response: httpx.Response, slug: str) -> dict[str, Any]:
 
 
 def done(http: Client, capture: str) -> dict[str, Any]:
-    http.stage.captures.wait(capture, 20)
+    http.service._captures.wait(capture, 20)
     status: dict[str, Any] = http.get(f"/captures/{capture}").json()
     assert status["state"] == "done"
     return status
@@ -252,7 +252,7 @@ def test_a_plan_that_flashes_otherwise_than_predicted_is_stopped(rig_file, world
 def interrupted(http: Client) -> str:
     """A capture that was aborted after some frames."""
     capture: str = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
-    events = http.stage.events
+    events = http.service.events
     while not any(e.kind == "capture.step" for e in events.since(0)):
         assert events.wait(events.last, 10.0)
     http.post(f"/captures/{capture}/abort")

@@ -1,0 +1,136 @@
+"""What goes into the service and comes out of it, as JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from stage_service.acquisition.capture_status import CaptureStatus
+from stage_service.jobs.records import PipelineRequest
+from stage_service.plan.capture_plan import CapturePlan
+
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
+PersonName = Annotated[str, Field(min_length=1, max_length=100)]
+LeaseSeconds = Annotated[float, Field(ge=1.0, le=86400.0)]
+
+
+def _example(**fields: Any) -> ConfigDict:
+    return ConfigDict(extra="forbid", frozen=True, json_schema_extra={"examples": [fields]})
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CaptureRequest(_Request):
+    """A capture to make, and the job that follows it by itself when it completes.
+
+    `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine.
+    `armed_by` says who at the stage answers for flashes that the plan has consent for.
+    """
+
+    model_config = _example(
+        plan={"projectors": [], "exposure": {"olat": 0.01}},
+        head="/data/subject/head.obj",
+        pipeline={"name": "light_planes", "options": {"held_out_cameras": ["cam_03"]}},
+    )
+
+    plan: CapturePlan = CapturePlan()
+    head: Path | None = None
+    masks: Path | None = None
+    pipeline: PipelineRequest | None = None
+    armed_by: PersonName | None = None
+
+
+class ResumeRequest(_Request):
+    """`armed_by`: who answers at the stage for flashes that the plan has consent for."""
+
+    armed_by: PersonName | None = None
+
+
+class JobRequest(_Request):
+    """A pipeline to run on a capture; `model` names the model folder (default: a new one)."""
+
+    model_config = _example(capture="20261121-093000", pipeline={"name": "light_planes"})
+
+    capture: str
+    pipeline: PipelineRequest
+    model: FileName | None = None
+
+
+class LeaseRequest(_Request):
+    """Who wants to steer alone, and for how long."""
+
+    holder: PersonName
+    seconds: LeaseSeconds = 60.0
+
+
+class RenewRequest(_Request):
+    """How long the lease is to last from now."""
+
+    seconds: LeaseSeconds = 60.0
+
+
+class AcknowledgeRequest(_Request):
+    """Who looked at the stage, and what they saw."""
+
+    name: Annotated[str, Field(min_length=2, max_length=100)]
+    note: Annotated[str, Field(min_length=4, max_length=2000)]
+
+
+class CaptureView(CaptureStatus):
+    """A capture's status and the job that its completion enqueued."""
+
+    model_config = _example(
+        id="20261121-093000-1f2e",
+        state="done",
+        outcome="completed",
+        error=None,
+        path="/data/stage/captures/20261121-093000-1f2e",
+        steps=545,
+        step=545,
+        frames_planned=4360,
+        frames_written=4360,
+        frames_missing=0,
+        seconds_predicted=29.6,
+        seconds=31.2,
+        left_out=[],
+        started="2026-11-21T09:30:00.123+00:00",
+        request={"pipeline": {"name": "light_planes"}},
+        job="job-20261121-093000-1f2e",
+    )
+
+    job: str | None
+
+
+class LeaseView(BaseModel):
+    """Who holds the lease, and until when (UTC); None: nobody, so anybody may steer."""
+
+    holder: str | None
+    expires: str | None
+
+
+class LeaseGrant(LeaseView):
+    """A lease and the token that steers under it, to be sent as the header `Hairstage-Lease`."""
+
+    token: str
+
+
+class Artifact(BaseModel):
+    """A file of a model folder; `path` is relative to it."""
+
+    path: str
+    bytes: int
+
+
+class Health(BaseModel):
+    """Whether the service and its worker run; says nothing of the devices."""
+
+    status: str
+    version: str
+    rig: str
+    root: str
+    worker: bool
+    capture: str | None
