@@ -10,7 +10,6 @@ import numpy as np
 from reconstruction.arrays import Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 from reconstruction.images.orientation import LogGaborBank, orientations
 from reconstruction.images.silhouettes import background_noise, dark_frame
 from reconstruction.light_codes.code_views import View, furthest_light, light_beside, line_vectors
@@ -36,7 +35,6 @@ def views_of(
     names = capture.olat_lights()
     if not names:
         raise CaptureError(f"{capture.path}: no OLAT frames, which lines and lightcodes come from")
-    lights = [capture.rig.light(n) for n in names]
     cameras = [c for c in capture.rig.cameras if c.name in hair and hair[c.name].any()]
     if len(cameras) < 2:
         raise CaptureError(
@@ -46,10 +44,10 @@ def views_of(
     views = []
     for done, camera in enumerate(cameras):
         progress("lines and lightcodes", done / len(cameras))
-        views.append(_view(capture, camera, names, lights, hair[camera.name], subject, bank))
+        views.append(_view(capture, camera, names, hair[camera.name], subject, bank))
     alone = [v.camera.name for v in views if v.beside < 0]
     stage.figures.update(
-        lights=len(lights),
+        lights=len(names),
         cameras_with_a_light_beside=len(views) - len(alone),
         varying_lights={v.camera.name: int(np.bitwise_count(v.codes.varying).sum()) for v in views},
         threshold={v.camera.name: v.codes.threshold for v in views},
@@ -76,12 +74,12 @@ def _view(
     capture: Capture,
     camera: Camera,
     names: Sequence[str],
-    lights: Sequence[Light],
     mask: Bools,
     subject: Any,
     bank: LogGaborBank,
 ) -> View:
     at = np.asarray(subject, float)
+    lights = [capture.rig.light(n) for n in names]
     images = np.empty((len(names), camera.height, camera.width), np.float32)
     clipped = np.zeros(images.shape, bool)
     noise = 0.0

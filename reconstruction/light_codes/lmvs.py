@@ -42,13 +42,10 @@ class LmvsSearch(DepthSearch):
         along = self._in_plane(view, x, y)
         near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
         step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, options.samples)
-        fan = t.Float(for_kernels(FAN))
         total = len(self.neighbours[view])
         few = min(COARSE_NEIGHBOURS, total)
         coarse = _Cost(self.device, pixels, along, few, options.length)
-        cost, depth, tilt = _sweep(
-            coarse, near, step, number, fan, len(FAN), dr.opaque(t.UInt32, COARSE_SAMPLES)
-        )
+        cost, depth, tilt = _sweep(coarse, near, step, number)
         fine = _Cost(self.device, pixels, along, total, options.length)
         cost = fine(depth, tilt, samples)
         move, turn = 0.5 * options.step, 0.5 * float(FAN[1] - FAN[0])
@@ -61,7 +58,7 @@ class LmvsSearch(DepthSearch):
                 depth, tilt = dr.select(better, d, depth), dr.select(better, a, tilt)
                 dr.eval(cost, depth, tilt)
             move, turn = 0.5 * move, 0.5 * turn
-        line = line_through(self.device, pixels, pixels.at(depth), t.Bool(True))
+        line = line_through(self.device, pixels, pixels.at(depth))
         direction = along(tilt)
         dr.eval(depth, direction, cost, line.spread, line.misfit)
         return (
@@ -100,64 +97,48 @@ class _Cost:
     def __call__(self, depth: Any, tilt: Any, samples: Any) -> Any:
         apart = self.length / dr.maximum(self.views.types.Float(samples) - 1, 1)
         direction = apart * self.along(tilt)
-        best = _best_angles(
-            self.views,
-            self.pixels,
-            self.pixels.at(depth),
-            direction,
-            samples,
-            dr.opaque(self.views.types.UInt32, self.count + 1),
-            self.kept,
-        )
+        best = self._best_angles(self.pixels.at(depth), direction, samples)
         return sum(best) / self.kept
 
-
-@dr.syntax
-def _best_angles(
-    views: DeviceViews,
-    pixels: Pixels,
-    point: Any,
-    along: Any,
-    samples: Any,
-    count: Any,
-    kept: int,
-) -> list[Any]:
-    """The `kept` smallest mean angles among the neighbours, a right angle where no line is."""
-    t = views.types
-    best = [t.Float(np.pi / 2) for _ in range(kept)]
-    n = t.UInt32(1)
-    while n < count:
-        view = dr.gather(t.UInt32, pixels.neighbours, n)
-        middle = views.projection(view, point, 1)
-        step = views.projection(view, along, 0)
-        frame = views.corner(view)
-        h = middle - 0.5 * (t.Float(samples) - 1) * step
-        angle = t.Float(0)
-        s = t.UInt32(0)
-        while s < samples:
-            seen = views.look(frame, [], [], h, t.Bool(True))
-            ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
-            norm = (ux * ux + uy * uy) * (seen.lx * seen.lx + seen.ly * seen.ly)
-            cosine = dr.abs(ux * seen.lx + uy * seen.ly) * dr.rsqrt(dr.maximum(norm, 1e-20))
-            angle += dr.select(seen.there, dr.acos(dr.minimum(cosine, 1)), np.pi / 2)
-            h += step
-            s += 1
-        here = angle / t.Float(samples)
-        for i in range(kept):
-            better = here < best[i]
-            old = best[i]
-            best[i] = dr.select(better, here, old)
-            here = dr.select(better, old, here)
-        n += 1
-    return best
+    @dr.syntax
+    def _best_angles(self, point: Any, along: Any, samples: Any) -> list[Any]:
+        """The `kept` smallest mean angles among the neighbours, a right angle where no line is."""
+        views, t = self.views, self.views.types
+        best = [t.Float(np.pi / 2) for _ in range(self.kept)]
+        count = dr.opaque(t.UInt32, self.count + 1)
+        n = t.UInt32(1)
+        while n < count:
+            view = dr.gather(t.UInt32, self.pixels.neighbours, n)
+            middle = views.projection(view, point, 1)
+            step = views.projection(view, along, 0)
+            frame = views.corner(view)
+            h = middle - 0.5 * (t.Float(samples) - 1) * step
+            angle = t.Float(0)
+            s = t.UInt32(0)
+            while s < samples:
+                seen = views.look(frame, [], [], h, t.Bool(True))
+                ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
+                norm = (ux * ux + uy * uy) * (seen.lx * seen.lx + seen.ly * seen.ly)
+                cosine = dr.abs(ux * seen.lx + uy * seen.ly) * dr.rsqrt(dr.maximum(norm, 1e-20))
+                angle += dr.select(seen.there, dr.acos(dr.minimum(cosine, 1)), np.pi / 2)
+                h += step
+                s += 1
+            here = angle / t.Float(samples)
+            for i in range(self.kept):
+                better = here < best[i]
+                old = best[i]
+                best[i] = dr.select(better, here, old)
+                here = dr.select(better, old, here)
+            n += 1
+        return best
 
 
 @dr.syntax
-def _sweep(
-    cost: _Cost, near: Any, step: Any, number: Any, fan: Any, tilts: int, samples: Any
-) -> tuple[Any, Any, Any]:
+def _sweep(cost: _Cost, near: Any, step: Any, number: Any) -> tuple[Any, Any, Any]:
     """The least cost over all depths and the fan's inclinations, with its depth and inclination."""
     t = cost.views.types
+    fan, tilts = t.Float(for_kernels(FAN)), len(FAN)
+    samples = dr.opaque(t.UInt32, COARSE_SAMPLES)
     least, depth, tilt = t.Float(np.inf), t.Float(near), t.Float(0)
     k = t.UInt32(0)
     while k < number:

@@ -34,6 +34,9 @@ OUTLIER_POWER = 128
 """Of the cosine between a view's line and the first direction, in the weights of the second."""
 
 
+Triple = tuple[Any, Any, Any]
+
+
 class Pixels:
     """Reference pixels, one a lane. No dataclass: Dr.Jit would carry it through every loop.
 
@@ -49,11 +52,11 @@ class Pixels:
         code: list[Any],
         view: Any,
         neighbours: Any,
-        count: Any,
         visible: Any,
     ) -> None:
         self.origin, self.ray, self.code, self.view = origin, ray, code, view
-        self.neighbours, self.count, self.visible = neighbours, count, visible
+        self.neighbours, self.visible = neighbours, visible
+        self.count = dr.opaque(type(neighbours), len(neighbours))
 
     def at(self, depth: Any) -> Any:
         """The points at `depth`."""
@@ -75,7 +78,7 @@ class Line:
 
 
 @dr.syntax
-def line_through(views: DeviceViews, pixels: Pixels, point: Any, active: Any) -> Line:
+def line_through(views: DeviceViews, pixels: Pixels, point: Any) -> Line:
     """The direction that lies in the planes of the visible views' lines (Sun Eq. 4).
 
     The singular vector of the smallest singular value of the planes' normals, weighted by how well
@@ -84,14 +87,12 @@ def line_through(views: DeviceViews, pixels: Pixels, point: Any, active: Any) ->
     something else there.
     """
     zero = views.types.Array3f(0, 0, 0)
-    first = _weighed_line(views, pixels, point, zero, active, 0)
-    return _weighed_line(views, pixels, point, first.direction, active, OUTLIER_POWER)
+    first = _weighed_line(views, pixels, point, zero, 0)
+    return _weighed_line(views, pixels, point, first.direction, OUTLIER_POWER)
 
 
 @dr.syntax
-def _weighed_line(
-    views: DeviceViews, pixels: Pixels, point: Any, along: Any, active: Any, trust: int
-) -> Line:
+def _weighed_line(views: DeviceViews, pixels: Pixels, point: Any, along: Any, trust: int) -> Line:
     """The direction where a line `trust`s in the cosine between it and `along`, to that power."""
     t = views.types
     xx, yy, zz = t.Float(0), t.Float(0), t.Float(0)
@@ -99,7 +100,7 @@ def _weighed_line(
     n = t.UInt32(0)
     while n < pixels.count:
         view = dr.gather(t.UInt32, pixels.neighbours, n)
-        sees = active & ((pixels.visible >> n) & 1 == 1)
+        sees = (pixels.visible >> n) & 1 == 1
         h = views.projection(view, point, 1)
         asked = views.asked(view, pixels.view)
         seen = views.look(views.corner(view), asked, pixels.code, h, sees)
@@ -125,18 +126,20 @@ def _weighed_line(
         xz += weight * normal.x * normal.z
         yz += weight * normal.y * normal.z
         n += 1
-    return smallest_axis(t, xx, yy, zz, xy, xz, yz)
+    return smallest_axis(t, (xx, yy, zz), (xy, xz, yz))
 
 
-def smallest_axis(t: Any, xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Line:
+def smallest_axis(t: Any, diagonal: Triple, beside: Triple) -> Line:
     """Eigenvector of a positive 3x3 matrix's smallest eigenvalue, in closed form.
+
+    The matrix has `diagonal` (xx, yy, zz) and `beside` it (xy, xz, yz), lane by lane.
 
     Eigenvalues by the trigonometric formula, the vector as the longest cross product of two rows
     of A - λI, refined by nothing: errors are of the order of float32's rounding over `spread`².
     """
-    trace = xx + yy + zz
+    trace = diagonal[0] + diagonal[1] + diagonal[2]
     scale = dr.maximum(trace, 1e-30)
-    xx, yy, zz, xy, xz, yz = (a / scale for a in (xx, yy, zz, xy, xz, yz))
+    xx, yy, zz, xy, xz, yz = (a / scale for a in (*diagonal, *beside))
     mean = t.Float(1.0 / 3)
     dx, dy, dz = xx - mean, yy - mean, zz - mean
     off = xy * xy + xz * xz + yz * yz
@@ -161,9 +164,7 @@ def smallest_axis(t: Any, xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) 
 
 
 @dr.syntax
-def agreement(
-    views: DeviceViews, pixels: Pixels, point: Any, along: Any, samples: Any, active: Any
-) -> Any:
+def agreement(views: DeviceViews, pixels: Pixels, point: Any, along: Any, samples: Any) -> Any:
     """Sun's Eq. 6 over the number of its terms: 0 to 1.
 
     `samples` points stand `along` apart about `point`; each term is the share of equal bits times
@@ -174,7 +175,7 @@ def agreement(
     n = t.UInt32(0)
     while n < pixels.count:
         view = dr.gather(t.UInt32, pixels.neighbours, n)
-        sees = active & ((pixels.visible >> n) & 1 == 1)
+        sees = (pixels.visible >> n) & 1 == 1
         middle = views.projection(view, point, 1)
         step = views.projection(view, along, 0)
         asked = views.asked(view, pixels.view)

@@ -130,7 +130,6 @@ class DepthSearch:
             [t.UInt32(for_kernels(w, np.uint32)) for w in code],
             dr.opaque(t.UInt32, view),
             t.UInt32(for_kernels(order, np.uint32)),
-            dr.opaque(t.UInt32, len(order)),
             t.UInt32(for_kernels(mask, np.uint32)),
         )
         return lanes, visible.sum(axis=1)
@@ -180,28 +179,25 @@ def _search(
     t = device.types
     near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
     step = dr.opaque(t.Float, options.step)
-    samples = dr.opaque(t.UInt32, options.samples)
-    apart = dr.opaque(t.Float, options.length / max(options.samples - 1, 1))
+    apart = options.length / max(options.samples - 1, 1)
+    fine = _Depths(device, pixels, near, step, options.samples, apart)
     if options.candidates:
-        few = dr.opaque(t.UInt32, FEW_SAMPLES)
-        wide = dr.opaque(t.Float, options.length / FEW_SAMPLES)
         every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
-        steps = best_coarse(
-            device, pixels, near, every * step, coarse, few, wide, options.candidates
-        )
+        apart = options.length / FEW_SAMPLES
+        wide = _Depths(device, pixels, near, every * step, FEW_SAMPLES, apart)
+        steps = best_coarse(wide, coarse, options.candidates)
         between = range(1 - every, every)
         steps = [t.UInt32(dr.maximum(t.Int32(k * every) + j, 0)) for k in steps for j in between]
-        score, best = best_of(device, pixels, near, step, steps, samples, apart)
+        score, best = best_of(fine, steps)
     else:
-        score, best = best_of_all(device, pixels, near, step, number, samples, apart)
+        score, best = best_of_all(fine, number)
     dr.eval(score, best)
     depth = near + step * t.Float(best)
-    before = worth(device, pixels, depth - step, samples, apart, t.Bool(True))[0]
-    after = worth(device, pixels, depth + step, samples, apart, t.Bool(True))[0]
+    before, after = fine.worth(depth - step)[0], fine.worth(depth + step)[0]
     bend = before - 2 * score + after
     shift = dr.select(bend < 0, 0.5 * (before - after) / dr.minimum(bend, -1e-12), 0)
     depth += step * dr.clip(shift, -0.5, 0.5)
-    agree, line = worth(device, pixels, depth, samples, apart, t.Bool(True))
+    agree, line = fine.worth(depth)
     dr.eval(depth, agree, line.direction, line.spread, line.misfit)
     return (
         depth.numpy(),
@@ -212,25 +208,46 @@ def _search(
     )
 
 
-def worth(
-    device: DeviceViews, pixels: Pixels, depth: Any, samples: Any, apart: Any, active: Any
-) -> tuple[Any, Any]:
-    """The agreement at `depth` and the line that has it."""
-    point = pixels.at(depth)
-    line = line_through(device, pixels, point, active)
-    return agreement(device, pixels, point, apart * line.direction, samples, active), line
+class _Depths:
+    """Depths of the `pixels`: number k is `near + k step`. No dataclass, as `Pixels` is none.
+
+    Segments are compared by `samples` points, `apart` metres from one to the next.
+    """
+
+    def __init__(
+        self,
+        device: DeviceViews,
+        pixels: Pixels,
+        near: Any,
+        step: Any,
+        samples: int,
+        apart: float,
+    ) -> None:
+        self.device, self.types, self.pixels = device, device.types, pixels
+        self.near, self.step = near, step
+        self.samples = dr.opaque(self.types.UInt32, samples)
+        self.apart = dr.opaque(self.types.Float, apart)
+
+    def worth(self, depth: Any) -> tuple[Any, Any]:
+        """The agreement at `depth` and the line that has it."""
+        point = self.pixels.at(depth)
+        line = line_through(self.device, self.pixels, point)
+        along = self.apart * line.direction
+        return agreement(self.device, self.pixels, point, along, self.samples), line
+
+    def worth_of(self, number: Any) -> Any:
+        """The agreement at the depth of this number."""
+        return self.worth(self.near + self.step * self.types.Float(number))[0]
 
 
 @dr.syntax
-def best_of_all(
-    device: DeviceViews, pixels: Pixels, near: Any, step: Any, number: Any, samples: Any, apart: Any
-) -> tuple[Any, Any]:
-    """The best agreement over all depths and its number: brute force."""
-    t = device.types
+def best_of_all(depths: _Depths, number: Any) -> tuple[Any, Any]:
+    """The best agreement over all depths below `number`, and its number: brute force."""
+    t = depths.types
     score, best = t.Float(-1), t.UInt32(0)
     k = t.UInt32(0)
     while k < number:
-        here = worth(device, pixels, near + step * t.Float(k), samples, apart, t.Bool(True))[0]
+        here = depths.worth_of(k)
         better = here > score
         score = dr.select(better, here, score)
         best = dr.select(better, k, best)
@@ -239,23 +256,14 @@ def best_of_all(
 
 
 @dr.syntax
-def best_coarse(
-    device: DeviceViews,
-    pixels: Pixels,
-    near: Any,
-    step: Any,
-    number: Any,
-    samples: Any,
-    apart: Any,
-    count: int,
-) -> list[Any]:
-    """Numbers of the `count` best depths by `samples` points: an array for each rank."""
-    t = device.types
+def best_coarse(depths: _Depths, number: Any, count: int) -> list[Any]:
+    """Numbers of the `count` best depths below `number`: an array for each rank."""
+    t = depths.types
     scores = [t.Float(-1) for _ in range(count)]
     steps = [t.UInt32(0) for _ in range(count)]
     k = t.UInt32(0)
     while k < number:
-        here = worth(device, pixels, near + step * t.Float(k), samples, apart, t.Bool(True))[0]
+        here = depths.worth_of(k)
         moved = k
         for i in range(count):  # insertion into the sorted list, without a branch
             better = here > scores[i]
@@ -268,44 +276,22 @@ def best_coarse(
     return steps
 
 
-def best_of(
-    device: DeviceViews,
-    pixels: Pixels,
-    near: Any,
-    step: Any,
-    steps: list[Any],
-    samples: Any,
-    apart: Any,
-) -> tuple[Any, Any]:
-    """The best agreement over the given depths and its number."""
-    t = device.types
+def best_of(depths: _Depths, steps: list[Any]) -> tuple[Any, Any]:
+    """The best agreement over the depths numbered `steps`, and its number."""
     dr.eval(steps)
-    width = dr.width(steps[0])
-    table = dr.concat(steps)
-    return _best_listed(
-        device, pixels, near, step, table, dr.opaque(t.UInt32, width), len(steps), samples, apart
-    )
+    width = dr.opaque(depths.types.UInt32, dr.width(steps[0]))
+    return _best_listed(depths, dr.concat(steps), width, len(steps))
 
 
 @dr.syntax
-def _best_listed(
-    device: DeviceViews,
-    pixels: Pixels,
-    near: Any,
-    step: Any,
-    table: Any,
-    width: Any,
-    count: int,
-    samples: Any,
-    apart: Any,
-) -> tuple[Any, Any]:
-    t = device.types
-    lane = dr.arange(t.UInt32, len(near))
+def _best_listed(depths: _Depths, table: Any, width: Any, count: int) -> tuple[Any, Any]:
+    t = depths.types
+    lane = dr.arange(t.UInt32, len(depths.near))
     score, best = t.Float(-1), t.UInt32(0)
     i = t.UInt32(0)
     while i < count:
         k = dr.gather(t.UInt32, table, i * width + lane)
-        here = worth(device, pixels, near + step * t.Float(k), samples, apart, t.Bool(True))[0]
+        here = depths.worth_of(k)
         better = here > score
         score = dr.select(better, here, score)
         best = dr.select(better, k, best)

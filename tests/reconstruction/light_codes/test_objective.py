@@ -57,7 +57,8 @@ def test_the_smallest_axis_is_the_svds() -> None:
     normals = normals @ turn
     A = np.einsum("nki,nkj->nij", normals, normals)
     entries = [A[:, 0, 0], A[:, 1, 1], A[:, 2, 2], A[:, 0, 1], A[:, 0, 2], A[:, 1, 2]]
-    line = smallest_axis(t, *(t.Float(e.astype(np.float32)) for e in entries))
+    xx, yy, zz, xy, xz, yz = (t.Float(e.astype(np.float32)) for e in entries)
+    line = smallest_axis(t, (xx, yy, zz), (xy, xz, yz))
     _, values, vectors = np.linalg.svd(normals)
     cosine = np.abs((line.direction.numpy().T * vectors[:, 2]).sum(axis=1))
     assert np.degrees(np.arccos(np.minimum(cosine, 1))).max() < 0.1
@@ -68,9 +69,9 @@ def test_the_smallest_axis_is_the_svds() -> None:
 def test_parallel_planes_have_no_spread() -> None:
     t = array_types()
     zero, one = t.Float(0), t.Float(1)
-    line = smallest_axis(t, one, zero, zero, zero, zero, zero)
+    line = smallest_axis(t, (one, zero, zero), (zero, zero, zero))
     assert line.spread.numpy()[0] < 1e-3
-    nothing = smallest_axis(t, zero, zero, zero, zero, zero, zero)
+    nothing = smallest_axis(t, (zero, zero, zero), (zero, zero, zero))
     assert np.isfinite(nothing.direction.numpy()).all()
 
 
@@ -83,7 +84,7 @@ def test_direction_and_agreement_are_those_of_the_formulas(
     pixels, _ = search.pixels(view, y, x)
     depth = fibres.depth(view)[y, x]
     device_depth = t.Float(depth.astype(np.float32))
-    line = line_through(search.device, pixels, pixels.at(device_depth), t.Bool(True))
+    line = line_through(search.device, pixels, pixels.at(device_depth))
     samples, apart = 25, 2e-4
     found = agreement(
         search.device,
@@ -91,7 +92,6 @@ def test_direction_and_agreement_are_those_of_the_formulas(
         pixels.at(device_depth),
         apart * line.direction,
         dr.opaque(t.UInt32, samples),
-        t.Bool(True),
     ).numpy()
     own = search.views[view]
     rays = own.camera.rays(np.stack([x, y], axis=1))
