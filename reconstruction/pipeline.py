@@ -14,7 +14,7 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
-from reconstruction.growth.from_roots import Coverage, fill_gaps, grow_from_roots
+from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
@@ -350,14 +350,8 @@ def grow(
     """
     roots, normals = sample_roots(scalp, options.roots, options.seed)
     progress("growing strands", 0.1)
-    rooted = grow_from_roots(
-        field,
-        roots,
-        normals,
-        step=options.step,
-        max_length=options.max_length,
-        to_measured=options.to_measured,
-    )
+    tracing = Tracing(options.step, options.max_length)
+    rooted = grow_from_roots(field, roots, normals, tracing, to_measured=options.to_measured)
     coverage = Coverage(field)
     for path in rooted:
         coverage.add(path)
@@ -365,14 +359,7 @@ def grow(
         coverage.add(polyline)
     share = float(coverage.covered[field.valid].mean())
     progress("filling gaps", 0.4)
-    loose = fill_gaps(
-        field,
-        coverage,
-        seed=options.seed,
-        step=options.step,
-        max_length=options.max_length,
-        within=options.within,
-    )
+    loose = fill_gaps(field, coverage, tracing, seed=options.seed, within=options.within)
     filled = float(coverage.covered[field.valid].mean())
     progress("rooting strands", 0.7)
     loose = [polyline.astype(np.float32) for polyline in seen] + loose

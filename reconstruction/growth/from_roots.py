@@ -9,13 +9,39 @@ from typing import Literal
 
 import numpy as np
 
-from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.growth.field import OrientationField
 
 Method = Literal["euler", "midpoint", "rk4"]
 
+_LIFT = 12e-3
+"""Metres that a root is lifted by, at most, to where there is hair."""
+
+_SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3
+"""Metres: shorter strands are not kept."""
+
+_ROUNDS = 120
+
 _TOGETHER = 2000
 """Strands that are traced at once: enough to keep numpy busy, few enough for the caches."""
+
+
+@dataclass(frozen=True)
+class Tracing:
+    """How a field is followed: `step` metres at a time, at most `max_length` metres far.
+
+    `euler` samples the field once a step, `midpoint` twice, `rk4` four times. At half a millimetre
+    `midpoint` is a micrometre or two from the field's own line at half of `rk4`'s time, `euler` a
+    tenth of a millimetre, in tight curls several (the benchmarks' `compare_growth`).
+    """
+
+    step: float = 5e-4
+    max_length: float = 0.3
+    method: Method = "midpoint"
+
+    def __post_init__(self) -> None:
+        if not self.step > 0 or not self.max_length >= self.step:
+            raise ValueError(f"need 0 < step <= max_length, got {self.step} and {self.max_length}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,36 +56,27 @@ def trace(
     field: OrientationField,
     starts: AnyFloats,
     along: AnyFloats,
-    *,
-    step: float = 5e-4,
-    max_length: float = 0.3,
-    method: Method = "midpoint",
+    tracing: Tracing = Tracing(),
 ) -> Paths:
     """Follow the field from `starts (N, 3)`, setting out on the side of `along (N, 3)`.
 
-    Every `step` metres the line's sign is the one that turns least. A path ends where it leaves
-    the envelope or the field has no orientation, and at `max_length` metres. `euler` samples the
-    field once a step, `midpoint` twice, `rk4` four times. At half a millimetre `midpoint` is a
-    micrometre or two from the field's own line at half of `rk4`'s time, `euler` a tenth of a
-    millimetre, in tight curls several (`growth_study.compare_growth`).
+    At every step the line's sign is the one that turns least. A path ends where it leaves the
+    envelope or the field has no orientation.
     """
-    if not step > 0 or not max_length >= step:
-        raise ValueError(f"need 0 < step <= max_length, got {step} and {max_length}")
     p = np.asarray(starts, float).copy()
     d, alive = field.sample(p, np.asarray(along, float))
     alive &= field.voxel(p) >= 0
-    steps = int(np.ceil(max_length / step))
     rows = [p.astype(np.float32)]
     counts = np.ones(len(p), np.int64)
     active = np.flatnonzero(alive)
     p, d = p[active], d[active]
-    for _ in range(steps):
+    for _ in range(int(np.ceil(tracing.max_length / tracing.step))):
         if not len(active):
             break
-        move, good = _advance(field, p, d, step, method)
-        q = p + step * move
+        move = _advance(field, p, d, tracing)
+        q = p + tracing.step * move
         d, there = field.sample(q, move)
-        good &= there & (field.voxel(q) >= 0)
+        good = there & (field.voxel(q) >= 0)
         active, p, d = active[good], q[good], d[good]
         row = np.zeros((len(starts), 3), np.float32)
         row[active] = p
@@ -68,25 +85,25 @@ def trace(
     return Paths(np.stack(rows), counts)
 
 
-def _advance(
-    field: OrientationField, p: Array, d: Array, step: float, method: Method
-) -> tuple[Array, Bools]:
+def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> Array:
     """The mean direction `(N, 3)` over one step from `p` where the field points along `d`."""
-    if method == "euler":
-        return d, np.ones(len(p), bool)
-    k2, good = field.sample(p + 0.5 * step * d, d)
-    if method == "midpoint":
-        return np.where(good[:, None], k2, d), np.ones(len(p), bool)
-    k2 = np.where(good[:, None], k2, d)
-    k3, good = field.sample(p + 0.5 * step * k2, d)
-    k3 = np.where(good[:, None], k3, d)
-    k4, good = field.sample(p + step * k3, d)
-    k4 = np.where(good[:, None], k4, d)
-    return (d + 2 * k2 + 2 * k3 + k4) / 6, np.ones(len(p), bool)
+
+    def ahead(move: Array) -> Array:
+        there, good = field.sample(p + move, d)
+        return np.where(good[:, None], there, d)
+
+    step = tracing.step
+    if tracing.method == "euler":
+        return d
+    k2 = ahead(0.5 * step * d)
+    if tracing.method == "midpoint":
+        return k2
+    k3 = ahead(0.5 * step * k2)
+    return (d + 2 * k2 + 2 * k3 + ahead(step * k3)) / 6
 
 
 def to_polylines(paths: Paths) -> list[Floats]:
-    """The paths as a list of `(n_i, 3)` arrays."""
+    """The paths as a list of points `(n_i, 3)`."""
     columns = np.ascontiguousarray(paths.points.transpose(1, 0, 2))
     return [columns[i, :n] for i, n in enumerate(paths.counts)]
 
@@ -95,46 +112,41 @@ def grow_from_roots(
     field: OrientationField,
     roots: AnyFloats,
     normals: AnyFloats,
+    tracing: Tracing = Tracing(),
     *,
-    step: float = 5e-4,
-    max_length: float = 0.3,
-    lift: float = 12e-3,
-    shortest: float = 5e-3,
     to_measured: bool = False,
-    method: Method = "midpoint",
     threads: int | None = None,
 ) -> list[Floats]:
     """Strands from `roots (N, 3)`, setting out along the scalp's `normals (N, 3)`.
 
-    A root whose envelope stays clear of the skin is led to it along the normal, by at most `lift`
-    metres. `to_measured` ends a strand at the last measured voxel that it passes and keeps none
+    A root whose envelope stays clear of the skin is led to it along the normal, by at most 12 mm.
+    `to_measured` ends a strand at the last measured voxel that it passes and keeps none
     that passes none, as Photobooth §3.4 does; without it they go on, since what a strand passes
-    inside the envelope is hair as well. Those shorter than `shortest` metres are not kept.
+    inside the envelope is hair as well. Those shorter than 5 mm are not kept.
 
     Two thousand strands at a time on `threads` (one per core where None), so that memory grows with
     what is kept alone; the strands do not depend on it.
     """
     at: Array = np.asarray(roots, np.float64)
+    step = tracing.step
     out_of: Array = np.asarray(normals, np.float64)
 
     def some(first: int) -> list[Floats]:
         these = slice(first, first + _TOGETHER)
         p, n = at[these], out_of[these]
         starts, found = p.copy(), np.zeros(len(p), bool)
-        for height in np.arange(0, lift, step):
+        for height in np.arange(0, _LIFT, step):
             lifted = p + height * n
             new = ~found & (field.voxel(lifted) >= 0) & field.sample(lifted, n)[1]
             starts[new] = lifted[new]
             found |= new
         which = np.flatnonzero(found)
-        traced = trace(
-            field, starts[which], n[which], step=step, max_length=max_length, method=method
-        )
+        traced = trace(field, starts[which], n[which], tracing)
         out = []
         for root, path in zip(p[which].astype(np.float32), to_polylines(traced), strict=True):
             if to_measured:
                 path = path[: _last_measured(field, path) + 1]
-            if (len(path) - 1) * step < shortest:
+            if (len(path) - 1) * step < _SHORTEST_FROM_ROOT:
                 continue
             near = np.linalg.norm(root - path[0]) < step
             out.append(path.copy() if near else np.vstack([root[None], path]))
@@ -164,35 +176,32 @@ class Coverage:
         self.covered[n[n >= 0]] = True
 
     def gaps(self) -> Ints:
-        """Numbers of the voxels with an orientation and no strand."""
+        """Numbers `(G,)` of the voxels with an orientation and no strand."""
         return np.flatnonzero(self.field.valid & ~self.covered)
 
 
 def fill_gaps(
     field: OrientationField,
     coverage: Coverage,
+    tracing: Tracing = Tracing(),
     *,
     seed: int,
-    step: float = 5e-4,
-    max_length: float = 0.3,
-    shortest: float = 0.01,
     within: float | None = None,
     batch: int = 1500,
-    rounds: int = 120,
 ) -> list[Floats]:
-    """Strands through the voxels that no strand passes, traced both ways from random ones.
+    """Strands `(n, 3)` through the voxels that no strand passes, traced both ways from random ones.
 
     Only voxels within `within` metres of a measured one are set out from: Photobooth §3.4 deletes
     strands that meet nothing measured, and the volume between hair and face has no hair. None takes
-    3 mm, or two voxels where those are more. Each round
-    starts from at most `batch` of the remaining gaps, so that strands of one round cover the seeds
-    of the next. Paths shorter than `shortest` metres are not kept.
+    3 mm, or two voxels where those are more. Each round starts from at most `batch` of the
+    remaining gaps, so that strands of one round cover the seeds of the next. Paths shorter than
+    10 mm are not kept.
     """
     rng = np.random.default_rng(seed)
     out: list[Floats] = []
     spent = ~field.near_measured(max(3e-3, 2 * field.grid.spacing) if within is None else within)
     centers = field.grid.centers()
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         gaps = coverage.gaps()
         gaps = gaps[~spent[gaps]]
         if not len(gaps):
@@ -201,13 +210,10 @@ def fill_gaps(
         spent[chosen] = True
         starts = centers[chosen] + field.grid.spacing * rng.uniform(-0.4, 0.4, (len(chosen), 3))
         d = field.directions[chosen]
-        both = trace(
-            field, np.tile(starts, (2, 1)), np.vstack([d, -d]), step=step, max_length=max_length
-        )
-        paths = to_polylines(both)
+        paths = to_polylines(trace(field, np.tile(starts, (2, 1)), np.vstack([d, -d]), tracing))
         for a, b in zip(paths[: len(chosen)], paths[len(chosen) :], strict=True):
             path = np.concatenate([b[:0:-1], a])
-            if (len(path) - 1) * step >= shortest:
+            if (len(path) - 1) * tracing.step >= _SHORTEST_THROUGH_GAP:
                 out.append(path)
                 coverage.add(path)
     return out

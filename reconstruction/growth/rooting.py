@@ -16,6 +16,15 @@ _STRIDE = 4
 _RISE = 1e-3
 """Metres between the points of a way from the scalp."""
 
+_NEAR, _HIGHEST = 8e-3, 40e-3
+"""Metres above the scalp: up to where an end is led down at once, and up to where at all."""
+
+_REACHES = (3e-3, 5e-3, 8e-3, 8e-3, 12e-3, 12e-3, 20e-3)
+"""Metres within which a neighbour is looked for, round by round."""
+
+_LEAST_COSINE = np.cos(np.radians(45.0))
+"""Of the turn from a loose strand into the neighbour that continues it."""
+
 
 @dataclass(frozen=True)
 class Rooted:
@@ -31,60 +40,48 @@ class Rooted:
     dropped: int
 
 
-def root_all(
-    rooted: list[Floats],
-    loose: list[Floats],
-    scalp: Scalp,
-    *,
-    near_scalp: float = 8e-3,
-    highest: float = 40e-3,
-    reaches: tuple[float, ...] = (3e-3, 5e-3, 8e-3, 8e-3, 12e-3, 12e-3, 20e-3),
-    turn_deg: float = 45.0,
-) -> Rooted:
-    """Give every loose polyline a root; its direction in space is not changed.
+def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
+    """Give every loose polyline `(n, 3)` a root; its direction in space is not changed.
 
-    An end within `near_scalp` metres of the scalp is led to it. Any other goes on as the nearest
-    rooted strand that continues it within `turn_deg`: where the scalp is at most `highest` metres
-    below, down through the hair to it, which hides what nobody measured; else beside that strand,
-    keeping a distance that fades towards its root. Strands that were joined carry others in the
-    next round. `reaches` are the distances, metres, within which a neighbour is looked for, round
-    by round. What finds none is led down from its lower end, if the scalp is near enough.
+    An end within 8 mm of the scalp is led to it. Any other goes on as the nearest rooted strand
+    that continues it within 45 degrees: where the scalp is at most 40 mm below, down through the
+    hair to it, which hides what nobody measured; else beside that strand, keeping a distance that
+    fades towards its root. Strands that were joined carry others in the next round, which looks
+    further. What finds none is led down from its lower end, if the scalp is near enough.
     """
     strands = list(rooted)
     if not loose:
         return Rooted(strands, 0, 0, 0)
-    below = _Below(scalp, highest)
+    below = _Below(scalp)
     height = below.heights(_ends(loose))
     waiting: list[Floats] = []
     for path, h in zip(loose, height, strict=True):
-        if h.min() > near_scalp:
+        if h.min() > _NEAR:
             waiting.append(path)
         else:
             strands.append(below.lead_lower(path, h))
     to_scalp = len(strands) - len(rooted)
     joined = 0
-    for reach in reaches:
+    for reach in _REACHES:
         if not waiting or not strands:
             break
-        least = np.cos(np.radians(turn_deg))
-        attached, waiting = _join_round(strands, waiting, reach, least, below)
+        attached, waiting = _join_round(strands, waiting, reach, below)
         joined += len(attached)
         strands += attached
     height = below.heights(_ends(waiting)) if waiting else np.zeros((0, 2))
     for path, h in zip(waiting, height, strict=True):
-        if h.min() <= highest:
+        if h.min() <= _HIGHEST:
             strands.append(below.lead_lower(path, h))
-    led = int((height.min(axis=1) <= highest).sum())
+    led = int((height.min(axis=1) <= _HIGHEST).sum())
     return Rooted(strands, to_scalp + led, joined, len(waiting) - led)
 
 
 class _Below:
     """Ways to the scalp under a strand."""
 
-    def __init__(self, scalp: Scalp, highest: float) -> None:
+    def __init__(self, scalp: Scalp) -> None:
         self._scalp = scalp
         self._tree = cKDTree(scalp.points)
-        self.highest = highest
 
     def heights(self, points: Array) -> Array:
         """Distance `(...)` of `points (..., 3)` to the scalp, metres."""
@@ -124,7 +121,6 @@ def _join_round(
     strands: list[Floats],
     loose: list[Floats],
     reach: float,
-    least_cosine: float,
     below: _Below,
 ) -> tuple[list[Floats], list[Floats]]:
     """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
@@ -148,7 +144,7 @@ def _join_round(
     found = np.isfinite(distance)
     index = np.where(found, index, 0)
     cosine = np.einsum("nkd,nd->nk", rootward[index], out)
-    cost = np.where(found & (cosine >= least_cosine), distance + reach * (1 - cosine), np.inf)
+    cost = np.where(found & (cosine >= _LEAST_COSINE), distance + reach * (1 - cosine), np.inf)
     pick = cost.argmin(axis=1)
     cost = cost[np.arange(len(ends)), pick].reshape(-1, 2)
     target = some[index[np.arange(len(ends)), pick]].reshape(-1, 2)
@@ -159,7 +155,7 @@ def _join_round(
             continue
         end = int(c.argmin())
         path = path if end == 0 else path[::-1]
-        if h[end] <= below.highest:
+        if h[end] <= _HIGHEST:
             attached.append(below.lead(path))
             continue
         guide = points[first[owner[t[end]]] : t[end] + 1].astype(float)

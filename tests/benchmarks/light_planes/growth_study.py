@@ -9,7 +9,7 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats
 from reconstruction.growth.field import OrientationField
-from reconstruction.growth.from_roots import Method, trace
+from reconstruction.growth.from_roots import Method, Tracing, trace
 from reconstruction.report.report import Series
 
 METHODS: tuple[Method, ...] = ("euler", "midpoint", "rk4")
@@ -38,7 +38,7 @@ def compare_growth(
     often = [round(step / shortest) for step in steps]
     if not np.allclose(np.array(often) * shortest, steps):
         raise ValueError(f"every step must be a multiple of the shortest, got {list(steps)}")
-    truth = trace(field, starts, along, step=shortest / finer, max_length=max_length, method="rk4")
+    truth = trace(field, starts, along, Tracing(shortest / finer, max_length, "rk4"))
     out = []
     for method in METHODS:
         series = Series(method, "distance from the field's line, m")
@@ -46,7 +46,7 @@ def compare_growth(
             seconds = np.inf
             for _ in range(3):
                 begin = time.perf_counter()
-                paths = trace(field, starts, along, step=step, max_length=max_length, method=method)
+                paths = trace(field, starts, along, Tracing(step, max_length, method))
                 seconds = min(seconds, time.perf_counter() - begin)
             there = truth.points[:: stride * finer]
             last = np.minimum(paths.counts, (truth.counts - 1) // (stride * finer) + 1)

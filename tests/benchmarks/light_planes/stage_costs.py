@@ -13,7 +13,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
-from reconstruction.growth.from_roots import grow_from_roots
+from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.light_planes import TriangulateOptions, sweep_peaks, triangulate
 from reconstruction.report.memory import peak_memory
@@ -111,7 +111,7 @@ def of_strands(field: OrientationField, scalp: Scalp, max_length: float) -> Grow
 
     def grow(count: int) -> None:
         roots, normals = sample_roots(scalp, count, 0)
-        grow_from_roots(field, roots, normals, max_length=max_length)
+        grow_from_roots(field, roots, normals, Tracing(max_length=max_length))
 
     return measure_growth("growth", "strands", (2000, 8000, 32000), grow)
 

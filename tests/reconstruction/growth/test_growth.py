@@ -14,6 +14,7 @@ from reconstruction.growth.field import OrientationField, solve_field, to_tensor
 from reconstruction.growth.from_roots import (
     Coverage,
     Method,
+    Tracing,
     fill_gaps,
     grow_from_roots,
     to_polylines,
@@ -50,7 +51,7 @@ def drift(method: Method, step: float) -> float:
     """How far a strand strays from its circle of 12 mm radius over half a turn, metres."""
     field = analytic(circles, (61, 61, 5), 5e-4)
     start, along = np.array([[12e-3, 0, 0]]), np.array([[0, 1.0, 0]])
-    paths = trace(field, start, along, step=step, max_length=np.pi * 12e-3, method=method)
+    paths = trace(field, start, along, Tracing(step, np.pi * 12e-3, method))
     end = paths.points[paths.counts[0] - 1, 0]
     assert paths.counts[0] > 5
     return abs(float(np.linalg.norm(end[:2])) - 12e-3)
@@ -119,10 +120,10 @@ def test_sign_follows_the_way_and_paths_end_at_the_envelope() -> None:
 
 def test_length_is_limited() -> None:
     field = analytic(up, (5, 5, 41))
-    paths = trace(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), max_length=5e-3)
+    paths = trace(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), Tracing(max_length=5e-3))
     assert paths.counts[0] == 11
     with pytest.raises(ValueError, match="step"):
-        trace(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), step=0.0)
+        Tracing(step=0.0)
 
 
 def test_nothing_grows_where_there_is_no_orientation() -> None:
@@ -143,9 +144,7 @@ def test_roots_are_led_to_an_envelope_that_stays_clear_of_the_skin() -> None:
 
 def test_gaps_are_filled_and_reproducibly() -> None:
     field = analytic(up, (15, 15, 31))
-    first, second = (
-        fill_gaps(field, Coverage(field), seed=4, batch=40, rounds=60) for _ in range(2)
-    )
+    first, second = (fill_gaps(field, Coverage(field), seed=4, batch=40) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     coverage = Coverage(field)
     for path in first:

@@ -23,7 +23,7 @@ from reconstruction.geometry.mesh import Mesh, write_obj
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import solve_field
-from reconstruction.growth.from_roots import grow_from_roots
+from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import NoScalp
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, triangulate
 from reconstruction.model import Model
@@ -217,7 +217,9 @@ def test_one_line_of_voxels_grows_one_strand() -> None:
     grid = VoxelGrid(np.array([-1e-3, -1e-3, 0.0]), 1e-3, inside)
     points = np.array([[0.0, 0.0, 5e-3], [0.0, 0.0, 35e-3]])
     field, _ = solve_field(grid, points, np.array([[0, 0, 1.0], [0, 0, -1.0]]), np.ones(2), None)
-    paths = grow_from_roots(field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), max_length=0.1)
+    paths = grow_from_roots(
+        field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), Tracing(max_length=0.1)
+    )
     assert len(paths) == 1
     assert paths[0][-1, 2] > 0.038
     assert np.abs(paths[0][:, :2]).max() < 1e-4
@@ -233,7 +235,7 @@ def test_orthogonal_tensors_leave_no_direction_and_no_strand_through() -> None:
     assert field.degenerate.any()
     assert np.isfinite(field.directions).all()
     assert not field.directions[field.degenerate].any()
-    paths = grow_from_roots(field, low[None], np.array([[0, 0, 1.0]]), max_length=0.05)
+    paths = grow_from_roots(field, low[None], np.array([[0, 0, 1.0]]), Tracing(max_length=0.05))
     assert all(np.isfinite(p).all() for p in paths)
 
 
