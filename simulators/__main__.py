@@ -93,7 +93,7 @@ def _run(
         world = World(rig, lamps, faults, frames.counts, log, args.processes, moves)
         free = args.ports == "auto"
         wires, paced = rig_file.devices, args.paced
-        stage = SimulatedStage(world, sensor, faults, args.state, wires, free, paced)
+        stage = SimulatedStage(world, sensor, args.state, wires, free, paced)
         # Ends in reverse: the renderer first, so that no frame holds up the devices' end.
         stack.enter_context(stage)
         stack.callback(responder.stop)

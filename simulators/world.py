@@ -73,7 +73,7 @@ class World:
         self.lamps = lamps
         self.projectors = ProjectorController(rig.projectors, self.blank)
         lamps.cut_by(self.safety)
-        self._faults = faults
+        self.faults = faults
         self._make = make
         self._log = log
         self._moves = moves
@@ -94,7 +94,7 @@ class World:
     def safety(self) -> tuple[bool, bool]:
         """Whether the interlock is open, and whether the emergency stop is pressed."""
         interlock, estop = (
-            self._faults.since("trigger", kind, self._fired) for kind in ("interlock", "estop")
+            self.faults.since("trigger", kind, self._fired) for kind in ("interlock", "estop")
         )
         return interlock, estop
 
@@ -111,7 +111,7 @@ class World:
         with self._lock:
             self._pulses += counts
             self._fired += 1
-            if self._faults.once("lights", "stuck", self._pulses):
+            if self.faults.once("lights", "stuck", self._pulses):
                 self.lamps.stick()
             power, show = self.lamps.power(), self.projectors.show
             if fires and self._moves:
@@ -126,7 +126,7 @@ class World:
 
     def strikes(self, device: str, request: str) -> Fault | None:
         """The fault of the serial device's wire at this request; PULSE is about the pulse to be."""
-        return self._faults.on_request(device, request, self._pulses + request.startswith("PULSE"))
+        return self.faults.on_request(device, request, self._pulses + request.startswith("PULSE"))
 
     def hello(self, camera: str) -> None:
         """Start counting the camera's frames again; it is not armed and holds none."""
@@ -162,15 +162,15 @@ class World:
 
     def mute(self, camera: str) -> bool:
         """Whether a fault keeps the camera from answering."""
-        return self._faults.since("camera", "mute", self._fired, camera)
+        return self.faults.since("camera", "mute", self._fired, camera)
 
     def blank(self) -> bool:
         """Whether a fault keeps the projectors' patterns from coming up."""
-        return self._faults.since("projectors", "blank", self._fired)
+        return self.faults.since("projectors", "blank", self._fired)
 
     def begun(self, device: str, kind: str) -> bool:
         """Whether a lasting fault of the device shows."""
-        return self._faults.since(device, kind, self._fired)
+        return self.faults.since(device, kind, self._fired)
 
     def stop(self) -> None:
         """Make no more frames."""
@@ -184,14 +184,14 @@ class World:
         for index, (name, camera) in enumerate(self._cameras.items()):
             if camera.exposure is None:
                 continue
-            if self._faults.once("camera", "drop", shot.pulse, name):
+            if self.faults.once("camera", "drop", shot.pulse, name):
                 continue
             camera.queue.extend(camera.late)
             camera.late.clear()
             lane = self._lanes[index % len(self._lanes)]
             counts = lane.submit(self._make, name, shot, camera.exposure)
             for kind in ("repeat", "lost", "late_frame", "stray"):
-                if self._faults.once("camera", kind, shot.pulse, name):
+                if self.faults.once("camera", kind, shot.pulse, name):
                     self._queue(camera, camera.exposure, counts, kind)
                     break
             else:

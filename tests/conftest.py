@@ -172,7 +172,7 @@ def simulated(
             frames = FrameMaker(known, Flat(known), sensor, 0)
             world = World(known, Lamps(len(known.lights)), used, frames.counts)
             state = path.with_suffix("")
-            stage = SimulatedStage(world, sensor, used, state, rig_file.devices)
+            stage = SimulatedStage(world, sensor, state, rig_file.devices)
             stack.enter_context(stage)
             return load_rig_file(path, state / DEVICES_FILE), world
 

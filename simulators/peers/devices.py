@@ -12,7 +12,6 @@ from typing import Any, Self
 
 from simulators.frames.sensor import Sensor
 from simulators.peers.cameras import CameraLink
-from simulators.peers.faults import Faults
 from simulators.peers.light_bank import light_bank
 from simulators.peers.serial_peer import SerialPeer
 from simulators.peers.trigger_box import TriggerBox
@@ -36,7 +35,6 @@ class SimulatedStage:
         self,
         world: World,
         sensor: Sensor,
-        faults: Faults,
         state: Path,
         configured: DevicesConfig | None = None,
         free_ports: bool = True,
@@ -44,7 +42,6 @@ class SimulatedStage:
     ) -> None:
         self._world = world
         self._sensor = sensor
-        self._faults = faults
         self._state = state
         self._configured = configured
         self._free_ports = free_ports
@@ -90,7 +87,7 @@ class SimulatedStage:
         cameras = CameraLink(world, self._sensor, camera_host, camera_port)
         stack.callback(cameras.stop)
         camera_port = cameras.start()
-        trigger = TriggerBox(world, self._faults)
+        trigger = TriggerBox(world, world.faults)
         stack.callback(trigger.stop)
         serial = {"trigger": trigger.reply, "projectors": world.projectors.reply}
         paths = {}

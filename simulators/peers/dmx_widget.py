@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import struct
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps
-from simulators.peers.terminal import Terminal
+from simulators.peers.terminal import TerminalPeer
 
 _START, _END = 0x7E, 0xE7
 _MOST_DATA = 600
@@ -19,11 +18,11 @@ _SERIAL = bytes.fromhex("78563412")  # binary-coded decimal, low digits first: 1
 _GARBAGE = b"\x7e\x03\xff\xff\x00\x55"
 
 
-class DmxWidget:
+class DmxWidget(TerminalPeer):
     """The widget at a pseudo-terminal, and `lamps` as its dimmers from `first_channel` on.
 
-    It has no dead-man: lamps keep their last level whatever happens to the host. Start with
-    `start`, end with `stop`. A request is told to `strikes` as its label, "6".
+    It has no dead-man: lamps keep their last level whatever happens to the host. A
+    request is told to `strikes` as its label, "6".
     """
 
     def __init__(
@@ -39,20 +38,7 @@ class DmxWidget:
         self._before = first_channel - 1
         self._strikes = strikes
         self._begun = begun
-        self._terminal = Terminal(link)
-        self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
-
-    def start(self) -> str:
-        """Make the link, answer from now on; returns the link's path."""
-        self._terminal.make_link()
-        self._thread.start()
-        return str(self._terminal.link)
-
-    def stop(self) -> None:
-        """Remove the link and close the terminal."""
-        self._terminal.wake()
-        self._thread.join()
-        self._terminal.close()
+        super().__init__(link)
 
     def _run(self) -> None:
         pending = b""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from pathlib import Path
 
 from simulators.peers.modbus_faults import DisturbedUnit
-from simulators.peers.terminal import Terminal
+from simulators.peers.terminal import TerminalPeer
 from stage_service.config import ModbusRtuConfig
 
 BROADCAST = 0
@@ -15,8 +14,8 @@ _SHORTEST, _LONGEST = 4, 256
 _FIXED_ABOVE_BAUD, _FIXED_SILENCE_S = 19200, 1.75e-3
 
 
-class ModbusRtuPeer:
-    """Serves a unit at a pseudo-terminal. Start with `start`, end with `stop`.
+class ModbusRtuPeer(TerminalPeer):
+    """Serves a unit at a pseudo-terminal.
 
     `paced`: an answer arrives when it would at the line's baud rate, of which a pseudo-terminal
     knows nothing.
@@ -32,20 +31,7 @@ class ModbusRtuPeer:
         fixed = config.baud > _FIXED_ABOVE_BAUD
         self._silence_s = _FIXED_SILENCE_S if fixed else 3.5 * self._character_s
         self._paced = paced
-        self._terminal = Terminal(link)
-        self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
-
-    def start(self) -> str:
-        """Make the link, answer from now on; returns the link's path."""
-        self._terminal.make_link()
-        self._thread.start()
-        return str(self._terminal.link)
-
-    def stop(self) -> None:
-        """Remove the link and close the terminal."""
-        self._terminal.wake()
-        self._thread.join()
-        self._terminal.close()
+        super().__init__(link)
 
     def _run(self) -> None:
         while (frame := self._terminal.receive()) is not None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from simulators.peers.faults import Fault
-from simulators.peers.terminal import Terminal
+from simulators.peers.terminal import TerminalPeer
 
 _LONGEST_LINE = 96
 _NOISE = b"\xff\x00\x1b[A~~\n"
@@ -25,11 +24,10 @@ UNKNOWN, BAD_ARGUMENT, UNSAFE, NOT_NOW = 1, 2, 3, 4
 WATCHDOG_MS = (100, 60_000)
 
 
-class SerialPeer:
-    """Answers each line with `reply(line)` at a pseudo-terminal that `link` points to.
+class SerialPeer(TerminalPeer):
+    """Answers each line with `reply(line)`, which returns the answer or raises `Refusal`.
 
-    `reply` returns the answer or raises `Refusal`; `strikes(line)` is the wire's fault at this
-    request. The link is made by `start` and removed by `stop`.
+    `strikes(line)` is the wire's fault at this request.
     """
 
     def __init__(
@@ -38,22 +36,9 @@ class SerialPeer:
         reply: Callable[[str], str],
         strikes: Callable[[str], Fault | None] = lambda _line: None,
     ) -> None:
-        self.link = link
         self._reply = reply
         self._strikes = strikes
-        self._terminal = Terminal(link)
-        self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
-
-    def start(self) -> None:
-        """Make the link and answer from now on."""
-        self._terminal.make_link()
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Remove the link and close the terminal."""
-        self._terminal.wake()
-        self._thread.join()
-        self._terminal.close()
+        super().__init__(link)
 
     def _run(self) -> None:
         pending = b""

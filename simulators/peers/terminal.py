@@ -1,10 +1,12 @@
-"""A pseudo-terminal as a serial port that can be unplugged."""
+"""A pseudo-terminal as a serial port that can be unplugged, and a device behind one."""
 
 from __future__ import annotations
 
 import os
 import select
+import threading
 import tty
+from abc import ABC, abstractmethod
 from pathlib import Path
 
 
@@ -79,3 +81,28 @@ class Terminal:
     def _remove_link(self) -> None:
         if self.link.is_symlink() and str(self.link.readlink()) == self.path:
             self.link.unlink()
+
+
+class TerminalPeer(ABC):
+    """A device at a pseudo-terminal that `link` points to, on a thread of its own."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self._terminal = Terminal(link)
+        self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
+
+    def start(self) -> str:
+        """Make the link, answer from now on; returns the link's path."""
+        self._terminal.make_link()
+        self._thread.start()
+        return str(self.link)
+
+    def stop(self) -> None:
+        """Remove the link and close the terminal."""
+        self._terminal.wake()
+        self._thread.join()
+        self._terminal.close()
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Answer until the terminal says to stop."""

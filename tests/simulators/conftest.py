@@ -157,7 +157,7 @@ def start(tiny_rig: Rig, tmp_path: Path) -> Iterator[Callable[..., Bench]]:
         sensor = Sensor()
         frames = FrameMaker(tiny_rig, responder or Known(tiny_rig), sensor, seed)
         world = World(tiny_rig, Lamps(5, lambda: now[0]), used, frames.counts)
-        stage = SimulatedStage(world, sensor, used, tmp_path / f"state{len(running)}")
+        stage = SimulatedStage(world, sensor, tmp_path / f"state{len(running)}")
         stage.__enter__()
         bench = Bench(stage, world, now)
         running.append((bench, stage))

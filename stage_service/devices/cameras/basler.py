@@ -44,19 +44,6 @@ QUIET: tuple[tuple[str, str | float | bool], ...] = (
     ("Gamma", 1.0),
 )
 """What would otherwise pace the camera by itself or bend its response; not every model has all."""
-CHUNKS = ("ExposureTime", "Framecounter", "FrameID", "FrameTriggerIgnoredCounter")
-"""Asked for with every frame, where the camera offers them."""
-STATISTICS = tuple(
-    f"Statistic_{name}_Count"
-    for name in (
-        "Total_Buffer",
-        "Failed_Buffer",
-        "Buffer_Underrun",
-        "Missed_Frame",
-        "Failed_Packet",
-        "Resend_Request",
-    )
-)
 OURS = {
     *(name for name, _ in QUIET),
     *EXPOSURES,
@@ -79,7 +66,7 @@ class BaslerCamera:
         self.device = f"camera {geometry.name} (Basler {self.serial})"
         self.config = config
         self.geometry = geometry
-        self.capabilities = CameraCapabilities(config.buffers, True, False, BLOCK_WRAP)
+        self.capabilities = CameraCapabilities(config.buffers, False, BLOCK_WRAP)
         self._info: CameraInfo | None = None
         self._pylon: Any = None
         self._genicam: Any = None
@@ -87,7 +74,6 @@ class BaslerCamera:
         self._blocks = BlockCounter(1, BLOCK_WRAP)
         self._ticks_per_s = 0.0
         self._exposure: float | None = None
-        self._counters: dict[str, int] = {}
 
     @property
     def info(self) -> CameraInfo:
@@ -145,7 +131,6 @@ class BaslerCamera:
             self._check_exposure(actual, exposure, doing)
             camera.StartGrabbing(self._pylon.GrabStrategy_OneByOne)
             self._blocks.restart()
-            self._counters = {}
             # Pulses before the camera waits for them are ignored, and leave no gap in its ids.
             ready = not camera.CanWaitForFrameTriggerReady() or camera.WaitForFrameTriggerReady(
                 round(self.config.timeout_s * 1e3), self._pylon.TimeoutHandling_Return
@@ -190,18 +175,6 @@ class BaslerCamera:
                 if cancel.is_set():
                     raise Cancelled(f"{self.device}: {doing} was given up")
 
-    def statistics(self) -> dict[str, int]:
-        """Buffers, failures and losses since arming, as far as camera and link count them.
-
-        `FrameTriggerIgnoredCounter` counts pulses that came too early: those leave no gap in the
-        block ids.
-        """
-        with self._told("reading statistics"):
-            camera = self._open("reading statistics")
-            nodes = Nodes(self.device, camera.GetStreamGrabberNodeMap(), self._genicam)
-            counts = {name: nodes.number(name) for name in STATISTICS}
-        return {k: int(v) for k, v in counts.items() if v is not None} | self._counters
-
     def _set_up(self) -> None:
         doing = "setting up"
         if ours := sorted(OURS & self.config.features.keys()):
@@ -221,7 +194,11 @@ class BaslerCamera:
             for name, value in QUIET:
                 nodes.write_if_there(name, value)
             self._set_trigger(nodes)
-            self._set_chunks(nodes)
+            timed = "ExposureTime" in nodes.symbols("ChunkSelector")
+            nodes.write_if_there("ChunkModeActive", timed)
+            if timed:
+                nodes.write("ChunkSelector", "ExposureTime")
+                nodes.write("ChunkEnable", True)
             camera.MaxNumBuffer.Value = config.buffers
             self._blocks = BlockCounter(*_block_ids(camera, nodes))
             self._ticks_per_s = _ticks_per_s(nodes)
@@ -254,13 +231,6 @@ class BaslerCamera:
         nodes.write_if_there("TriggerOverlap", "ReadOut")
         nodes.write("TriggerMode", "On")
 
-    def _set_chunks(self, nodes: Nodes) -> None:
-        offered = [chunk for chunk in CHUNKS if chunk in nodes.symbols("ChunkSelector")]
-        nodes.write_if_there("ChunkModeActive", bool(offered))
-        for chunk in offered:
-            nodes.write("ChunkSelector", chunk)
-            nodes.write("ChunkEnable", True)
-
     def _stop(self, camera: Any) -> None:
         self._exposure = None
         while camera.IsGrabbing() and (result := self._retrieve(camera, 0.0)).IsValid():
@@ -275,7 +245,7 @@ class BaslerCamera:
     def _frame(self, result: Any, exposure: float, doing: str) -> Frame | None:
         block_id = self._blocks.take(result.GetBlockID())
         if not result.GrabSucceeded():
-            return None  # pylon counts it in Statistic_Failed_Buffer_Count
+            return None
         if block_id is None:
             raise self._error(
                 doing,
@@ -294,10 +264,8 @@ class BaslerCamera:
                 "Another program changed the camera's settings: close it and start again.",
             )
         chunks = Nodes(self.device, result.GetChunkDataNodeMap(), self._genicam)
-        values = {chunk: chunks.number(f"Chunk{chunk}") for chunk in CHUNKS}
-        if (told := values.pop("ExposureTime")) is not None:
+        if (told := chunks.number("ChunkExposureTime")) is not None:
             self._check_exposure(told * 1e-6, exposure, doing)
-        self._counters = {k: int(v) for k, v in values.items() if v is not None}
         ticks = result.GetTimeStamp()
         timestamp = ticks / self._ticks_per_s if self._ticks_per_s else 0.0
         counts = pixel_formats.rgb(result.GetArray(), pixel_format)

@@ -59,13 +59,11 @@ class Frame:
 class CameraCapabilities:
     """What camera and link can do.
 
-    `buffers`: frames that it holds unread. `hardware_trigger`: pulses reach it by wire.
-    `timestamps`: its clock tells frames apart. `block_wrap`: the last block id
-    before they begin again at 1.
+    `buffers`: frames that it holds unread. `timestamps`: its clock tells frames apart.
+    `block_wrap`: the last block id before they begin again at 1.
     """
 
     buffers: int
-    hardware_trigger: bool
     timestamps: bool
     block_wrap: int
 

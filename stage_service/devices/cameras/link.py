@@ -32,7 +32,7 @@ class LinkCamera:
     """Implements `Camera` on a TCP connection of its own; see there for the contract."""
 
     def __init__(self, config: LinkCamerasConfig, geometry: CameraGeometry) -> None:
-        self.capabilities = CameraCapabilities(config.buffers, True, True, BLOCK_WRAP)
+        self.capabilities = CameraCapabilities(config.buffers, True, BLOCK_WRAP)
         self.name = geometry.name
         self.device = f"camera {geometry.name} ({config.host}:{config.port})"
         self.config = config

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from shooting import shoot
 
 from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.capture.folder import Capture, Step
@@ -18,7 +19,6 @@ from reconstruction.geometry.lights import Light
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig
 from simulators.frames.sensor import Sensor
-from simulators.frames.shooting import shoot
 from simulators.subject.props import Prop, PropResponder, SphereProp, board_pose
 
 POSES = (0, 1, 2, 13, 14, 15, 16, 17, 31)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pjlink_projector import PjLinkServer, SimulatedProjector
 
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.verify import verify
 from reconstruction.capture.writer import CaptureWriter
 from simulators.peers.faults import Fault
-from simulators.peers.pjlink_projector import PjLinkServer, SimulatedProjector
 from stage_service.acquisition.safety import blackout
 from stage_service.acquisition.sequencer import CannotPause, Sequencer
 from stage_service.devices.device_set import DeviceSet

@@ -136,7 +136,6 @@ def test_the_camera_waits_for_pulses_on_its_line(make):
     }
     assert {name: node(camera, name) for name in written} == written
     assert camera._camera.MaxNumBuffer.Value == camera.capabilities.buffers == 16
-    assert camera.capabilities.hardware_trigger
     assert not camera.capabilities.timestamps  # nor has it a clock
 
 
@@ -252,9 +251,6 @@ def test_a_damaged_frame_is_a_lost_frame(camera):
     frame = camera.read(NEVER)
     account.arrived(frame.block_id)
     assert frame.block_id == 2
-    statistics = camera.statistics()
-    assert statistics["Statistic_Failed_Buffer_Count"] == 1
-    assert statistics["Statistic_Total_Buffer_Count"] == 2
 
 
 def test_two_cameras_are_told_apart_by_serial_number(camera, make):

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from pjlink_projector import GREETING, PjLinkServer, SimulatedProjector
 
-from simulators.peers.pjlink_projector import GREETING, PjLinkServer, SimulatedProjector
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.projectors.pjlink import Lamp, PjLinkProjector, Power, ProjectorBusy
 
