@@ -46,7 +46,7 @@ class HeldOut:
 class Observed:
     """One camera's pixels under single lights.
 
-    `pixels (P,)` are flat indices; `radiance (L, P, 3)` in W/(sr m²) at full lamp level; `valid
+    `pixels (P,)` are flat indices; `radiance (L, P, 3)` in W/(sr m²) at full level; `valid
     (L, P)` is false where the frame is missing or saturated.
     """
 

@@ -126,7 +126,7 @@ class MappedStrands:
         )
         return cls(scene, np.asarray(root_uv, float), coordinates)
 
-    def painted(self, maps: HairMaps) -> HairScene:
+    def with_maps(self, maps: HairMaps) -> HairScene:
         """The scene with the maps on its hair; geometry is shared."""
         bsdf = mi.load_dict(
             {
@@ -142,7 +142,7 @@ class MappedStrands:
         )
         return replace(self.scene, hair=maps.mean(), hair_bsdf=bsdf)
 
-    def repainted(self, scene: HairScene, maps: HairMaps) -> HairScene:
+    def update_maps(self, scene: HairScene, maps: HairMaps) -> HairScene:
         """`scene`, which `painted` made, with other maps on the same BSDF: `scene` changes too."""
         values = mi.traverse(scene.hair_bsdf)
         values["sigma_a"] = mi.TensorXf(for_kernels(maps.sigma_a))

@@ -72,7 +72,7 @@ class HairParameters:
             constant = self._constant["rotation"]
             self._turns = constant is None or any(x[0] != 0 for x in constant)
 
-    def fibre(self, place: Place) -> Fibre:
+    def fibre(self, place: StrandHit) -> Fibre:
         """The fibre at a hit."""
         beta_n = place.scalar(self.values["azimuthal_roughness"])
         if "color" in self.values:
@@ -89,7 +89,7 @@ class HairParameters:
             -dr.deg2rad(place.scalar(self.values["scale_tilt"])),
         )
 
-    def frame(self, place: Place) -> ShadingFrame:
+    def frame(self, place: StrandHit) -> ShadingFrame:
         """The fibre's frame at a hit: its own direction, and the corrective of its cell."""
         tangent = place.tangent if self._many_segments() else None
         if "rotation" not in self.values:
@@ -107,7 +107,7 @@ class HairParameters:
         indices = self.strands.get("segment_indices")
         return indices is not None and len(indices) > MITSUBAS_SEGMENTS
 
-    def _look_up(self, name: str, kind: Any, place: Place) -> Any:
+    def _look_up(self, name: str, kind: Any, place: StrandHit) -> Any:
         value = self.values[name]
         if not dr.is_tensor_v(value):
             return value
@@ -119,7 +119,7 @@ class HairParameters:
         return kind(constant)
 
 
-class Place:
+class StrandHit:
     """Where a hit lies, worked out only as far as it is asked for."""
 
     def __init__(self, strands: dict[str, Any], si: Any, active: Any) -> None:

@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance.bsdf.lobes import evaluate, sample
-from appearance.bsdf.parameters import HairParameters, Place
+from appearance.bsdf.parameters import HairParameters, StrandHit
 
 
 def plugin() -> Any:
@@ -80,7 +80,7 @@ def plugin() -> Any:
             return f"extended_hair[{', '.join(self.parameters.values)}]"
 
         def _at(self, si: Any, active: Any) -> tuple[Any, Any]:
-            place = Place(self.parameters.strands, si, active)
+            place = StrandHit(self.parameters.strands, si, active)
             return self.parameters.fibre(place), self.parameters.frame(place)
 
     return ExtendedHair

@@ -1,4 +1,4 @@
-"""Which pairs of camera and light a step looks at."""
+"""Which pairs of camera and light a step observes."""
 
 from __future__ import annotations
 
@@ -28,8 +28,15 @@ class Batch:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """A batch's pixels: `rendered`, `captured` and its local mean `level (k, P, 3)`; `valid`."""
+class Patch(Batch):
+    """A batch at some of its view's pixels: `few (P,)` are their numbers in the view."""
+
+    few: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A patch `rendered`, `captured` and its local mean `level (k, P, 3)`; `valid (k, P)`."""
 
     rendered: Array
     captured: Array
@@ -38,11 +45,11 @@ class Seen:
 
 
 class Pairs:
-    """The pairs that show lit hair, and how much each still teaches.
+    """The pairs that show lit hair, and how far off each still is.
 
     Left out are pairs under whose light the hair is black next to others (under 2 % of the median
     pair), and grazing ones, where under 5 % of the hair pixels are lit: their few rim pixels are
-    noise. `taught (V, L)` is a running estimate of each pair's squared error, noise taken off.
+    noise. `squared_error (V, L)` is a running estimate, noise taken off.
     """
 
     def __init__(self, views: Sequence[Observed], scale: float, *, weighted: bool = True) -> None:
@@ -56,10 +63,10 @@ class Pairs:
         seen = level > 0
         usual = float(np.median(level[seen])) if seen.any() else 0.0
         self.used = seen & (level > 0.02 * usual) & (np.array(lit) > 0.05)
-        self.taught = np.where(self.used, np.nan, 0.0)
+        self.squared_error = np.where(self.used, np.nan, 0.0)
 
     def draw(self, images: int, rng: np.random.Generator) -> Batch:
-        """A view and up to `images` of its lights, by what they still teach and half at random."""
+        """A view and up to `images` of its lights, by their estimated errors and half at random."""
         chance = self.chance()
         of_view = chance.sum(axis=1)
         view = int(rng.choice(len(of_view), p=of_view / of_view.sum()))
@@ -80,18 +87,20 @@ class Pairs:
     def chance(self) -> Array:
         """Probability of each pair, summing to 1 `(V, L)`."""
         even = self.used / self.used.sum()
-        known = self.used & np.isfinite(self.taught)
+        known = self.used & np.isfinite(self.squared_error)
         if not self.weighted or not known.any():
             return even
-        # what has not been looked at yet is as promising as the best
-        score = np.where(known, self.taught, np.where(self.used, self.taught[known].max(), 0.0))
+        # what has not been observed yet is as promising as the best
+        score = np.where(
+            known, self.squared_error, np.where(self.used, self.squared_error[known].max(), 0.0)
+        )
         score = np.sqrt(np.maximum(score, 0))
         if not score.sum() > 0:
             return even
         return np.asarray(_UNIFORM * even + (1 - _UNIFORM) * score / score.sum())
 
-    def learn(self, batch: Batch, seen: Seen) -> None:
-        """Take note of what a batch has shown, its pixels in the order of the image.
+    def update(self, batch: Batch, seen: Comparison) -> None:
+        """Update the estimates from a batch, its pixels in the order of the image.
 
         Neighbouring pixels have independent noise and nearly the same error: the mean product of
         their differences is the squared error without the noise.
@@ -99,9 +108,9 @@ class Pairs:
         d = (seen.rendered - seen.captured) * np.sqrt(weights(seen.level)) * seen.valid[..., None]
         product = (d[:, 1:] * d[:, :-1]).mean(axis=(1, 2))
         for light, value in zip(batch.lights, product, strict=True):
-            old = self.taught[batch.view, light]
+            old = self.squared_error[batch.view, light]
             new = value if not np.isfinite(old) else old + _FORGET * (value - old)
-            self.taught[batch.view, light] = new
+            self.squared_error[batch.view, light] = new
 
 
 def _inclusion(within: Array, images: int) -> Array:

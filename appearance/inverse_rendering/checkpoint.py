@@ -15,10 +15,10 @@ from reconstruction.arrays import Array
 
 @dataclass
 class State:
-    """Where a fit stands. `average` is the running mean of `raw` that is watched and returned.
+    """Where a fit stands. `average` is the running mean of `raw` that is validated and returned.
 
-    `first` is what the steps began with. `tables` are `taught (V, L)`, what batches have taught,
-    and the lamps' `gain (L,)`.
+    `first` is what the steps began with. `tables` are the pairs' estimated
+    `squared_error (V, L)` and the lights' `gain (L,)`.
     """
 
     raw: Raw
@@ -33,7 +33,7 @@ class State:
 
     @property
     def gain(self) -> Array:
-        """The factors on the lamps' intensities."""
+        """The factors on the lights' intensities `(L,)`."""
         return self.tables["gain"]
 
     def save(self, path: Path | None, fingerprint: str) -> None:

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from appearance.inverse_rendering.unknowns import Lamps
+from appearance.inverse_rendering.unknowns import LightDeviations
 from reconstruction.geometry.lights import Light
 from reconstruction.model import Model
 
 FILE = "lights.json"
 
 
-def save_lights(model: Model, found: Lamps, lights: Sequence[Light]) -> None:
+def save_lights(model: Model, found: LightDeviations, lights: Sequence[Light]) -> None:
     """Write the calibrated `lights` as `found`, and how each differs from its calibration."""
     rows = [
         {
@@ -23,7 +23,7 @@ def save_lights(model: Model, found: Lamps, lights: Sequence[Light]) -> None:
             "gain": float(found.gain[i]),
             "profile_scale": float(found.profile[i]),
         }
-        for i, light in enumerate(found.of(lights))
+        for i, light in enumerate(found.applied(lights))
     ]
     model.write_json(FILE, rows)
 
@@ -36,6 +36,6 @@ def lights_as_found(model: Model, lights: Sequence[Light]) -> list[Light]:
         row = rows.get(light.name)
         if row is not None:
             names = ("moved_m", "turned_rad", "gain", "profile_scale")
-            (light,) = Lamps(*(np.array([row[n]], float) for n in names)).of([light])
+            (light,) = LightDeviations(*(np.array([row[n]], float) for n in names)).applied([light])
         out.append(light)
     return out

@@ -15,9 +15,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.batches import Batch
-from appearance.inverse_rendering.problem import Effort, Problem
-from appearance.inverse_rendering.unknowns import BRACKET, Lamps, Raw, maps_of
+from appearance.bsdf.parameters import StrandHit
+from appearance.inverse_rendering.batches import Patch
+from appearance.inverse_rendering.options import Effort
+from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.unknowns import BRACKET, LightDeviations, Raw, decode
 from appearance.observations import Observed
 from appearance.render.paths import Surface, jittered, stream
 from reconstruction.array_backend import for_kernels
@@ -29,27 +31,29 @@ _WIDE = 0.02
 """Share of what a cell's far neighbours say: all that a cell has which no ray meets."""
 
 
-def cell_colours(
+def initial_absorption(
     problem: Problem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 12, seed: int = 0
 ) -> HairMaps:
-    """The maps of `raw` with each cell's absorption scaled to its captured colour.
+    """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
 
     The light is the mean of the valid single lights of each pixel. A cell's mean needs fewer paths
     a pixel than a step does: a quarter of `effort`'s.
     """
     effort = replace(effort, spp=max(1, effort.spp // 4))
-    maps = maps_of(raw)
+    maps = decode(raw)
     cells = [visible_cells(problem, o, maps.shape, seed) for o in problem.views]
     captured = [_mean(o, o.radiance.astype(float) * problem.scale) for o in problem.views]
     colour = np.exp(-BRACKET * np.sqrt(maps.sigma_a))
     for k in range(rounds):
         sums = np.zeros((2, *maps.shape, 3))
         trial = replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
-        now = raw | {"sigma_a": problem.raw_of(trial, Lamps.calibrated(len(gain)))["sigma_a"]}
+        now = raw | {
+            "sigma_a": problem.encode(trial, LightDeviations.calibrated(len(gain)))["sigma_a"]
+        }
         for i, o in enumerate(problem.views):
-            every = Batch(i, np.arange(len(o.lights)), np.ones(len(o.lights)))
-            few = np.arange(len(o.pixels))
-            rendered = problem.render(now, gain, every, few, effort, (seed << 16) + 997 * k + i)
+            lights = np.arange(len(o.lights))
+            every = Patch(i, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
+            rendered = problem.render(now, gain, every, effort, (seed << 16) + 997 * k + i)
             for total, values in zip(sums, (captured[i], _mean(o, rendered)), strict=True):
                 _add(total, cells[i], values)
         ratio = _smoothed(sums[0]) / np.maximum(_smoothed(sums[1]), 1e-12)
@@ -60,8 +64,6 @@ def cell_colours(
 
 def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> Ints:
     """Cells that rays through the pixels meet first `(P, 8)`, as flat indices; -1 where none."""
-    from appearance.bsdf.parameters import Place
-
     count = len(o.pixels) * _RAYS
     lane = dr.arange(mi.UInt32, count)
     slot = lane // _RAYS
@@ -70,9 +72,9 @@ def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> Int
     surface = Surface(problem.mapped.scene)
     si = surface.interact(ray, mi.Bool(True))
     hair = si.is_valid() & surface.is_hair(si)
-    place = Place(problem.mapped.coordinates, si, hair)
-    along = np.array(dr.select(hair, place.along, 0))
-    strand = np.array(dr.select(hair, place.strand, 0))
+    on_strand = StrandHit(problem.mapped.coordinates, si, hair)
+    along = np.array(dr.select(hair, on_strand.along, 0))
+    strand = np.array(dr.select(hair, on_strand.strand, 0))
     layers, columns, rows = shape
     u, v = problem.mapped.root_uv[strand].T
     column = np.minimum((u * columns).astype(int), columns - 1)

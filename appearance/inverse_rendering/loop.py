@@ -1,4 +1,4 @@
-"""The fit: what pictures alone tell first, then steps until the watched error no longer falls."""
+"""The fit: what needs no gradient first, then steps until the validation error no longer falls."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Batch, Pairs
 from appearance.inverse_rendering.checkpoint import State
-from appearance.inverse_rendering.global_parameters import WIDE, solved
-from appearance.inverse_rendering.initial_absorption import cell_colours
-from appearance.inverse_rendering.problem import Effort, Problem, Watched
-from appearance.inverse_rendering.unknowns import Lamps, Raw, maps_of
+from appearance.inverse_rendering.global_parameters import WIDE, Evidence, solve_global_parameters
+from appearance.inverse_rendering.initial_absorption import initial_absorption
+from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
+from appearance.inverse_rendering.problem import Objective, Problem, ValidationSet
+from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode
 from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, silent
 
 Shape = tuple[int, int, int]
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
-ROWS: dict[str, tuple[tuple[str, ...], bool]] = {
+VARIANTS: dict[Variant, tuple[tuple[str, ...], bool]] = {
     "original": (COLOUR, False),
     "spatial": (COLOUR, True),
     "correctives": ((*COLOUR, "rotation"), True),
@@ -39,60 +40,12 @@ _LATEST = 0.04
 """Least weight of the latest step in the running mean, in which the steps' noise averages out; the
 mean is over about the latest quarter of the steps before that (Shamir & Zhang 2013)."""
 _SLOWED = 0.8
-"""Share of the pace that the later half of the steps gives up, for what noise moves in the end."""
+"""Share of the learning rate that the later half of the steps gives up: noise moves the end."""
 _ALTERNATIONS = 2
-"""Of shared numbers and cells, each with what it knows of the other."""
+"""Of global parameters and cells, each with what it knows of the other."""
 _MORE_ROUNDS = 6
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared prior deviation, beside the image loss."""
-
-
-@dataclass(frozen=True)
-class Stage1Options:
-    """How a fit is run.
-
-    `row` is one of `ROWS`; `tilt` frees the cuticle's tilt. `shape` is the volume's (n_c, w, h),
-    reached at once by `cell_start` (see `cell_colours`), or else over `levels` doublings. With
-    `gauss_newton` the numbers that all hair shares and the lamps' intensities are solved for (see
-    `shared_numbers`), and steps are for what is left: correctives and the lamps' places, and
-    nothing in the rows before those. There are at most `steps`, of `images` pairs each: lights of
-    one view on shared paths, or pairs drawn one by one and rendered alone. `common_numbers` repeats
-    the same random numbers for a view in every step. `repeatable` gives the same bytes for the same
-    seed, with gradients in a single thread. The watched error is that of `watched_views` views,
-    every `check_every` steps; after `halvings` of the pace it has converged.
-    """
-
-    row: str = "lights"
-    tilt: bool = False
-    shape: Shape = (4, 8, 8)
-    levels: int = 3
-    cell_start: bool = True
-    gauss_newton: bool = True
-    steps: int = 60
-    images: int = 8
-    effort: Effort = field(default_factory=Effort)
-    loss: str = "squares"
-    lambda_sigma: float = 0.5
-    lambda_r: float = 10.0
-    residual_weighted: bool = True
-    shared_paths: bool = True
-    common_numbers: bool = False
-    repeatable: bool = True
-    check_every: int = 10
-    halvings: int = 2
-    watched_views: int = 3
-
-    def __post_init__(self) -> None:
-        if self.row not in ROWS:
-            raise ValueError(f"row must be one of {list(ROWS)}, got {self.row!r}")
-        if self.loss not in ("squares", "l1"):
-            raise ValueError(f"loss must be 'squares' or 'l1', got {self.loss!r}")
-        counts = (*self.shape, self.levels, self.steps, self.images, self.check_every)
-        if min(counts) < 1:
-            raise ValueError(
-                "shape, levels, steps, images and check_every must be positive, got "
-                f"{self.shape}, {self.levels}, {self.steps}, {self.images}, {self.check_every}"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +53,12 @@ class Outcome:
     """What a fit found, and how it came to an end.
 
     `ended` is "converged", "all steps taken", or why it ended early; `start_error` and `error` are
-    watched errors of the start and of the result, under fresh random numbers and alike for both.
-    `history` holds (seconds, step, watched error).
+    validation errors of the start and of the result, under fresh random numbers and alike for
+    both. `history` holds (seconds, step, validation error).
     """
 
     maps: HairMaps
-    lamps: Lamps
+    lights: LightDeviations
     ended: str
     start_error: float
     error: float
@@ -113,28 +66,33 @@ class Outcome:
     history: list[tuple[float, int, float]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class Monitor:
+    """Who follows a fit, and where it saves itself.
+
+    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
+    data or options is replaced. The file stays: whoever starts the fit removes it. `snapshot`
+    gets the CPU seconds so far, without validation, and the maps: as they come, and in the end.
+    """
+
+    progress: Progress = silent
+    checkpoint: Path | None = None
+    snapshot: Callable[[float, HairMaps], None] = lambda seconds, maps: None
+
+
 def run(
     problem: Problem,
     maps: HairMaps,
-    lamps: Lamps | None = None,
+    lights: LightDeviations | None = None,
     *,
-    options: Stage1Options | None = None,
-    checkpoint: Path | None = None,
-    progress: Progress = silent,
-    snapshot: Callable[[float, HairMaps], None] | None = None,
+    options: InverseRenderingOptions | None = None,
+    monitor: Monitor | None = None,
     seed: int = 0,
 ) -> Outcome:
-    """Fit from `maps` and `lamps` (the calibration where None); never returns a worse guess.
-
-    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
-    data or options is replaced. The file stays: whoever starts the fit removes it. `snapshot` is
-    told the CPU seconds so far, without watching, and the maps: as they come, and in the end.
-    """
-    options = options or Stage1Options()
-    fit = _Fit(problem, maps, lamps, options, checkpoint, progress, seed)
-    if snapshot is not None:
-        fit.snapshot = snapshot
-    return fit.run()
+    """Fit from `maps` and `lights` (the calibration where None); never returns a worse guess."""
+    lights = LightDeviations.calibrated(len(problem.lights)) if lights is None else lights
+    options = options or InverseRenderingOptions()
+    return _Fit(problem, maps, lights, options, monitor or Monitor(), seed).run()
 
 
 class _Fit:
@@ -142,109 +100,106 @@ class _Fit:
         self,
         problem: Problem,
         maps: HairMaps,
-        lamps: Lamps | None,
-        options: Stage1Options,
-        checkpoint: Path | None,
-        progress: Progress,
+        lights: LightDeviations,
+        options: InverseRenderingOptions,
+        monitor: Monitor,
         seed: int,
     ) -> None:
-        self.problem, self.options, self.seed = problem, options, seed
-        self.checkpoint, self.progress = checkpoint, progress
-        self.start = maps
-        self.lamps = Lamps.calibrated(len(problem.lights)) if lamps is None else lamps
-        free, self.spatial = ROWS[options.row]
-        free = (*free, "tilt_deg") if options.tilt else free
+        self.problem, self.options, self.monitor, self.seed = problem, options, monitor, seed
+        self.start, self.lights = maps, lights
+        free, self.spatial = VARIANTS[options.variant]
         self.solves = [n for n in free if n in WIDE] if options.gauss_newton else []
         self.free = [n for n in free if n not in self.solves and n != "gain"]
         if self.spatial and not options.cell_start and self.solves:
             self.free.append("sigma_a")
         self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
-        self.spread = problem.spread(self.pairs, options.watched_views, options.images)
+        self.spread = problem.spread(self.pairs, options.validation_views, options.images)
         self.series: list[tuple[float, int, float]] = []
-        self.snapshot: Callable[[float, HairMaps], None] = lambda seconds, maps: None
 
     def run(self) -> Outcome:
         self.begun, self.worked = time.perf_counter(), time.process_time()
         if not self.pairs.used.any():
             return self._unchanged("no pair of camera and light shows lit hair")
         state = self._begun()
-        self.pairs.taught = state.tables["taught"]
+        self.pairs.squared_error = state.tables["squared_error"]
         ended = "all steps taken" if self.free else "converged"
         while self.free and state.step < self.options.steps:
             if state.step % self.options.check_every == 0:
                 state.history = [list(p) for p in self.series]
-                state.save(self.checkpoint, self._fingerprint)
+                state.save(self.monitor.checkpoint, self._fingerprint)
                 share = 0.5 + 0.5 * state.step / self.options.steps
                 what = f"step {state.step}"
-                error = self._tell(state.average, state.gain, what, share, state.step)
-                if state.convergence.tell(error) and self._level(state.step) == self._last_level:
+                error = self._record(state.average, state.gain, what, share, state.step)
+                if state.convergence.update(error) and self._level(state.step) == self._last_level:
                     ended = "converged"
                     break
             reason = self._step(state)
             if reason:
                 ended = reason
                 break
-        self.snapshot(time.process_time() - self.worked, maps_of(state.average))
+        self.monitor.snapshot(time.process_time() - self.worked, decode(state.average))
         return self._judged(state, ended)
 
-    def _tell(self, raw: Raw, gain: Array, what: str, share: float, step: int = 0) -> float:
-        """Watch the error, tell it and note when it was; CPU time for that does not count."""
-        self.snapshot(time.process_time() - self.worked, maps_of(raw))
+    def _record(self, raw: Raw, gain: Array, what: str, share: float, step: int = 0) -> float:
+        """Validate a guess and report its error; CPU time for that does not count."""
+        self.monitor.snapshot(time.process_time() - self.worked, decode(raw))
         paused = time.process_time()
-        error = self._watch(raw, gain, self.seed)
+        error = self.problem.error(
+            raw, gain, self._validation, self.options.effort, self.seed << 16
+        )
         self.series.append((time.perf_counter() - self.begun, step, error))
-        self.progress(f"{what}: error {max(error, 0.0) ** 0.5:.4f}", share)
+        self.monitor.progress(f"{what}: error {max(error, 0.0) ** 0.5:.4f}", share)
         self.worked += time.process_time() - paused
         return error
 
     def _begun(self) -> State:
-        state = State.load(self.checkpoint, self._fingerprint)
+        state = State.load(self.monitor.checkpoint, self._fingerprint)
         if state is not None:
             self.series = [(s, int(k), e) for s, k, e in state.history]
             self.begun -= self.series[-1][0] if self.series else 0.0
             return state
         raw, gain = self._first()
         state = State(raw, _copied(raw), _copied(raw))
-        state.tables = {"taught": self.pairs.taught, "gain": gain}
+        state.tables = {"squared_error": self.pairs.squared_error, "gain": gain}
         state.convergence.halvings = self.options.halvings
         return state
 
     def _first(self) -> tuple[Raw, Array]:
-        """What pictures tell without a gradient: cells, shared numbers, and each again."""
+        """What needs no gradient: cells, global parameters, and each again."""
         one_colour = self.start.shape == (1, 1, 1)
         cells = self.spatial and self.options.cell_start and one_colour
-        # maps that differ from cell to cell come from a row that has solved for all but the gains
+        # maps that differ from cell to cell come from a fit that has solved for all but the gains
         solves = self.solves if one_colour or "gain" in self.solves else []
-        gain = self.lamps.gain
+        gain = self.lights.gain
         raw = self._raw(self.start.resized(self._shape(self._level(0))))
         if cells or solves:
-            self._tell(raw, gain, "start", 0.0)
+            self._record(raw, gain, "start", 0.0)
         if cells:
             raw = self._coloured(raw, gain, 12, 0)
         rounds = (_ALTERNATIONS if cells else 1) if solves else 0
         for k in range(rounds):
             if cells:
-                self._tell(raw, gain, "cells", 0.5 * k / rounds)
-            raw, gain = solved(
+                self._record(raw, gain, "cells", 0.5 * k / rounds)
+            raw, gain = solve_global_parameters(
                 self.problem,
                 raw,
                 gain,
                 solves,
-                self.spread,
-                self.options.effort,
-                progress=lambda what, share, k=k: self.progress(  # type: ignore[misc]
+                Evidence(self.spread, self.options.effort, (self.seed << 4) + k),
+                lambda what, share, k=k: self.monitor.progress(  # type: ignore[misc]
                     what, 0.5 * (k + share) / rounds
                 ),
-                seed=(self.seed << 4) + k,
             )
-            self._tell(raw, gain, "shared numbers", 0.5 * (k + 1) / rounds)
+            self._record(raw, gain, "global parameters", 0.5 * (k + 1) / rounds)
             if cells:
                 raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
         return raw, gain
 
     def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
         effort, seed = self.options.effort, (self.seed << 4) + number
-        return self._raw(cell_colours(self.problem, raw, gain, effort, rounds=rounds, seed=seed))
+        return self._raw(
+            initial_absorption(self.problem, raw, gain, effort, rounds=rounds, seed=seed)
+        )
 
     @cached_property
     def _fingerprint(self) -> str:
@@ -252,7 +207,7 @@ class _Fit:
         total = hashlib.sha256(repr((self.options, self.seed, self.problem.scale)).encode())
         arrays: list[NDArray[Any]] = [
             *self._raw(self.start).values(),
-            self.lamps.gain,
+            self.lights.gain,
             *(o.radiance for o in self.problem.views),
         ]
         for array in arrays:
@@ -260,7 +215,7 @@ class _Fit:
         return total.hexdigest()
 
     def _raw(self, maps: HairMaps) -> Raw:
-        return self.problem.raw_of(maps, self.lamps)
+        return self.problem.encode(maps, self.lights)
 
     def _step(self, state: State) -> str | None:
         """One step; why the fit must end, if it must."""
@@ -271,27 +226,23 @@ class _Fit:
         for k, batch in enumerate(self._batches(rng)):
             numbers = batch.view if options.common_numbers else state.step * options.images + k
             first = (self.seed << 20) + 2 * numbers
-            slope = self.problem.slope(
+            gradient, seen = self.problem.gradient(
                 state.raw,
                 state.gain,
-                self.free,
-                batch,
+                self.problem.patch(batch, options.effort.pixels, rng),
+                Objective(self.free, self.series[-1][2], smooth=k == 0),
                 options.effort,
                 (first, first + 1),
-                rng,
-                loss=options.loss,
-                lambdas=(options.lambda_sigma, options.lambda_r) if k == 0 else (0.0, 0.0),
-                error=self.series[-1][2],
-                repeatable=options.repeatable,
             )
-            if not all(np.isfinite(g).all() for g in slope.gradient.values()):
+            if not all(np.isfinite(g).all() for g in gradient.values()):
                 return f"step {state.step}: the gradient is not finite"
-            self.pairs.learn(batch, slope.seen)
-            for name, value in slope.gradient.items():
+            self.pairs.update(batch, seen)
+            for name, value in gradient.items():
                 total[name] = total.get(name, 0.0) + value
         self._pull_to_priors(state.raw, total)
         late = max(0.0, 2 * state.step / options.steps - 1)
-        state.descent.step(state.raw, total, state.convergence.pace * (1 - _SLOWED * late))
+        scale = state.convergence.learning_rate_scale * (1 - _SLOWED * late)
+        state.descent.step(state.raw, total, scale)
         state.step += 1
         share = max(_LATEST, 4 / (state.step - state.level_began + 3))
         for name, value in state.raw.items():
@@ -335,7 +286,7 @@ class _Fit:
         if state.raw["sigma_a"].shape[:3] == shape:
             return
         for raw in (state.raw, state.average):
-            fine = self._raw(maps_of(raw).resized(shape))
+            fine = self._raw(decode(raw).resized(shape))
             raw |= {k: fine[k] for k in ("sigma_a", "rotation")}
         for moments in (state.descent.first, state.descent.second):
             for name in ("sigma_a", "rotation"):
@@ -344,17 +295,14 @@ class _Fit:
         state.average = _copied(state.raw)
 
     @cached_property
-    def _watched(self) -> Watched:
-        return self.problem.watched(
+    def _validation(self) -> ValidationSet:
+        return self.problem.validation(
             self._raw(self.start),
-            self.lamps.gain,
+            self.lights.gain,
             self.spread,
             self.options.effort,
             self.seed << 16,
         )
-
-    def _watch(self, raw: Raw, gain: Array, seed: int) -> float:
-        return self.problem.error(raw, gain, self._watched, self.options.effort, seed << 16)
 
     def _judged(self, state: State, ended: str) -> Outcome:
         """The best of the result and of what it came from, by fresh random numbers."""
@@ -364,29 +312,30 @@ class _Fit:
         guesses = [(state.average, found, ended)]
         if state.step:
             guesses.append((state.first, found, f"{ended}; kept the first maps, which are better"))
-        if (found != self.lamps.gain).any():
+        if (found != self.lights.gain).any():
             guesses.append(
                 (start, found, f"{ended}; kept all but the intensities, which is better")
             )
-        guesses.append((start, self.lamps.gain, f"{ended}; kept the start, which is better"))
+        guesses.append((start, self.lights.gain, f"{ended}; kept the start, which is better"))
         errors = [
-            self.problem.error(raw, gain, self._watched, effort, seed) for raw, gain, _ in guesses
+            self.problem.error(raw, gain, self._validation, effort, seed)
+            for raw, gain, _ in guesses
         ]
         best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
         raw, gain, how = guesses[best]
         self.series.append((time.perf_counter() - self.begun, state.step, errors[best]))
         if best == len(errors) - 1:
-            # in cells, though all alike: the next row need not tell them apart again
+            # in cells, though all alike: the next variant need not tell them apart again
             maps = self.start.resized(raw["sigma_a"].shape[:3])
             return Outcome(
-                maps, self.lamps, how, errors[best], errors[best], state.step, self.series
+                maps, self.lights, how, errors[best], errors[best], state.step, self.series
             )
         profile = np.exp(raw["profile"])[self.problem.profile_of]
-        lamps = Lamps(raw["position"], raw["turn"], gain, profile)
-        return Outcome(maps_of(raw), lamps, how, errors[-1], errors[best], state.step, self.series)
+        lights = LightDeviations(raw["position"], raw["turn"], gain, profile)
+        return Outcome(decode(raw), lights, how, errors[-1], errors[best], state.step, self.series)
 
     def _unchanged(self, reason: str) -> Outcome:
-        return Outcome(self.start, self.lamps, reason, 0.0, 0.0, 0)
+        return Outcome(self.start, self.lights, reason, 0.0, 0.0, 0)
 
 
 def _copied(raw: Raw) -> Raw:

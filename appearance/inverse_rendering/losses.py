@@ -5,10 +5,10 @@ hair's 99th percentile at 1), smoothness over neighbouring layers, cells and cha
 weights mean the same whatever the resolution of images and maps.
 
 The papers' L1 takes the sign of a noisy difference: with few samples a pixel it fits the median of
-the noise, which for path tracing lies far below its mean. "squares" is unbiased: squared
-differences, the picture's and the gradient's noise independent of each other, with weights that
-make them differences of displayed (sRGB) values. Its square root is what is minimised: like L1 it
-is proportional to the difference, so that λ_σ and λ_R keep their meaning.
+the noise, which for path tracing lies far below its mean. Squared differences, the picture's and
+the gradient's noise independent of each other, are unbiased, with weights that make them
+differences of displayed (sRGB) values. The square root is what is minimised: like L1 it is
+proportional to the difference, so that λ_σ and λ_R keep their meaning.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ LEAST_NOISE = 0.1
 """Of the median pixel's: what a pixel's noise is held to be at least, known from few paths."""
 LEAST_ERROR = 0.02
 """Of the root of the squares: below it smoothness gets no more say."""
+LAMBDA_SIGMA, LAMBDA_R = 0.5, 10.0
+"""Weights of smoothness along strands, of absorption and of correctives."""
 
 
 def level(captured: Array) -> Array:
@@ -39,14 +41,14 @@ def level(captured: Array) -> Array:
 
 
 def weights(level: Array) -> Array:
-    """Weight of a squared difference at a captured `level`, in exposure units.
+    """Weight of a squared difference at a captured `level`, of its shape, in exposure units.
 
     The squared slope of the sRGB curve, with a floor below which darkness counts no more.
     """
     return 0.2 * (level + FLOOR) ** -1.17
 
 
-def quieted(weight: Array, squares: Array) -> Array:
+def noise_weighted(weight: Array, squares: Array) -> Array:
     """`weight (L, P, 3)`, less of it where pictures are noisy: one pixel in a hundred has two
     fifths of all noise.
 
@@ -64,36 +66,36 @@ def quieted(weight: Array, squares: Array) -> Array:
     return np.asarray(out * (weight.sum() / out.sum()))
 
 
-def slope(difference: Array, level: Array, valid: Bools, kind: str, error: float) -> Array:
+def gradient(difference: Array, level: Array, valid: Bools, error: float) -> Array:
     """Derivative of the image loss by the rendered values `(L, P, 3)`, in exposure units.
 
-    `difference` is rendered less captured; `valid (L, P)`; `kind` "squares" or "l1"; `error` an
-    estimate of the mean of the squares, of which the root is taken.
+    `difference` is rendered less captured; `valid (L, P)`; `error` an estimate of the mean of
+    the squares, of which the root is taken.
     """
     root = max(error, LEAST_ERROR**2) ** 0.5
-    out = np.sign(difference) if kind == "l1" else difference * weights(level) / root
+    out = difference * weights(level) / root
     used = max(int(valid.sum()), 1) * 3
     return np.where(valid[..., None], out, 0.0) / used
 
 
 def squares(one: Array, other: Array, weight: Array, valid: Bools) -> float:
-    """Weighted mean square of the differences `one` and `other`, of two independent renderings.
+    """Weighted mean square of the differences `one`, `other (L, P, 3)` of independent renderings.
 
     Without their noise: may be slightly negative where the renderings agree with the captured.
     """
     return float((one * other * weight)[valid].mean()) if valid.any() else 0.0
 
 
-def smoothness(values: dict[str, Any], lambda_sigma: float, lambda_r: float) -> Any:
+def smoothness(values: dict[str, Any]) -> Any:
     """λ_σ mean |σ_i − σ_(i−1)| + λ_R mean |R_i − R_(i−1)| over layers (GroomLight Eq. 4 and 5).
 
     Cells whose strands no ray meets follow their neighbours along the strand. A Dr.Jit number, or
     0 for a single layer.
     """
     total: Any = 0.0
-    for name, weight in (("hair.sigma_a", lambda_sigma), ("hair.rotation", lambda_r)):
+    for name, weight in (("hair.sigma_a", LAMBDA_SIGMA), ("hair.rotation", LAMBDA_R)):
         table = values[name]
-        if weight > 0 and table.ndim == 4 and table.shape[0] > 1 and dr.grad_enabled(table):
+        if table.ndim == 4 and table.shape[0] > 1 and dr.grad_enabled(table):
             step = table[1:] - table[:-1]
             # rounded off at a thousandth: no jitter about equal layers
             total = total + weight * dr.mean(dr.sqrt(step * step + 1e-6), axis=None)

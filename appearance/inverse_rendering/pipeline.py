@@ -11,9 +11,10 @@ from pydantic import Field
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import save_lights
 from appearance.inverse_rendering.held_out import Sampling, held_out_frames, judge
-from appearance.inverse_rendering.loop import Outcome, Stage1Options, run
+from appearance.inverse_rendering.loop import Monitor, Outcome, run
+from appearance.inverse_rendering.options import InverseRenderingOptions
 from appearance.inverse_rendering.problem import Problem
-from appearance.inverse_rendering.unknowns import Lamps
+from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
 from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.bounces import bounce_limit
@@ -46,7 +47,7 @@ class InverseRenderingRequest:
     hair_pixels: Count = 4000
     judged_spp: Count = 48
     max_depth: Count | None = None
-    fit: Stage1Options = Field(default_factory=Stage1Options)
+    fit: InverseRenderingOptions = Field(default_factory=InverseRenderingOptions)
 
 
 def inverse_rendering(
@@ -85,10 +86,10 @@ def inverse_rendering(
         problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
         start = HairMaps.of(fitted.hair)
         fit = _Fit(problem, model, stage, progress, seed)
-        one_colour = fit.run(replace(options, row="original"), start, None, (0.05, 0.3))
-        outcome = fit.run(options, one_colour.maps, one_colour.lamps, (0.3, 0.9))
+        one_colour = fit.run(replace(options, variant="original"), start, None, (0.05, 0.3))
+        outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
         outcome.maps.save(model, mapped.root_uv)
-        save_lights(model, outcome.lamps, problem.lights)
+        save_lights(model, outcome.lights, problem.lights)
         progress("judging held-out images", 0.92)
         result: dict[str, Any] = {
             "ended": outcome.ended,
@@ -99,7 +100,7 @@ def inverse_rendering(
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
             scenes = {
-                name: mapped.painted(maps).with_skin(fitted.skin)
+                name: mapped.with_maps(maps).with_skin(fitted.skin)
                 for name, maps in (("start", start), ("inverse_rendering", outcome.maps))
             }
             judging = Sampling(request.judged_spp, depth, seed)
@@ -107,7 +108,7 @@ def inverse_rendering(
             result |= scores_unavailable()
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     model.write_report(report)
-    for variant in ("original", options.row):
+    for variant in ("original", options.variant):
         model.checkpoint(variant).unlink(missing_ok=True)
     progress("inverse rendering done", 1.0)
     return result
@@ -130,27 +131,33 @@ class _Fit:
     seed: int
 
     def run(
-        self, options: Stage1Options, maps: HairMaps, lamps: Lamps | None, part: tuple[float, float]
+        self,
+        options: InverseRenderingOptions,
+        maps: HairMaps,
+        lights: LightDeviations | None,
+        part: tuple[float, float],
     ) -> Outcome:
-        """Fit from `maps` and `lamps`; `part` is what it is of the progress."""
+        """Fit from `maps` and `lights`; `part` is what it is of the progress."""
         begin, end = part
         outcome = run(
             self.problem,
             maps,
-            lamps,
+            lights,
             options=options,
-            checkpoint=self.model.checkpoint(options.row),
-            progress=lambda what, share: self.progress(what, begin + (end - begin) * share),
+            monitor=Monitor(
+                lambda what, share: self.progress(what, begin + (end - begin) * share),
+                self.model.checkpoint(options.variant),
+            ),
             seed=self.seed,
         )
         series = Series(
-            f"inverse rendering, {options.row}",
+            f"inverse rendering, {options.variant}",
             "weighted mean squared difference, noise taken off",
         )
         series.points = [(seconds, error) for seconds, _, error in outcome.history]
         self.stage.series.append(series)
         if outcome.steps < options.steps and outcome.ended != "converged":
-            self.stage.warn(f"{options.row}: {outcome.ended}")
+            self.stage.warn(f"{options.variant}: {outcome.ended}")
         return outcome
 
 

@@ -14,12 +14,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from appearance.bsdf.maps import HairMaps
 from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.lights import Light
 
 Raw = dict[str, Array]
+"""Unconstrained numbers by name. Of lights: "position" offsets in metres, "turn" axis-angles in
+radians, "profile" logarithms of a factor for each profile."""
 
 BRACKET = 6.0
 """About Chiang's polynomial at beta_N = 0.3: here it only shapes the parametrisation."""
@@ -30,16 +33,12 @@ MOST_TILT = 10.0
 _PLUGIN = {"beta_m": "longitudinal_roughness", "beta_n": "azimuthal_roughness", "eta": "eta"}
 _FARTHEST = 16.0
 
-HAIR = ("sigma_a", "rotation", "beta_m", "beta_n", "eta", "tilt_deg")
-LAMPS = ("position", "turn", "profile")
-"""Offsets in metres, axis-angles in radians, logarithms of a factor for each lamp's profile."""
-
 
 @dataclass(frozen=True, eq=False)
-class Lamps:
-    """How the lamps differ from their calibration, for all L lights of a fit.
+class LightDeviations:
+    """How the lights differ from their calibration, for all L lights of a fit.
 
-    `position (L, 3)` metres, `turn (L, 3)` radians about the lamp's centre in the world's frame,
+    `position (L, 3)` metres, `turn (L, 3)` radians about the light's centre in the world's frame,
     `gain (L,)` and `profile (L,)` factors on the intensity; those of one profile share the latter.
     """
 
@@ -49,14 +48,12 @@ class Lamps:
     profile: Array
 
     @classmethod
-    def calibrated(cls, count: int) -> Lamps:
+    def calibrated(cls, count: int) -> LightDeviations:
         """No difference."""
         return cls(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count), np.ones(count))
 
-    def of(self, lights: Sequence[Light]) -> list[Light]:
-        """The lights as they are found to be."""
-        from scipy.spatial.transform import Rotation
-
+    def applied(self, lights: Sequence[Light]) -> list[Light]:
+        """The `lights` as they are found to be."""
         out = []
         for i, light in enumerate(lights):
             turned = light.orientation
@@ -73,18 +70,18 @@ class Lamps:
         return out
 
 
-def raw_of(maps: HairMaps, lamps: Lamps, profile_of: Ints) -> Raw:
-    """The unconstrained numbers of `maps` and `lamps`; `profile_of (L,)` numbers the profiles."""
+def encode(maps: HairMaps, lights: LightDeviations, profile_of: Ints) -> Raw:
+    """The unconstrained numbers of `maps` and `lights`; `profile_of (L,)` numbers the profiles."""
     raw = {
         "sigma_a": _logit_of_colour(-BRACKET * np.sqrt(np.maximum(maps.sigma_a, 1e-12))),
         "rotation": MOST_TURN * np.arctanh(np.clip(maps.rotation / MOST_TURN, -0.999, 0.999)),
         "tilt_deg": np.array(
             [MOST_TILT * np.arctanh(np.clip(maps.tilt_deg / MOST_TILT, -0.99, 0.99))]
         ),
-        "position": lamps.position.copy(),
-        "turn": lamps.turn.copy(),
+        "position": lights.position.copy(),
+        "turn": lights.turn.copy(),
         "profile": np.array(
-            [np.log(lamps.profile[profile_of == k][0]) for k in range(profile_of.max() + 1)]
+            [np.log(lights.profile[profile_of == k][0]) for k in range(profile_of.max() + 1)]
         ),
     }
     for name, (low, high) in RANGES.items():
@@ -106,7 +103,7 @@ def hair_values(raw: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def maps_of(raw: Raw) -> HairMaps:
+def decode(raw: Raw) -> HairMaps:
     """The maps that the numbers stand for."""
     scalars = {
         name: float(low + (high - low) * (0.5 + 0.5 * np.tanh(0.5 * raw[name][0])))

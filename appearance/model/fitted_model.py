@@ -96,7 +96,7 @@ class FittedModel:
         )
         if self.maps.uniform or not len(moved):
             return base
-        return MappedStrands.of(base, moved, self.root_uv).painted(self.maps)
+        return MappedStrands.of(base, moved, self.root_uv).with_maps(self.maps)
 
     def render(
         self,

@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import Surface, opaque_index
-from appearance.render.tracing import Paths, Reach, follow
+from appearance.render.tracing import PathLimits, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.cameras import Camera
@@ -45,9 +45,9 @@ def bounce_limit(
 ) -> BounceLimit:
     """The smallest depth that leaves out at most `share` of the light.
 
-    Measured under light that is alike from everywhere, which is the mean over all places of a lamp:
-    there the light that a path brings is its throughput where it leaves the subject, and no lamp
-    has to be asked. A lamp that reaches a pixel only by many bounces may lose a larger share of
+    Measured under light that is alike from everywhere, the mean over all places of a light:
+    there the light that a path brings is its throughput where it leaves the subject, and no light
+    has to be asked. A light that reaches a pixel only by many bounces may lose a larger share of
     its little light. `pixels (P,)` default to those that see the subject; about `paths` paths are
     spent. The largest depth tried is 256. Raises `ValueError` for `share` outside (0, 1).
     """
@@ -86,7 +86,7 @@ def _by_depth(scene: HairScene, camera: Camera, index: Ints, spp: int, seed: int
             )
 
     # one ray more than vertices: the light of the last vertex is the ray that leaves it
-    reach = Reach(_LONGEST + 1, _ROULETTE)
+    reach = PathLimits(_LONGEST + 1, _ROULETTE)
     follow(
         Surface(scene), camera, index, spp, (seed, _STREAM), reach, lambda si, paths: None, escape
     )

@@ -1,14 +1,14 @@
-"""Radiance under each lamp, differentiable in the hair, the skin and the lamps: path replay.
+"""Radiance under each light, differentiable in the hair, the skin and the lights: path replay.
 
 The gradient takes two walks along the same camera paths, from the same seeds (Vicini et al. 2021).
 The first sums what each path brings in, weighted by the gradient of the loss; the second subtracts
 vertex after vertex from that sum, so that at every vertex what is left is the light that arrives
-from further along, and needs no memory of the path: neither its length nor the number of lamps
+from further along, and needs no memory of the path: neither its length nor the number of lights
 costs any. Directions, roulette and geometry are held fixed; BSDF values and emitter samples are
-differentiated, the way from a vertex to a lamp included.
+differentiated, the way from a vertex to a light included.
 
 What a moving shadow edge does is left out: a vertex is lit or not, and the moment at which that
-changes has no derivative here. With respect to a lamp's position or turn the gradient is that of
+changes has no derivative here. With respect to a light's position or turn the gradient is that of
 the light that arrives where it arrives already. All other parameters move no edge.
 """
 
@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.render.lamps import LampBank
+from appearance.render.lights import LightBank
 from appearance.render.paths import (
     Surface,
     Wave,
@@ -41,14 +41,14 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
 _GRADIENT_STREAM = 1 << 29
-_UNITS = {"lamps.position": SCALE, "lamps.intensity": SCALE**2, "lamps.turn": 1.0}
+_UNITS = {"lights.position": SCALE, "lights.intensity": SCALE**2, "lights.turn": 1.0}
 
 
 class DifferentiableOlat:
     """The pixels `(P,)` of `camera` under each of `lights` alone, as a function of parameters.
 
-    `spp` paths a pixel of at most `max_depth` vertices serve all lamps; roulette of paths starts at
-    vertex `rr_depth`. The BSDF of `scene` holds the parameters' values during a call only.
+    `spp` paths a pixel of at most `max_depth` vertices serve all lights; roulette starts at vertex
+    `rr_depth`. The BSDF of `scene` holds the parameters' values during a call only.
 
     With a `guide`, the same geometry with materials of its own (`scene.with_hair(…)`), directions
     are drawn from those, and the paths are the same for all values of the parameters: but for
@@ -79,22 +79,22 @@ class DifferentiableOlat:
         self.guide = guide
         self.index = pixel_indices(camera, pixels)
         self.spp, self.max_depth, self.rr_depth = spp, max_depth, rr_depth
-        self._bank = LampBank.of(self.lights)
+        self._bank = LightBank.of(self.lights)
 
     def parameters(self) -> dict[str, Any]:
-        """Copies of the values that scene and lamps have, by name, for `dr.enable_grad`.
+        """Copies of the values that scene and lights have, by name, for `dr.enable_grad`.
 
         `hair.…`: what `mitsuba.traverse` finds in the hair's BSDF, or `hair.albedo` of diffuse
-        fibres; `skin`: the head's albedo, `Color3f`. `lamps.position (L, 3)` in metres,
-        `lamps.intensity (L, 3)` in W/sr, `lamps.turn (L, 3)`: by how many radians each lamp is
-        turned about its centre, an axis-angle in the world's frame, 0 now (no effect on lamps
+        fibres; `skin`: the head's albedo, `Color3f`. `lights.position (L, 3)` in metres,
+        `lights.intensity (L, 3)` in W/sr, `lights.turn (L, 3)`: by how many radians each light is
+        turned about its centre, an axis-angle in the world's frame, 0 now (no effect on lights
         without an orientation).
         """
         values: dict[str, Any] = {
             "skin": mi.Color3f(*self.scene.skin),
-            "lamps.position": mi.TensorXf(for_kernels([x.position for x in self.lights])),
-            "lamps.intensity": mi.TensorXf(for_kernels([x.intensity for x in self.lights])),
-            "lamps.turn": dr.zeros(mi.TensorXf, (len(self.lights), 3)),
+            "lights.position": mi.TensorXf(for_kernels([x.position for x in self.lights])),
+            "lights.intensity": mi.TensorXf(for_kernels([x.intensity for x in self.lights])),
+            "lights.turn": dr.zeros(mi.TensorXf, (len(self.lights), 3)),
         }
         if isinstance(self.scene.hair, DiffuseHair):
             values["hair.albedo"] = mi.Color3f(*self.scene.hair.albedo)
@@ -126,15 +126,15 @@ class DifferentiableOlat:
         return mi.traverse(self.scene.hair_bsdf) if self.scene.hair_bsdf is not None else {}
 
     @contextmanager
-    def _applied(self, values: Mapping[str, Any]) -> Iterator[tuple[Surface, LampBank]]:
-        """Surface and lamps with these values, in scene units; the BSDF gets its own back after."""
+    def _applied(self, values: Mapping[str, Any]) -> Iterator[tuple[Surface, LightBank]]:
+        """Surface and lights with these values, in scene units; the BSDF gets its own back."""
         before = self.parameters()
         self._set_hair(values)
         bank = replace(
             self._bank,
-            positions=values["lamps.position"].array,
-            intensities=values["lamps.intensity"].array,
-            turns=None if self._bank.orientations is None else values["lamps.turn"].array,
+            positions=values["lights.position"].array,
+            intensities=values["lights.intensity"].array,
+            turns=None if self._bank.orientations is None else values["lights.turn"].array,
         )
         guide = None if self.guide is None else Surface(self.guide)
         try:
@@ -260,7 +260,7 @@ class _Walk:
 
     owner: DifferentiableOlat
     surface: Surface
-    bank: LampBank
+    bank: LightBank
     paths: Wave
     film: Any | None
     share: Any | None
@@ -275,7 +275,7 @@ class _Walk:
             return active
 
         def body(si: Any, beta: Any, total: Any, depth: Any, rng: Any, active: Any) -> Any:
-            total = self._lamps(si, beta, total, rng, active)
+            total = self._lights(si, beta, total, rng, active)
             active = active & (depth + 1 < max_depth)
             ray, beta, active = continue_path(
                 self.surface, si, beta, depth, rng, self.owner.rr_depth, active
@@ -288,8 +288,8 @@ class _Walk:
         state = (si, mi.Color3f(1), total, mi.UInt32(0), rng, si.is_valid())
         return dr.while_loop(state, more, body, label="path")[2]
 
-    def _lamps(self, si: Any, beta: Any, total: Any, rng: Any, active: Any) -> Any:
-        """The light of all lamps at a vertex."""
+    def _lights(self, si: Any, beta: Any, total: Any, rng: Any, active: Any) -> Any:
+        """The light of all lights at a vertex."""
         count, slots = self.bank.count, opaque_index(len(self.owner.index))
         resume: Any = dr.resume_grad  # untyped
 
@@ -322,7 +322,7 @@ class _Walk:
                 total = total - arrives if self.replay else total + arrives
             return light + 1, total, rng
 
-        return dr.while_loop((mi.UInt32(0), total, rng), more, body, label="lamps of a vertex")[1]
+        return dr.while_loop((mi.UInt32(0), total, rng), more, body, label="lights of a vertex")[1]
 
     def _bounce(self, si: Any, ray: Any, total: Any, active: Any) -> None:
         """What is still to come was multiplied by the BSDF at this vertex."""

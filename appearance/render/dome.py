@@ -23,8 +23,8 @@ class Dome:
     """Spherical harmonics up to `degree` over the positions of lights around the subject.
 
     Light that has met two fibres or more varies slowly with the light's place. Where a path leaves
-    the subject it tells what a light out there would send down it: no lamp is asked and no shadow
-    ray is cast, and one path serves every lamp. That is projected on the harmonics over the sphere
+    the subject it tells what a light out there would send down it: no light is asked and no shadow
+    ray is cast, and one path serves every light. That is projected on the harmonics over the sphere
     of the lights' mean distance about the origin, with the parallax of each path. Each degree is
     then weighted by signal / (signal + noise) (Wiener), both measured on two halves of the
     samples: few samples give a smoother answer, many a sharper one.
@@ -41,13 +41,13 @@ class Dome:
 
     @classmethod
     def over(cls, scene: HairScene, lights: Sequence[Light], degree: int) -> Self:
-        """The dome that holds `lights`, spherical lamps as points.
+        """The dome that holds `lights`, spherical lights as points.
 
-        Raises `ValueError` if the subject reaches out of it, or a lamp is directed.
+        Raises `ValueError` if the subject reaches out of it, or a light is directed.
         """
         if directed := [x.name for x in lights if x.profile is not None or x.size is not None]:
             raise ValueError(
-                f"{', '.join(directed[:3])}: the smooth basis knows lamps that shine alike in all "
+                f"{', '.join(directed[:3])}: the smooth basis knows lights that shine alike in all "
                 "directions; render with degree=None"
             )
         position = np.array([light.position for light in lights]) * SCALE
@@ -102,7 +102,7 @@ class Splat:
         # radius times the cosine between the ray and the sphere's normal where they meet
         upright = dr.sqrt(along * along - dr.squared_norm(ray.o) + radius * radius)
         place = (ray.o + ray.d * (upright - along)) / radius
-        # per area of the unit sphere, for a lamp whose light falls with the squared distance
+        # per area of the unit sphere, for a light whose light falls with the squared distance
         weight = paths.throughput * dr.rcp(radius * upright)
         slots = opaque_index(self.slots)
         half = (paths.sample & 1) * (self.dome.terms * 3)

@@ -17,7 +17,7 @@ import numpy as np
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
-from appearance.render.tracing import Paths, Reach, follow
+from appearance.render.tracing import PathLimits, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Floats
@@ -57,7 +57,7 @@ def render_environment(
         def missed(ray: Any, paths: Paths) -> None:
             _add(film, paths.slot, sky.radiance(ray.d), paths.active & (paths.depth == 0))
 
-        reach = Reach(max_depth)
+        reach = PathLimits(max_depth)
         escape = missed if background else None
         follow(gather.surface, camera, index, spp, (seed,), reach, gather, escape)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)

@@ -1,4 +1,4 @@
-"""One image under any linear combination of lamps and environment maps."""
+"""One image under any linear combination of lights and environment maps."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from numpy.typing import ArrayLike
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment import Sky
 from appearance.render.environment_maps import check_environment
-from appearance.render.lamps import LampBank
+from appearance.render.lights import LightBank
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface, opaque, pixel_indices
-from appearance.render.tracing import Paths, Reach, follow
+from appearance.render.tracing import PathLimits, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
-_PILOT = 256  # pixels whose light from each lamp is looked at first
-_SPREAD = 0.1  # share of the choices that all lamps have alike
+_PILOT = 256  # pixels whose light from each light is looked at first
+_SPREAD = 0.1  # share of the choices that all lights have alike
 _PILOT_STREAM = 1 << 30
 
 
@@ -53,7 +53,7 @@ def render_mixed(
     """Radiance, W/(sr m²), of the subject under everything at once: `(H, W, 3)`, or `(P, 3)`.
 
     `weights` broadcasts to `(L, 3)`: a factor for each light and channel, of any sign (a light may
-    be taken away). Every vertex asks one lamp, drawn in proportion to its mean contribution in a
+    be taken away). Every vertex asks one light, drawn in proportion to its mean contribution in a
     pilot pass, and one direction of each environment. Without `pixels (P,)` (flat indices) those
     that see the subject are rendered and the others are 0. Raises `ValueError` naming the fault.
     """
@@ -70,7 +70,7 @@ def render_mixed(
         radiance = _render(
             scene,
             camera,
-            LampBank.of(lights, weight / choice[:, None]) if lights else None,
+            LightBank.of(lights, weight / choice[:, None]) if lights else None,
             choice,
             [
                 (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
@@ -95,7 +95,7 @@ def _choice(
     max_depth: int,
     seed: int,
 ) -> Array:
-    """Probabilities `(L,)` of asking each lamp; none is 0, so nothing is left out for good."""
+    """Probabilities `(L,)` of asking each light; none is 0, so nothing is left out for good."""
     if len(lights) < 2:
         return np.ones(len(lights))
     few = index[:: max(1, len(index) // _PILOT)]
@@ -118,7 +118,7 @@ def _choice(
 def _render(
     scene: HairScene,
     camera: Camera,
-    bank: LampBank | None,
+    bank: LightBank | None,
     choice: Array,
     skies: Sequence[tuple[Sky, Array]],
     index: Ints,
@@ -130,18 +130,18 @@ def _render(
     draw = mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if bank is not None else None
 
     gather = _Gather(surface, film, bank, draw, skies)
-    follow(surface, camera, index, spp, (seed,), Reach(max_depth), gather)
+    follow(surface, camera, index, spp, (seed,), PathLimits(max_depth), gather)
     image = np.array(film).reshape(len(index), 3)
     return np.asarray(image / np.float32(spp), dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class _Gather:
-    """Light of one lamp and of one direction of each sky at a path's vertex."""
+    """Light of one light and of one direction of each sky at a path's vertex."""
 
     surface: Surface
     film: Any
-    bank: LampBank | None
+    bank: LightBank | None
     choice: Any
     skies: Sequence[tuple[Sky, Array]]
 

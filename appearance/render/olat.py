@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.dome import Dome
-from appearance.render.lamps import LampBank
+from appearance.render.lights import LightBank
 from appearance.render.paths import Surface, light_from, opaque_index, pixel_indices
-from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
+from appearance.render.tracing import LANE_BYTES, PathLimits, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
@@ -41,7 +41,7 @@ class OlatOptions:
     from that light (from a pilot pass) casts its shadow ray by roulette; 0 casts all of them. A
     shadow ray takes as long as the BSDF of twenty lights: 3 halves the time and more for 5 to 10 %
     more variance on hair, where 2 to 8 do as well within a tenth. `roulette`
-    of paths is that of `Reach`. The estimate is unbiased for every choice of these numbers.
+    of paths is that of `PathLimits`. The estimate is unbiased for every choice of these numbers.
 
     `degree` projects light from the second vertex on onto spherical harmonics over the lights'
     directions, see `Dome`: a fraction of the noise, biased. None is the unbiased renderer.
@@ -151,7 +151,7 @@ class _Plan:
 
     lights: Sequence[Light]
     counts: tuple[int, int]
-    reach: Reach
+    reach: PathLimits
     dim: Floats
     dome: Dome | None
 
@@ -170,7 +170,7 @@ def _plan(
     if depth is None:
         depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    plan = _Plan(lights, (first, deep), Reach(depth, options.roulette), none, None)
+    plan = _Plan(lights, (first, deep), PathLimits(depth, options.roulette), none, None)
     if options.thrift > 0:
         spread = _spread(scene, camera, index, options.spp, plan, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)
@@ -236,12 +236,12 @@ def _render_tile(
 class _Bank:
     """The lights on the device, and the contributions `(L,)` below which roulette is played."""
 
-    lamps: LampBank
+    lights: LightBank
     dim: Any
 
     @classmethod
     def of(cls, lights: Sequence[Light], dim: Floats) -> _Bank:
-        return cls(LampBank.of(lights), mi.Float(dim))
+        return cls(LightBank.of(lights), mi.Float(dim))
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class _Gather:
     plan: _Plan
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        total, first = self.bank.lamps.count, paths.depth == 0
+        total, first = self.bank.lights.count, paths.depth == 0
         active = paths.active if self.plan.dome is None else paths.active & first
         count = dr.select(first, *(opaque_index(n) for n in self.plan.counts))
         stride = mi.Float(total) / mi.Float(count)
@@ -275,7 +275,7 @@ class _Gather:
         dr.while_loop((mi.UInt32(0), paths.rng), more, body, label="lights of a vertex")
 
     def _add(self, si: Any, paths: Paths, weight: Any, light: Any, rng: Any, active: Any) -> None:
-        target, intensity = self.bank.lamps.sample(light, si.p, rng, active)
+        target, intensity = self.bank.lights.sample(light, si.p, rng, active)
         value, lit = light_from(
             self.surface,
             si,

@@ -21,7 +21,7 @@ from appearance.render.paths import (
     opaque_matrix,
     pixel_indices,
 )
-from appearance.render.tracing import LANE_BYTES, Paths, Reach, follow
+from appearance.render.tracing import LANE_BYTES, PathLimits, Paths, follow
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
@@ -127,7 +127,7 @@ class _Plan:
 
     projectors: Sequence[Projector]
     rows: dict[str, range]
-    reach: Reach
+    reach: PathLimits
     dim: tuple[float, ...]
 
 
@@ -146,7 +146,7 @@ def _tiles(
     depth = options.max_depth
     if depth is None:
         depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
-    plan = _Plan(projectors, rows, Reach(depth, options.roulette), (0.0,) * len(projectors))
+    plan = _Plan(projectors, rows, PathLimits(depth, options.roulette), (0.0,) * len(projectors))
     if options.thrift > 0:
         few = index[:: -(-len(index) // _PILOT)]
         films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))

@@ -20,7 +20,7 @@ LANE_BYTES = 512
 
 
 @dataclass(frozen=True)
-class Reach:
+class PathLimits:
     """How far paths go.
 
     `max_depth`: vertices a path may have. `roulette`: throughput (largest channel) below which a
@@ -63,7 +63,7 @@ def follow(
     pixels: Ints,
     spp: int,
     seeds: tuple[int, ...],
-    reach: Reach,
+    reach: PathLimits,
     vertex: Callable[[Any, Paths], None],
     escape: Callable[[Any, Paths], None] | None = None,
 ) -> None:

@@ -83,7 +83,7 @@ def mirror_samples(
     )
     light, pixel = np.nonzero(near)
     middle = _middle(fibres)
-    shines = np.array([lamp.intensity_towards(middle)[:, channel] for lamp in observed.lights])
+    shines = np.array([light.intensity_towards(middle)[:, channel] for light in observed.lights])
     tangent = fibres.tangent[pixel].astype(float)
     intensity = np.maximum(shines[light, pixel], 1e-12)
     value = observed.radiance[light, pixel, channel] * squared[light, pixel] / intensity

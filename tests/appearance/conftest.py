@@ -51,7 +51,7 @@ def camera(position: tuple[float, float, float] = (0.0, -0.5, 0.1), size: int = 
     return Camera.look_at("cam", size, size, position, (0, 0, 0), fov_deg=10)
 
 
-def lamps() -> list[Light]:
+def lights() -> list[Light]:
     """In front, behind, above; of different colours."""
     return [
         Light("front", np.array([0.3, -0.9, 0.3]), np.array([8.0, 8.0, 8.0])),
@@ -62,12 +62,12 @@ def lamps() -> list[Light]:
 
 @pytest.fixture(scope="session")
 def small() -> SimpleNamespace:
-    """`plane`, `ball`, `tuft`, `camera` and `lamps` above, and `no_hair`."""
+    """`plane`, `ball`, `tuft`, `camera` and `lights` above, and `no_hair`."""
     return SimpleNamespace(
         plane=plane,
         ball=ball,
         tuft=tuft,
         camera=camera,
-        lamps=lamps,
+        lights=lights,
         no_hair=Strands.from_list([]),
     )

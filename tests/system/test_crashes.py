@@ -77,7 +77,13 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
     model = Path(stage.get(f"/jobs/{made['job']}")["model"]).name
     stage.until(lambda: stage.get(f"/jobs/{made['job']}")["state"] == "done", 200)
     effort = {"pixels": 60, "spp": 4, "gradient_spp": 2}
-    fit = {"row": "correctives", "shape": [2, 2, 2], "steps": 200, "check_every": 5, "halvings": 99}
+    fit = {
+        "variant": "correctives",
+        "shape": [2, 2, 2],
+        "steps": 200,
+        "check_every": 5,
+        "halvings": 99,
+    }
     asked = {
         "capture": made["id"],
         "model": model,

@@ -12,7 +12,7 @@ from benchmarks.bsdf.integrals import Case
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import reference
-from appearance.bsdf.parameters import Place
+from appearance.bsdf.parameters import StrandHit
 from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import strand_parameters
 from appearance.scene.curves import spline_control_points
@@ -180,7 +180,7 @@ def test_a_volume_is_looked_up_by_strand_and_place_on_it(tuft):
     bsdf = hair(sigma_a=mi.TensorXf(volume), **curves)
     hit = np.flatnonzero(np.array(si.is_valid()))
     assert len(hit) > 300
-    place = Place(bsdf.parameters.strands, si, si.is_valid())
+    place = StrandHit(bsdf.parameters.strands, si, si.is_valid())
     got = np.array(bsdf.parameters.fibre(place).sigma_a)[:, hit].T
     strand, along = (a[hit] for a in true_place(strands, si))
     assert (np.array(place.strand)[hit] == strand).all()
@@ -211,7 +211,7 @@ def test_lookups_are_exact_among_millions_of_segments():
     si.p = mi.Point3f(np.stack([segment + inside, strand, np.full(5000, 0.01)]).astype(np.float32))
     table = rng.uniform(0, 3, (strands, 3)).astype(np.float32)
     bsdf = hair(sigma_a=mi.TensorXf(table), **curves)
-    place = Place(bsdf.parameters.strands, si, mi.Bool(True))
+    place = StrandHit(bsdf.parameters.strands, si, mi.Bool(True))
     got = np.array(bsdf.parameters.fibre(place).sigma_a).T
     assert (got == table[strand]).all()
     assert np.array(place.along) == pytest.approx((segment + inside) / each, abs=1e-6)
@@ -221,7 +221,7 @@ def test_lookups_are_exact_among_millions_of_segments():
         si.sh_frame = mi.Frame3f(
             mi.Vector3f(-s, -c, 0), mi.Vector3f(c, -s, 0), mi.Vector3f(0, 0, 1)
         )
-        frame = bsdf.parameters.frame(Place(bsdf.parameters.strands, si, mi.Bool(True)))
+        frame = bsdf.parameters.frame(StrandHit(bsdf.parameters.strands, si, mi.Bool(True)))
         world = mi.Vector3f(0.36, 0.48, 0.8)
         assert np.array(frame.enter(si.to_local(world)))[:, 0] == pytest.approx([-0.48, 0.36, 0.8])
         assert np.array(frame.leave(frame.enter(world)))[:, 0] == pytest.approx([0.36, 0.48, 0.8])
@@ -255,7 +255,7 @@ def test_a_table_that_is_the_same_everywhere_costs_no_lookup(tuft):
     _, curves, si, _ = tuft
     same = mi.TensorXf(np.full((5, 4, 3, 3), 0.7, np.float32))
     bsdf = hair(sigma_a=same, rotation=mi.TensorXf(np.zeros((5, 4, 3, 2), np.float32)), **curves)
-    place = Place(bsdf.parameters.strands, si, si.is_valid())
+    place = StrandHit(bsdf.parameters.strands, si, si.is_valid())
     assert np.array(bsdf.parameters.fibre(place).sigma_a)[:, 0] == pytest.approx([0.7] * 3)
     assert bsdf.parameters.frame(place) == ShadingFrame(None, None)
     assert not {"strand", "along", "normal"} & set(vars(place))
@@ -264,7 +264,9 @@ def test_a_table_that_is_the_same_everywhere_costs_no_lookup(tuft):
     changed[2] = 1.0
     parameters["sigma_a"] = mi.TensorXf(changed)
     parameters.update()
-    got = np.array(bsdf.parameters.fibre(Place(bsdf.parameters.strands, si, si.is_valid())).sigma_a)
+    got = np.array(
+        bsdf.parameters.fibre(StrandHit(bsdf.parameters.strands, si, si.is_valid())).sigma_a
+    )
     assert len(np.unique(got.round(4))) > 2
     parameters["sigma_a"] = same
     parameters.update()

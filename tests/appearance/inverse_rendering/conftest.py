@@ -1,4 +1,4 @@
-"""A tuft of known hair seen by two small cameras under eight lamps."""
+"""A tuft of known hair seen by two small cameras under eight lights."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.problem import Effort, Problem
+from appearance.inverse_rendering.options import Effort
+from appearance.inverse_rendering.problem import Problem
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
@@ -57,9 +58,9 @@ def tufted(small):
 
     def problem(truth=None, views=2, lights=None, spp=128):
         maps = HairMaps.of(TRUTH) if truth is None else truth
-        lamps = dome(8) if lights is None else lights
-        shown = mapped.painted(maps)
-        seen = [observed(shown, c, lamps, spp) for c in cameras(views)]
+        lights = dome(8) if lights is None else lights
+        shown = mapped.with_maps(maps)
+        seen = [observed(shown, c, lights, spp) for c in cameras(views)]
         return Problem(mapped, seen, exposure(seen), SKIN)
 
     return SimpleNamespace(

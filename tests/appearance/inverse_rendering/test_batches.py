@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from appearance.inverse_rendering.batches import Batch, Pairs, Seen
+from appearance.inverse_rendering.batches import Batch, Comparison, Pairs
 from appearance.observations import Observed
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -40,7 +40,7 @@ def test_black_saturated_and_grazing_frames_are_never_drawn():
 def test_the_weighted_sum_over_batches_is_the_mean_over_pairs(images):
     pairs = Pairs([view([1] * 6), view([1] * 6)], scale=1.0)
     loss = np.arange(12.0).reshape(2, 6)
-    pairs.taught = (loss - 2) ** 2
+    pairs.squared_error = (loss - 2) ** 2
     rng = np.random.default_rng(1)
     drawn = [pairs.draw(images, rng) for _ in range(4000)]
     mean = np.mean([(b.share * loss[b.view, b.lights]).sum() for b in drawn])
@@ -58,10 +58,10 @@ def test_pairs_with_larger_errors_are_drawn_more_often_and_noise_counts_for_noth
         rendered = captured.copy()
         rendered[1] += 0.5  # wrong everywhere
         rendered[2] += rng.normal(scale=0.5, size=(PIXELS, 3))  # right, but noisy
-        pairs.learn(batch, Seen(rendered, captured, captured, valid))
+        pairs.update(batch, Comparison(rendered, captured, captured, valid))
     chance = pairs.chance()[0]
     assert chance[1] > 2 * max(chance[0], chance[2], chance[3])
     assert chance.sum() == pytest.approx(1)
     even = Pairs([view([1] * 4)], scale=1.0, weighted=False)
-    even.taught = pairs.taught
+    even.squared_error = pairs.squared_error
     np.testing.assert_allclose(even.chance(), 0.25)

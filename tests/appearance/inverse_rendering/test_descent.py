@@ -1,4 +1,4 @@
-"""Cells that are told something move; cells that see noise alone hardly do."""
+"""Cells with a gradient move; cells that see noise alone hardly do."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_cells_move_by_what_is_more_than_noise():
     adam = Adam()
     for _ in range(30):
         adam.step(raw, {"sigma_a": mean + rng.normal(size=400)}, 1.0)
-    told, noise = np.abs(raw["sigma_a"][:200]), np.abs(raw["sigma_a"][200:])
+    moved, noise = np.abs(raw["sigma_a"][:200]), np.abs(raw["sigma_a"][200:])
     assert (raw["sigma_a"][:200] < 0).all()
-    assert told.mean() > 0.2 * 30 * STEP["sigma_a"]
-    assert noise.mean() < 0.2 * told.mean()
+    assert moved.mean() > 0.2 * 30 * STEP["sigma_a"]
+    assert noise.mean() < 0.2 * moved.mean()

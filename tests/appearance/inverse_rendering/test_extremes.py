@@ -9,17 +9,22 @@ import pytest
 
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Batch
-from appearance.inverse_rendering.loop import Stage1Options, run
-from appearance.inverse_rendering.problem import Effort, Problem
-from appearance.inverse_rendering.unknowns import Lamps
+from appearance.inverse_rendering.loop import run
+from appearance.inverse_rendering.options import Effort, InverseRenderingOptions
+from appearance.inverse_rendering.problem import Objective, Problem
+from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.scene.hair_appearance import HairAppearance
 
 START = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
 FEW = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=5)
-OPTIONS = Stage1Options(row="original", steps=4, check_every=2, watched_views=1, effort=FEW)
+OPTIONS = InverseRenderingOptions(
+    variant="original", steps=4, check_every=2, validation_views=1, effort=FEW
+)
 
 
-def check(problem: Problem, start: HairMaps, options: Stage1Options = OPTIONS) -> HairMaps:
+def check(
+    problem: Problem, start: HairMaps, options: InverseRenderingOptions = OPTIONS
+) -> HairMaps:
     found = run(problem, start, options=options)
     assert np.isfinite([found.error, found.start_error]).all()
     assert found.error <= found.start_error
@@ -47,7 +52,7 @@ def test_a_roughness_that_starts_at_either_end(plain, beta_m):
 
 def test_one_light_and_one_view(tufted):
     lone = tufted.problem(views=1, lights=tufted.dome(8)[1:2])
-    check(lone, HairMaps.of(START), replace(OPTIONS, row="lights", shape=(2, 2, 2)))
+    check(lone, HairMaps.of(START), replace(OPTIONS, variant="lights", shape=(2, 2, 2)))
 
 
 def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain):
@@ -65,32 +70,26 @@ def test_a_cell_that_no_ray_meets_stays_at_its_prior(tufted, plain):
     mapped = type(tufted.mapped).of(tufted.scene, tufted.strands, uv)
     problem = Problem(mapped, plain.views, plain.scale, plain.skin)
     start = HairMaps.of(START, (2, 2, 1))
-    options = replace(OPTIONS, row="correctives", shape=(2, 2, 1), steps=6)
+    options = replace(OPTIONS, variant="correctives", shape=(2, 2, 1), steps=6)
     found = run(problem, start, options=options).maps
     np.testing.assert_allclose(found.sigma_a[:, 1], START.sigma_a[0], rtol=1e-3)
     assert (np.abs(found.rotation[:, 1]) < 1e-6).all()
 
 
 def test_gradients_at_no_rotation_are_finite_and_not_all_zero(plain):
-    raw = plain.raw_of(HairMaps.of(START, (2, 2, 2)), Lamps.calibrated(8))
-    slope = plain.slope(
-        raw,
-        np.ones(8),
-        ("rotation", "position", "turn", "profile"),
-        Batch(0, np.arange(8), np.ones(8) / 8),
-        FEW,
-        (1, 2),
-        np.random.default_rng(0),
-        lambdas=(0.5, 10.0),
-    )
-    assert all(np.isfinite(g).all() for g in slope.gradient.values())
-    assert np.abs(slope.gradient["rotation"]).max() > 0
-    assert np.abs(slope.gradient["position"]).max() > 0
+    raw = plain.encode(HairMaps.of(START, (2, 2, 2)), LightDeviations.calibrated(8))
+    batch = Batch(0, np.arange(8), np.ones(8) / 8)
+    patch = plain.patch(batch, FEW.pixels, np.random.default_rng(0))
+    objective = Objective(("rotation", "position", "turn", "profile"), smooth=True)
+    gradient, _ = plain.gradient(raw, np.ones(8), patch, objective, FEW, (1, 2))
+    assert all(np.isfinite(g).all() for g in gradient.values())
+    assert np.abs(gradient["rotation"]).max() > 0
+    assert np.abs(gradient["position"]).max() > 0
 
 
-def test_lamps_at_a_third_of_the_distance(tufted):
+def test_lights_at_a_third_of_the_distance(tufted):
     near = tufted.problem(views=1, lights=tufted.dome(8, 0.33))
-    check(near, HairMaps.of(START), replace(OPTIONS, row="lights", shape=(2, 2, 2)))
+    check(near, HairMaps.of(START), replace(OPTIONS, variant="lights", shape=(2, 2, 2)))
 
 
 def test_a_constant_image_is_fitted_as_far_as_it_goes(plain):

@@ -9,9 +9,10 @@ import pytest
 
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Pairs
-from appearance.inverse_rendering.global_parameters import solved
-from appearance.inverse_rendering.problem import Effort, Problem
-from appearance.inverse_rendering.unknowns import Lamps, maps_of
+from appearance.inverse_rendering.global_parameters import Evidence, solve_global_parameters
+from appearance.inverse_rendering.options import Effort
+from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.unknowns import LightDeviations, decode
 from appearance.scene.hair_appearance import HairAppearance
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
@@ -19,10 +20,12 @@ EFFORT = Effort(pixels=100, spp=64, max_depth=6)
 
 
 def solve(problem: Problem, hair: HairAppearance, names=COLOUR, effort: Effort = EFFORT):
-    raw = problem.raw_of(HairMaps.of(hair), Lamps.calibrated(len(problem.lights)))
+    raw = problem.encode(HairMaps.of(hair), LightDeviations.calibrated(len(problem.lights)))
     pairs = problem.spread(Pairs(problem.views, problem.scale), 2, 8)
-    found, gain = solved(problem, raw, np.ones(len(problem.lights)), names, pairs, effort, seed=3)
-    return raw, found, maps_of(found), gain
+    found, gain = solve_global_parameters(
+        problem, raw, np.ones(len(problem.lights)), names, Evidence(pairs, effort, 3)
+    )
+    return raw, found, decode(found), gain
 
 
 @pytest.mark.parametrize(
@@ -80,9 +83,11 @@ def test_the_same_seed_gives_the_same_numbers(plain, tufted):
 def test_what_no_pixel_tells_stays(plain, tufted):
     views = [replace(o, valid=np.zeros_like(o.valid)) for o in plain.views]
     problem = Problem(plain.mapped, views, plain.scale, plain.skin)
-    raw = problem.raw_of(HairMaps.of(tufted.truth), Lamps.calibrated(8))
+    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
     pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
-    found, gain = solved(problem, raw, np.ones(8), COLOUR, pairs, replace(EFFORT, spp=8))
+    found, gain = solve_global_parameters(
+        problem, raw, np.ones(8), COLOUR, Evidence(pairs, replace(EFFORT, spp=8))
+    )
     for name, value in raw.items():
         np.testing.assert_allclose(found[name], value, rtol=1e-12)
     assert (gain == 1).all()
@@ -91,7 +96,9 @@ def test_what_no_pixel_tells_stays(plain, tufted):
 def test_a_frame_that_is_not_a_number_changes_nothing(plain, tufted):
     views = [replace(o, radiance=np.full_like(o.radiance, np.nan)) for o in plain.views]
     problem = Problem(plain.mapped, views, plain.scale, plain.skin)
-    raw = problem.raw_of(HairMaps.of(tufted.truth), Lamps.calibrated(8))
+    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
     pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
-    found, _ = solved(problem, raw, np.ones(8), COLOUR, pairs, replace(EFFORT, spp=8))
+    found, _ = solve_global_parameters(
+        problem, raw, np.ones(8), COLOUR, Evidence(pairs, replace(EFFORT, spp=8))
+    )
     assert all((found[name] == raw[name]).all() for name in raw)

@@ -27,7 +27,7 @@ REQUEST = parse_options(
         "judged_spp": 4,
         "max_depth": 5,
         "fit": {
-            "row": "correctives",
+            "variant": "correctives",
             "steps": 12,
             "shape": [2, 2, 2],
             "check_every": 5,
@@ -121,7 +121,7 @@ def test_the_head_that_was_laid_under_points_casts_its_shadow(made, small, tmp_p
     below = [x.name for x in capture.rig.lights if x.position[2] < -0.2]
     board = small.plane()
     board = replace(board, vertices=board.vertices + np.array([0, 0, -0.035]))
-    request = replace(REQUEST, fit=replace(REQUEST.fit, row="original"))
+    request = replace(REQUEST, fit=replace(REQUEST.fit, variant="original"))
     errors = []
     for head in (None, board):
         other = Model(tmp_path / str(head is None))

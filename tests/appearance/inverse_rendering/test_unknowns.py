@@ -9,7 +9,7 @@ import pytest
 
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import losses
-from appearance.inverse_rendering.unknowns import Lamps, hair_values, maps_of, raw_of
+from appearance.inverse_rendering.unknowns import LightDeviations, decode, encode, hair_values
 from appearance.metrics.scores import srgb
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
@@ -35,8 +35,8 @@ def maps(sigma_a=(0.1, 0.2, 0.4), beta=0.3, shape=(3, 2, 2)):
 @pytest.mark.parametrize("beta", [0.02, 0.3, 0.9])
 def test_black_white_sharp_and_rough_hair_survive_the_way_there_and_back(sigma_a, beta):
     wanted = maps(sigma_a, beta)
-    raw = raw_of(wanted, Lamps.calibrated(2), NONE)
-    found = maps_of(raw)
+    raw = encode(wanted, LightDeviations.calibrated(2), NONE)
+    found = decode(raw)
     np.testing.assert_allclose(found.sigma_a, wanted.sigma_a, rtol=1e-3)
     np.testing.assert_allclose(found.rotation, wanted.rotation, atol=1e-9)
     assert (found.beta_m, found.eta) == (pytest.approx(beta), pytest.approx(1.55))
@@ -46,14 +46,16 @@ def test_black_white_sharp_and_rough_hair_survive_the_way_there_and_back(sigma_a
 @pytest.mark.parametrize("sigma_a", [(8.0, 12.0, 20.0), (1e-4, 5e-4, 2e-3)])
 def test_derivatives_are_finite_also_at_no_rotation_and_at_both_ends_of_absorption(sigma_a):
     ensure_backend()
-    raw = raw_of(
-        HairMaps.of(HairAppearance(sigma_a, 0.02, 0.9), (3, 2, 2)), Lamps.calibrated(2), NONE
+    raw = encode(
+        HairMaps.of(HairAppearance(sigma_a, 0.02, 0.9), (3, 2, 2)),
+        LightDeviations.calibrated(2),
+        NONE,
     )
     leaves = {k: mi.TensorXf(v.astype(np.float32)) for k, v in raw.items()}
     for name in ("sigma_a", "rotation", "beta_m", "beta_n", "eta", "tilt_deg"):
         dr.enable_grad(leaves[name])
     values = hair_values(leaves)
-    total = losses.smoothness(values, 0.5, 10.0)
+    total = losses.smoothness(values)
     for value in values.values():
         total = total + dr.sum(value, axis=None)
     np.testing.assert_allclose(np.array(values["hair.sigma_a"])[0, 0, 0], sigma_a, rtol=2e-3)
@@ -71,13 +73,13 @@ def test_smoothness_is_a_mean_over_layers_cells_and_channels():
         table = mi.TensorXf(sigma_a)
         dr.enable_grad(table)
         values = {"hair.sigma_a": table, "hair.rotation": mi.TensorXf(np.zeros((3, 1, 1, 2)))}
-        return float(np.array(losses.smoothness(values, 0.5, 10.0)).ravel()[0])
+        return float(np.array(losses.smoothness(values)).ravel()[0])
 
     assert value(1) == pytest.approx(0.5 * 0.2, rel=0.01)
     assert value(8) == pytest.approx(value(1))
 
 
-def test_squares_have_no_noise_of_two_renderings_in_them_and_l1_has_a_sign():
+def test_squares_have_no_noise_of_two_renderings_in_them():
     rng = np.random.default_rng(1)
     level = np.full((2, 4000, 3), 0.4)
     valid = np.ones((2, 4000), bool)
@@ -87,9 +89,7 @@ def test_squares_have_no_noise_of_two_renderings_in_them_and_l1_has_a_sign():
         expected, rel=0.2
     )
     valid[1] = False
-    slope = losses.slope(one, level, valid, "l1", 1.0)
-    assert set(np.unique(slope * valid.sum() * 3)) <= {-1.0, 0.0, 1.0}
-    assert (slope[1] == 0).all()
+    assert (losses.gradient(one, level, valid, 1.0)[1] == 0).all()
     assert losses.squares(one, other, level, np.zeros_like(valid)) == 0.0
 
 
@@ -100,18 +100,16 @@ def test_the_loss_is_of_differences_as_they_are_displayed_and_proportional_to_th
     shown = srgb(level + step) - srgb(level)
     squares = losses.squares(step, step, losses.weights(level), valid)
     assert squares == pytest.approx((shown**2).mean(), rel=0.4)
-    once, twice = (
-        losses.slope(k * step, level, valid, "squares", k * k * 0.01) for k in (1.0, 2.0)
-    )
+    once, twice = (losses.gradient(k * step, level, valid, k * k * 0.01) for k in (1.0, 2.0))
     np.testing.assert_allclose(once, twice)
 
 
-def test_lamps_move_turn_and_brighten_about_their_calibration():
+def test_lights_move_turn_and_brighten_about_their_calibration():
     aimed = Light("a", (0, 0, 1), np.ones(3), orientation=facing((0, 0, -1)), size=(0.1, 0.1))
-    lamps = Lamps(
+    moved = LightDeviations(
         np.array([[0.01, 0, 0]]), np.array([[np.pi / 2, 0, 0]]), np.array([1.1]), np.array([2.0])
     )
-    (found,) = lamps.of([aimed])
+    (found,) = moved.applied([aimed])
     np.testing.assert_allclose(found.position, (0.01, 0, 1))
     np.testing.assert_allclose(found.intensity, 2.2)
     assert found.orientation is not None
@@ -147,9 +145,9 @@ def test_noisy_pixels_count_less_and_all_together_as_much():
     weight[:, 400:] = 0  # not valid
     squares = rng.exponential(size=weight.shape)
     squares[:, 100:110] *= 1e4
-    quiet = losses.quieted(weight, squares)
+    quiet = losses.noise_weighted(weight, squares)
     assert quiet.sum() == pytest.approx(weight.sum())
     assert quiet[:, 102:108].max() < 0.01 * np.median(quiet[:, :400])
     assert (quiet[:, 400:] == 0).all()
     for nothing in (np.zeros_like(weight), weight):
-        assert (losses.quieted(nothing, np.zeros_like(weight)) == nothing).all()
+        assert (losses.noise_weighted(nothing, np.zeros_like(weight)) == nothing).all()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from appearance.bsdf.maps import HairMaps
-from appearance.bsdf.parameters import Place
+from appearance.bsdf.parameters import StrandHit
 from appearance.metrics.scores import Exposure
 from appearance.model.edit import recoloured, wisp_of
 from appearance.model.export import at_points, export_maps, export_mitsuba, export_usd
@@ -72,9 +72,9 @@ def test_a_brush_colours_its_wisp_and_nothing_else(fitted):
 
 def test_dyed_and_smoother_hair_is_so_in_every_light(fitted, small):
     darker = recoloured(fitted.maps, np.ones((1, 1)), (5.0, 5.0, 5.0))
-    lamps = small.lamps()[:1]
+    lights = small.lights()[:1]
     pictures = [
-        render_olat(fitted.with_maps(m).scene(), CAMERA, lamps, spp=16, max_depth=4)
+        render_olat(fitted.with_maps(m).scene(), CAMERA, lights, spp=16, max_depth=4)
         for m in (fitted.maps, darker)
     ]
     assert pictures[1].mean() < 0.7 * pictures[0].mean()
@@ -88,9 +88,9 @@ def test_maps_stay_on_strands_that_move_and_other_strands_are_refused(fitted, sm
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     moved = fitted.strands.transformed(turn, (0, 0, 0))
     camera = Camera.look_at("m", 16, 16, turn @ (0, -0.5, 0.1), (0, 0, 0), 12)
-    lamp = replace(small.lamps()[0], position=turn @ small.lamps()[0].position)
-    still = render_olat(fitted.scene(), CAMERA, small.lamps()[:1], spp=64, max_depth=3)
-    turned = render_olat(fitted.scene(strands=moved), camera, [lamp], spp=64, max_depth=3)
+    light = replace(small.lights()[0], position=turn @ small.lights()[0].position)
+    still = render_olat(fitted.scene(), CAMERA, small.lights()[:1], spp=64, max_depth=3)
+    turned = render_olat(fitted.scene(strands=moved), camera, [light], spp=64, max_depth=3)
     np.testing.assert_allclose(turned.mean((1, 2)), still.mean((1, 2)), rtol=0.05)
     with pytest.raises(ValueError, match="same numbers of points"):
         fitted.scene(strands=small.tuft(5))
@@ -137,7 +137,7 @@ def test_values_at_points_are_those_that_the_bsdf_looks_up(fitted):
     si = dr.zeros(mi.SurfaceInteraction3f, segments)
     si.prim_index = dr.arange(mi.UInt32, segments)
     si.p = mi.Point3f(100 * strands.points[strands.segment_starts].T)
-    place = Place(mapped_of(fitted, scene), si, mi.Bool(True))
+    place = StrandHit(mapped_of(fitted, scene), si, mi.Bool(True))
     looked_up = np.array(place.cell(table, mi.Vector3f)).T
     expected, _ = at_points(fitted.maps, strands, fitted.root_uv)
     off = np.abs(looked_up - expected[strands.segment_starts]).max(axis=1)

@@ -21,9 +21,9 @@ from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
-NO_EDGES = ("lamps.position", "lamps.turn")
+NO_EDGES = ("lights.position", "lights.turn")
 """Parameters that move shadow edges too, or the kinks of a profile."""
-STEPS = {"lamps.intensity": 0.1, "hair.scale_tilt": 0.05, "lamps.position": 2e-3}
+STEPS = {"lights.intensity": 0.1, "hair.scale_tilt": 0.05, "lights.position": 2e-3}
 
 
 def numbers(value):
@@ -114,7 +114,7 @@ def tufted(small):
 def test_gradients_of_materials_are_differences_of_the_same_paths(tufted, small, kind):
     """All paths up to five vertices, to what float32 leaves of a difference."""
     scene, camera = tufted
-    lights = small.lamps()[:2]
+    lights = small.lights()[:2]
     guide, lit = KINDS[kind](scene), KINDS[kind](scene)
     op = DifferentiableOlat(
         lit,
@@ -127,8 +127,8 @@ def test_gradients_of_materials_are_differences_of_the_same_paths(tufted, small,
         guide=guide,
     )
     objective = Objective(op)
-    names = [k for k in op.parameters() if not k.startswith("lamps") and "melanin" not in k]
-    found = objective.gradient(*names, "lamps.intensity")
+    names = [k for k in op.parameters() if not k.startswith("lights") and "melanin" not in k]
+    found = objective.gradient(*names, "lights.intensity")
     assert {"skin"} < set(names)
     for name, gradient in found.items():
         assert np.isfinite(gradient).all()
@@ -153,16 +153,16 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_where_nothing_casts_a_shadow_lamps_agree_with_differences(small, shape):
-    """A convex body and its lamp, far from the terminator: position, turn and intensity."""
+def test_where_nothing_casts_a_shadow_lights_agree_with_differences(small, shape):
+    """A convex body and its light, far from the terminator: position, turn and intensity."""
     scene = build_scene(small.no_hair, small.plane(), hair=HAIR, skin=(0.5, 0.4, 0.3))
     camera = small.camera((0.0, -0.3, 0.6), size=8)
     light = Light("l", np.array([0.2, -0.1, 0.4]), np.array([8.0, 4.0, 2.0]), **SHAPES[shape])
     op = DifferentiableOlat(scene, camera, [light], np.arange(64), spp=64, max_depth=2)
     objective = Objective(op)
-    found = objective.gradient("lamps.position", "lamps.turn", "lamps.intensity")
+    found = objective.gradient("lights.position", "lights.turn", "lights.intensity")
     for name, gradient in found.items():
-        if name == "lamps.turn" and "orientation" not in SHAPES[shape]:
+        if name == "lights.turn" and "orientation" not in SHAPES[shape]:
             assert not gradient.any()
             continue
         for index in range(3):
@@ -175,10 +175,10 @@ def test_where_nothing_casts_a_shadow_lamps_agree_with_differences(small, shape)
 def test_a_shadow_edge_that_moves_is_left_out(small):
     """A wall's shadow on the floor: the light that the floor gains as the edge recedes is missing.
 
-    The whole of it is known: the edge moves by -(edge height)/(lamp height - edge height) of what
-    the lamp moves, and the gradient differs from the truth by the radiance at the edge times that.
+    The whole of it is known: the edge moves by -(edge height)/(light height - edge height) of what
+    the light moves, and the gradient differs from the truth by the radiance at the edge times that.
     """
-    lamp, edge = 1.0, 0.25
+    height, edge = 1.0, 0.25
     floor = small.plane(0.6).vertices
     wall = np.array([[0, -2, edge], [2, -2, edge], [2, 2, edge], [0, 2, edge]])
     mesh = Mesh(
@@ -187,15 +187,15 @@ def test_a_shadow_edge_that_moves_is_left_out(small):
     scene = build_scene(small.no_hair, mesh, hair=HAIR, skin=(0.5, 0.5, 0.5))
     # looks under the wall, at the place where its edge's shadow falls
     camera = Camera.look_at("c", 24, 24, (-0.1, 0.001, 0.2), (0, 0, 0), 20)
-    light = Light("l", np.array([0.0, 0.0, lamp]), np.full(3, 8.0))
+    light = Light("l", np.array([0.0, 0.0, height]), np.full(3, 8.0))
     op = DifferentiableOlat(scene, camera, [light], np.arange(576), spp=256, max_depth=1)
     objective = Objective(op)
     objective.weight = np.full_like(objective.weight, 1 / 576)
     objective.tensor = type(objective.tensor)(objective.weight.astype(np.float32))
-    gradient = objective.gradient("lamps.position")["lamps.position"]
+    gradient = objective.gradient("lights.position")["lights.position"]
     step = 0.02
-    base = op.parameters()["lamps.position"]
-    up, down = (objective.value(**{"lamps.position": changed(base, 0, s)}) for s in (step, -step))
+    base = op.parameters()["lights.position"]
+    up, down = (objective.value(**{"lights.position": changed(base, 0, s)}) for s in (step, -step))
     difference = (up - down) / (2 * step)
     # at the edge: radiance albedo/pi I/h², three channels; pixels per metre by projection
     at = [camera.project([[s * 1e-3, y, 0] for y in (-1e-3, 1e-3)])[0] for s in (-1, 1)]
@@ -203,16 +203,16 @@ def test_a_shadow_edge_that_moves_is_left_out(small):
     row = [a[:, 1].mean() for a in at]
     speed = np.hypot(column[1] - column[0], row[1] - row[0]) / 2e-3  # pixels a metre along x
     length = 24.0  # the shadow's edge crosses the whole image
-    missing = -3 * (0.5 / np.pi * 8 / lamp**2) * speed * length / 576 * edge / (lamp - edge)
+    missing = -3 * (0.5 / np.pi * 8 / height**2) * speed * length / 576 * edge / (height - edge)
     assert abs(missing) > 5 * abs(gradient[0])
     assert difference - gradient[0] == pytest.approx(missing, rel=0.1)
-    assert gradient[2] == pytest.approx(objective.difference("lamps.position", 2), rel=0.02)
+    assert gradient[2] == pytest.approx(objective.difference("lights.position", 2), rel=0.02)
 
 
 def test_the_picture_is_that_of_the_olat_renderer(tufted, small):
     scene, camera = tufted
     pixels = covered_pixels(scene, camera)
-    lights = small.lamps()
+    lights = small.lights()
     options = {"spp": 2048, "max_depth": 6}
     ours = numbers(DifferentiableOlat(scene, camera, lights, pixels, **options).radiance({}))
     olat = render_olat(scene, camera, lights, pixels=pixels, thrift=0, **options)
@@ -222,7 +222,7 @@ def test_the_picture_is_that_of_the_olat_renderer(tufted, small):
 
 def test_seeds_decide_the_picture_and_the_paths_of_the_gradient(tufted, small):
     scene, camera = tufted
-    op = DifferentiableOlat(scene, camera, small.lamps(), [66, 67, 78], spp=4, max_depth=4)
+    op = DifferentiableOlat(scene, camera, small.lights(), [66, 67, 78], spp=4, max_depth=4)
     a, b, c = (numbers(op.radiance({}, seed=s)).tobytes() for s in (1, 1, 2))
     assert a == b != c
     found = [Objective(op, seed=s).gradient("skin")["skin"] for s in (1, 1, 2)]
@@ -233,7 +233,7 @@ def test_seeds_decide_the_picture_and_the_paths_of_the_gradient(tufted, small):
 def test_a_loss_flows_on_through_other_operations(tufted, small):
     """Parameters of parameters, and a loss that is not linear; nothing else gets a gradient."""
     scene, camera = tufted
-    op = DifferentiableOlat(scene, camera, small.lamps()[:1], [66, 67, 78], spp=16, max_depth=3)
+    op = DifferentiableOlat(scene, camera, small.lights()[:1], [66, 67, 78], spp=16, max_depth=3)
     log_sigma = mi.Color3f(np.log([0.1, 0.2, 0.45]))
     dr.enable_grad(log_sigma)
     picture = op.radiance({"hair.sigma_a": dr.exp(log_sigma)}, seed=1, gradient_seed=1)
@@ -255,7 +255,7 @@ def test_memory_does_not_grow_with_paths_samples_or_bounces(tufted, small):
     scene, camera = tufted
 
     def widest(**how):
-        op = DifferentiableOlat(scene, camera, small.lamps(), [66, 67, 78], **how)
+        op = DifferentiableOlat(scene, camera, small.lights(), [66, 67, 78], **how)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             Objective(op).gradient("hair.longitudinal_roughness", "skin")
@@ -270,8 +270,8 @@ def test_what_cannot_be_is_refused(tufted, small):
     with pytest.raises(ValueError, match="lights must not be empty"):
         DifferentiableOlat(scene, camera, [], [0])
     with pytest.raises(ValueError, match="guide must have a hair BSDF of its own"):
-        DifferentiableOlat(scene, camera, small.lamps(), [0], guide=scene)
-    op = DifferentiableOlat(scene, camera, small.lamps(), [0])
+        DifferentiableOlat(scene, camera, small.lights(), [0], guide=scene)
+    op = DifferentiableOlat(scene, camera, small.lights(), [0])
     with pytest.raises(ValueError, match=r"unknown parameters \['hair.beta'\]"):
         op.radiance({"hair.beta": 1.0})
 
@@ -281,7 +281,7 @@ def test_gradients_are_those_of_the_truth_in_the_mean(tufted, small):
     """Free paths, finite differences of whole renderings: within their standard errors."""
     scene, camera = tufted
     pixels = covered_pixels(scene, camera)
-    op = DifferentiableOlat(scene, camera, small.lamps(), pixels, spp=2048, max_depth=4)
+    op = DifferentiableOlat(scene, camera, small.lights(), pixels, spp=2048, max_depth=4)
     names = ["hair.longitudinal_roughness", "hair.sigma_a", "hair.eta"]
     STEPS.update(dict.fromkeys(names, 0.02))
     runs = [Objective(op, seed=s) for s in range(8)]

@@ -55,7 +55,7 @@ def test_direct_light_is_the_unbiased_renderers(small):
     np.testing.assert_array_equal(plain, smooth)
 
 
-def test_lamps_at_different_distances_keep_their_share(blond):
+def test_lights_at_different_distances_keep_their_share(blond):
     scene, camera, pixels = blond
     near = dome()
     far = [Light(x.name, 1.5 * x.position, 1.5**2 * x.intensity) for x in near[:6]] + near[6:]

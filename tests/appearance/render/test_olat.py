@@ -20,8 +20,8 @@ HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 
 @pytest.fixture(scope="module")
 def tufted(small):
-    """A tuft of hair on a plane, a camera, and lamps all around."""
-    return build_scene(small.tuft(), small.plane(), hair=HAIR), small.camera(), small.lamps()
+    """A tuft of hair on a plane, a camera, and lights all around."""
+    return build_scene(small.tuft(), small.plane(), hair=HAIR), small.camera(), small.lights()
 
 
 def test_lambertian_radiance_is_albedo_over_pi_times_irradiance(small):
@@ -123,7 +123,7 @@ def test_a_camera_that_sees_nothing_gets_black_images(tufted):
 
 
 def test_lights_superpose(tufted):
-    """Two lamps at one place are one lamp of their sum, path by path."""
+    """Two lights at one place are one light of their sum, path by path."""
     scene, camera, lights = tufted
     here = lights[0].position
     parts = [Light("a", here, np.array([8.0, 1.0, 0.0])), Light("b", here, np.array([1, 2, 3.0]))]
@@ -152,14 +152,14 @@ def test_same_seed_same_bytes(tufted):
 
 
 def test_a_moved_subject_is_a_moved_stage(small):
-    """Turning subject, camera and lamps together changes nothing but the noise's seed."""
+    """Turning subject, camera and lights together changes nothing but the noise's seed."""
     angle = 0.7
     turn = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
     )
     shift = np.array([0.01, -0.02, 0.03])
     strands, floor = small.tuft(), small.plane()
-    camera, lights = small.camera(), small.lamps()
+    camera, lights = small.camera(), small.lights()
     moved = build_scene(strands.transformed(turn, shift), floor.transformed(turn, shift), hair=HAIR)
     still = build_scene(strands, floor, hair=HAIR)
     a = render_olat(moved, camera, lights, spp=64, max_depth=2).mean((1, 2))

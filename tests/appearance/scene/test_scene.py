@@ -59,7 +59,7 @@ def test_only_unevenly_spaced_strands_are_resampled():
 
 
 def test_empty_scenes_render(small):
-    camera, lights = small.camera(size=8), small.lamps()
+    camera, lights = small.camera(size=8), small.lights()
     nothing = build_scene(small.no_hair, None, hair=HAIR)
     assert not render_olat(nothing, camera, lights, spp=1).any()
     assert not coverage(nothing, camera)["hair"].any()
@@ -85,7 +85,7 @@ def test_coverage_of_a_ball_is_its_disc(small):
 
 
 def test_other_materials_share_the_geometry(small):
-    camera, lights = small.camera(), small.lamps()[:1]
+    camera, lights = small.camera(), small.lights()[:1]
     scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
     dark = scene.with_hair(HairAppearance((3.0, 3.0, 3.0), 0.3, 0.3))
     painted = scene.with_hair(DiffuseHair((0.5, 0.25, 0.0)))

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.loop import Stage1Options, run
-from appearance.inverse_rendering.problem import Effort, Problem
+from appearance.inverse_rendering.loop import Monitor, run
+from appearance.inverse_rendering.options import Effort, InverseRenderingOptions
+from appearance.inverse_rendering.problem import Problem
 from appearance.observations import Observed
 from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
 from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
@@ -29,7 +30,7 @@ from benchmarks.subjects import Subject, simulated
 from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, silent
 
-OPTIONS = Stage1Options(
+OPTIONS = InverseRenderingOptions(
     steps=30,
     check_every=30,
     shape=(6, 24, 24),
@@ -52,7 +53,7 @@ def run_bench(
     subject: Subject,
     *,
     seeds: int = 1,
-    options: Stage1Options = OPTIONS,
+    options: InverseRenderingOptions = OPTIONS,
     rig: Rig = STAGE,
     seed: int = 0,
     progress: Progress = silent,
@@ -97,7 +98,7 @@ def _write(out: Path, result: dict[str, Any]) -> None:
 def recovery(
     captured: Captured,
     rows: dict[str, dict[str, Any]],
-    options: Stage1Options,
+    options: InverseRenderingOptions,
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, dict[str, dict[str, Any]]]:
@@ -149,7 +150,7 @@ def recovery(
 
 
 def from_afar(
-    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+    captured: Captured, options: InverseRenderingOptions, progress: Progress = silent, seed: int = 0
 ) -> list[dict[str, Any]]:
     """What the variant "original" finds of one colour from `STARTS`, and in what time."""
     true, out = captured.truth.mean(), []
@@ -160,7 +161,7 @@ def from_afar(
         progress(f"from β_M {beta_m:g}, β_N {beta_n:g}", 0.0)
         begun = time.process_time()
         found = run(
-            problem, HairMaps.of(start), options=replace(options, row="original"), seed=seed
+            problem, HairMaps.of(start), options=replace(options, variant="original"), seed=seed
         )
         hair = found.maps.mean()
         out.append(
@@ -192,18 +193,18 @@ def _relative_spread(ratio: Array) -> float:
 
 
 def error_against_time(
-    captured: Captured, options: Stage1Options, progress: Progress = silent, seed: int = 0
+    captured: Captured, options: InverseRenderingOptions, progress: Progress = silent, seed: int = 0
 ) -> dict[str, list[dict[str, float]]]:
     """Held-out PSNR of "spatial" against CPU seconds: ours, by steps alone, and those undone.
 
     "steps" begins with the cells' colours and descends from there; the next three are that with one
     choice undone. "plain" draws pairs evenly, renders whole frames one at a time to a fixed number
     of bounces, as many paths for a picture as for its gradient, and starts from one colour.
-    Watching is not counted.
+    Validation is not counted.
     """
     training = captured.training()
     scale, skin = captured.exposure.scale, captured.skin
-    ours = replace(options, row="spatial", check_every=max(2, options.steps // 3))
+    ours = replace(options, variant="spatial", check_every=max(2, options.steps // 3))
     steps = replace(ours, gauss_newton=False)
     frame = captured.views[0].camera.width * captured.views[0].camera.height
     depth = options.effort.max_depth
@@ -233,7 +234,7 @@ def error_against_time(
             problem,
             start,
             options=version,
-            snapshot=_into(points),
+            monitor=Monitor(snapshot=_into(points)),
             seed=seed,
         )
         table = Table(captured, options, seed=seed)
@@ -313,7 +314,7 @@ def _off(found: dict[str, Any]) -> str:
     return f"β_M {beta_m:+.1f} %, β_N {beta_n:+.1f} %, σ {sigma_a} %"
 
 
-QUICK = Stage1Options(
+QUICK = InverseRenderingOptions(
     steps=2,
     check_every=2,
     shape=(2, 2, 2),

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.loop import Stage1Options, run
-from appearance.inverse_rendering.problem import Effort, Problem
-from appearance.inverse_rendering.start import hair_inverse
+from appearance.inverse_rendering.loop import Monitor, run
+from appearance.inverse_rendering.options import Effort, InverseRenderingOptions
+from appearance.inverse_rendering.problem import Problem
 from appearance.metrics.scores import Exposure, psnr
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
@@ -21,6 +21,7 @@ from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fit import FitOptions
+from benchmarks.appearance.hair_inverse import hair_inverse
 from benchmarks.subjects import Subject, cycles_subject
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture
@@ -30,9 +31,9 @@ from reconstruction.report.report import Progress, Stage, silent
 
 HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)
-OPTIONS = Stage1Options(
-    row="original",
-    watched_views=6,
+OPTIONS = InverseRenderingOptions(
+    variant="original",
+    validation_views=6,
     effort=Effort(pixels=300, spp=384, gradient_spp=48, max_depth=12),
 )
 AFAR = HairAppearance((0.13, 0.15, 0.35), 0.42, 0.2)
@@ -83,7 +84,7 @@ def fit_cycles(
     frames: CyclesFrames,
     start: HairAppearance | None = None,
     *,
-    options: Stage1Options = OPTIONS,
+    options: InverseRenderingOptions = OPTIONS,
     judged_spp: int = 512,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -108,13 +109,15 @@ def fit_cycles(
     strands = frames.subject.strands
     mapped = MappedStrands.of(frames.scene, strands, scalp_coordinates(strands, None))
     problem = Problem(mapped, frames.hair, exposure.scale, albedo)
-    found = run(problem, HairMaps.of(start), options=options, progress=progress, seed=frames.seed)
+    found = run(
+        problem, HairMaps.of(start), options=options, monitor=Monitor(progress), seed=frames.seed
+    )
     mean = np.mean([o.radiance.mean((0, 1)) for o in frames.hair], axis=0)
     flat = [np.broadcast_to(mean, o.radiance.shape) for o in frames.held]
     scores = {"mean colour": _psnr(flat, frames.held, exposure)}
     for name, maps in (("start", HairMaps.of(start)), ("original", found.maps)):
         progress(f"judging {name}", 0.9)
-        scene = mapped.painted(maps).with_skin(albedo)
+        scene = mapped.with_maps(maps).with_skin(albedo)
         pictures = [
             render_olat(
                 scene,

@@ -103,7 +103,7 @@ def known_subject(
     scene = subject.scene()
     mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, head))
     truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed)
-    shown = mapped.painted(truth)
+    shown = mapped.with_maps(truth)
     cameras, lights = _ring(strands, rig), _dome(rig)
     views, halves = [], []
     for k, camera in enumerate(cameras):

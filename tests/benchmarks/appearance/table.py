@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands
-from appearance.inverse_rendering.loop import ROWS, Stage1Options, run
+from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
+from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
 from appearance.inverse_rendering.problem import Problem
-from appearance.inverse_rendering.start import hair_inverse
-from appearance.inverse_rendering.unknowns import Lamps
+from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import mean_scores, scores, scores_unavailable
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.sun_fit.fit import FitOptions
+from benchmarks.appearance.hair_inverse import hair_inverse
 from benchmarks.appearance.known_subjects import Captured
 from benchmarks.command import within
 from reconstruction.arrays import Array, Floats, Ints
@@ -35,7 +36,7 @@ class Table:
     def __init__(
         self,
         captured: Captured,
-        options: Stage1Options,
+        options: InverseRenderingOptions,
         *,
         lights: Sequence[Light] | None = None,
         progress: Progress = silent,
@@ -46,7 +47,7 @@ class Table:
         self.training = captured.training(lights)
         self.rows: dict[str, dict[str, Any]] = {}
 
-    def run(self, rows: Sequence[str] = tuple(ROWS)) -> dict[str, dict[str, Any]]:
+    def run(self, rows: Sequence[Variant] = tuple(VARIANTS)) -> dict[str, dict[str, Any]]:
         """Baselines, then `rows`, then the truth itself."""
         captured = self.captured
         colour = np.mean([o.radiance.mean((0, 1)) for o in self.training], axis=0)
@@ -71,7 +72,7 @@ class Table:
         maps = HairMaps.of(hair)
         self.score_maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
         self.rows["HairInverse"]["warnings"] = stage.warnings
-        lamps = None
+        lights = None
         problem = Problem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
         for row in rows:
             begun = time.perf_counter()
@@ -79,21 +80,21 @@ class Table:
             found = run(
                 problem,
                 maps,
-                lamps,
-                options=replace(self.options, row=row),
+                lights,
+                options=replace(self.options, variant=row),
                 seed=self.seed,
-                progress=within(self.progress, f"({row})"),
+                monitor=Monitor(within(self.progress, f"({row})")),
             )
-            maps, lamps = found.maps, found.lamps
+            maps, lights = found.maps, found.lights
             self.score_maps(row, maps, captured.mapped, time.perf_counter() - begun)
             self.rows[row] |= {
                 "ended": found.ended,
                 "steps": found.steps,
-                "gain_spread": float(found.lamps.gain.std()),
+                "gain_spread": float(found.lights.gain.std()),
                 "history": found.history,
             }
         self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
-        self.found = maps, lamps or Lamps.calibrated(len(self.training[0].lights))
+        self.found = maps, lights or LightDeviations.calibrated(len(self.training[0].lights))
         return self.rows
 
     def _truth(self) -> list[tuple[int, int]]:
@@ -102,7 +103,7 @@ class Table:
 
     def score_maps(self, row: str, maps: HairMaps, mapped: MappedStrands, seconds: float) -> None:
         """Render `maps` on `mapped` with fresh random numbers and score them as `row`."""
-        scene = mapped.painted(maps).with_skin(self.captured.skin)
+        scene = mapped.with_maps(maps).with_skin(self.captured.skin)
         held = list(self.captured.held_lights)
         pictures: list[tuple[Array, Array]] = []
         for k, o in enumerate(self.captured.views):

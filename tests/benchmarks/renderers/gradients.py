@@ -80,9 +80,9 @@ def moved_light(scene: HairScene, places: Array, spp: int, runs: int) -> dict[st
         replayed, difference = [], []
         for seed in range(runs):
             values = ops[0.0].parameters()
-            dr.enable_grad(values["lamps.position"])
+            dr.enable_grad(values["lights.position"])
             dr.backward(dr.mean(ops[0.0].radiance(values, gradient_seed=seed)))
-            replayed.append(float(np.array(dr.grad(values["lamps.position"]))[0, 0]))
+            replayed.append(float(np.array(dr.grad(values["lights.position"]))[0, 0]))
             mean = {
                 d: float(np.array(op.radiance({}, seed=seed), float).mean())
                 for d, op in ops.items()

@@ -1,4 +1,4 @@
-"""Lamps: irradiance in closed form, soft shadows, profiles on the device, mixtures."""
+"""Lights: irradiance in closed form, soft shadows, profiles on the device, mixtures."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import pytest
 
 from appearance.render.environment import render_environment
 from appearance.render.environment_maps import studio
-from appearance.render.lamps import LampBank
+from appearance.render.lights import LightBank
 from appearance.render.mixed import Environment, render_mixed
 from appearance.render.olat import render_olat
 from appearance.scene.backend import ensure_backend
@@ -38,9 +38,9 @@ BEAM = LightProfile(
 
 
 def irradiance(light, point, normal, samples=1 << 16):
-    """Mean irradiance `(3,)` at `point` on a surface with `normal`, by sampling the lamp."""
+    """Mean irradiance `(3,)` at `point` on a surface with `normal`, by sampling the light."""
     ensure_backend()
-    bank = LampBank.of([light])
+    bank = LightBank.of([light])
     generator = mi.PCG32(samples, 1)
     p = mi.Point3f((np.asarray(point, float) * SCALE).tolist())
     target, intensity = bank.sample(mi.UInt32(0), p, generator, mi.Bool(True))
@@ -64,7 +64,7 @@ def test_a_sphere_shines_like_a_point_on_what_faces_it():
 def test_the_shadow_ray_ends_on_the_sphere():
     ensure_backend()
     light = Light("l", np.array([0.1, 0.2, 0.3]), np.ones(3), radius=0.04)
-    bank = LampBank.of([light])
+    bank = LightBank.of([light])
     p = mi.Point3f(-0.1 * SCALE, 0, 0)
     target, _ = bank.sample(mi.UInt32(0), p, mi.PCG32(10000, 1), mi.Bool(True))
     away = np.array(target).T / SCALE - light.position
@@ -102,7 +102,7 @@ def test_a_panel_is_the_sum_of_its_points(profile):
 
 
 def test_profiles_are_those_of_the_rig():
-    """`LampBank` and `Light.intensity_towards` are two writings of one thing."""
+    """`LightBank` and `Light.intensity_towards` are two writings of one thing."""
     ensure_backend()
     rng = np.random.default_rng(0)
     kinds = [
@@ -127,7 +127,7 @@ def test_profiles_are_those_of_the_rig():
     ]
     points = rng.normal(size=(5000, 3)).astype(np.float32)
     which = rng.integers(8, size=5000)
-    _, found = LampBank.of(lights).sample(
+    _, found = LightBank.of(lights).sample(
         mi.UInt32(which), mi.Point3f((points * SCALE).T), None, mi.Bool(True)
     )
     expected = np.array(
@@ -137,8 +137,8 @@ def test_profiles_are_those_of_the_rig():
 
 
 def test_a_sphere_casts_a_soft_shadow(small):
-    """Under a half plane's edge: the part of the lamp's disc that is seen."""
-    lamp_height, edge_height, radius = 2.0, 0.1, 0.1
+    """Under a half plane's edge: the part of the light's disc that is seen."""
+    light_height, edge_height, radius = 2.0, 0.1, 0.1
     floor = small.plane(0.05).vertices
     wall = np.array(
         [[0, -1, edge_height], [1, -1, edge_height], [1, 1, edge_height], [0, 1, edge_height]]
@@ -149,7 +149,7 @@ def test_a_sphere_casts_a_soft_shadow(small):
     scene = build_scene(small.no_hair, mesh, hair=HAIR, skin=(0.5, 0.5, 0.5))
     # seen from under the edge, so that the half plane hides no pixel
     camera = Camera.look_at("c", 32, 4, (-0.02, 0, 0.09), (0, 0, 0), 12, roll_deg=90)
-    light = Light("l", np.array([0, 0, lamp_height]), np.full(3, 8.0), radius=radius)
+    light = Light("l", np.array([0, 0, light_height]), np.full(3, 8.0), radius=radius)
     point = Light("p", light.position, light.intensity)
     open_scene = build_scene(small.no_hair, small.plane(0.05), hair=HAIR, skin=(0.5, 0.5, 0.5))
     soft = render_mixed(scene, camera, [light], spp=1024, max_depth=1)[..., 0]
@@ -157,8 +157,8 @@ def test_a_sphere_casts_a_soft_shadow(small):
     column, row = np.meshgrid(np.arange(32), np.arange(4))
     rays = camera.rays(np.stack([column, row], -1))
     x = (camera.center - rays * (camera.center[2] / rays[..., 2])[..., None])[..., 0]
-    # where the line from x over the edge meets the lamp's height, in radii from its middle
-    at = np.clip(-x * (lamp_height - edge_height) / edge_height / radius, -1, 1)
+    # where the line from x over the edge meets the light's height, in radii from its middle
+    at = np.clip(-x * (light_height - edge_height) / edge_height / radius, -1, 1)
     seen = 0.5 + (np.arcsin(at) + at * np.sqrt(1 - at * at)) / np.pi
     assert seen.min() < 0.3
     assert seen.max() > 0.7
@@ -170,12 +170,12 @@ def tufted(small):
     return (
         build_scene(small.tuft(100), small.plane(), hair=HAIR),
         small.camera(size=16),
-        small.lamps(),
+        small.lights(),
     )
 
 
 def test_a_mixture_is_the_sum_of_its_parts(tufted):
-    """Two lamps, one of them taken away, and two maps: against each alone, in the mean."""
+    """Two lights, one of them taken away, and two maps: against each alone, in the mean."""
     scene, camera, lights = tufted
     weights = np.array([[1.0, 0.5, 0.2], [-0.1, -0.1, 0.0], [0.5, 0.5, 0.5]])
     maps = [Environment(studio(16), 30.0, 0.2), Environment(np.ones((4, 8, 3)), 0.0, (0, 0.1, 0.3))]
@@ -190,7 +190,7 @@ def test_a_mixture_is_the_sum_of_its_parts(tufted):
     np.testing.assert_allclose(mixed.mean((0, 1)), parts, rtol=0.03)
 
 
-def test_a_lamp_taken_away_from_itself_is_dark(tufted):
+def test_a_light_taken_away_from_itself_is_dark(tufted):
     scene, camera, lights = tufted
     twice = [lights[0], lights[0]]
     options = {"spp": 512, "max_depth": 3, "seed": 4}
@@ -211,8 +211,8 @@ def test_mixtures_of_pixels_and_seeds(tufted):
             render_mixed(scene, camera, lights, **wrong)
 
 
-def test_lamps_of_every_shape_shine_in_olat_images(tufted):
-    """Each lamp alone, against the mixture of that one lamp."""
+def test_lights_of_every_shape_shine_in_olat_images(tufted):
+    """Each light alone, against the mixture of that one light."""
     scene, camera, lights = tufted
     shapes = (
         {"radius": 0.1},

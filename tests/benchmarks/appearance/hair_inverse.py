@@ -1,7 +1,4 @@
-"""Where inverse rendering starts from: Sun's roughness and colour, and groups of cells by colour.
-
-The homogeneous start is also the baseline that GroomLight calls HairInverse.
-"""
+"""One roughness and one colour for all hair: the baseline that GroomLight calls HairInverse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lamps of a rig on the device: where a shadow ray goes, and what comes back along it."""
+"""The lights of a rig on the device: where a shadow ray goes, and what comes back along it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from reconstruction.geometry.lights import Light
 
 
 @dataclass(frozen=True)
-class LampBank:
-    """Lamps in scene units, an array of one number after the other for each property.
+class LightBank:
+    """Lights in scene units, an array of one number after the other for each property.
 
     `positions`, `intensities (3 L,)` are there always. `orientations (9 L,)`, `radii (L,)`,
-    `sizes (2 L,)` are there where some lamp has one; a lamp without a size has sizes of 0.
+    `sizes (2 L,)` are there where some light has one; a light without a size has sizes of 0.
     `profiles` are the distinct ones, `profile_of (L,)` counts them from 1, 0 for none. `turns
-    (3 L,)` turns a lamp about its centre, axis-angle in the world's frame; only gradients need it.
+    (3 L,)` turns a light about its centre, axis-angle in the world's frame; only gradients need it.
     All may be differentiated.
     """
 
@@ -42,7 +42,7 @@ class LampBank:
     turns: Any | None = None
 
     @classmethod
-    def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> LampBank:
+    def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> LightBank:
         """The bank of `lights`, their intensities times `weights`, which broadcast to `(L, 3)`."""
         position, intensity = light_arrays(lights)
         intensity = (intensity * np.asarray(weights, float)).astype(np.float32)
@@ -66,11 +66,11 @@ class LampBank:
         )
 
     def sample(self, light: Any, p: Any, rng: Any, active: Any) -> tuple[Any, Any]:
-        """A point of lamp number `light` to cast a shadow ray at from `p`, and an intensity.
+        """A point of light number `light` to cast a shadow ray at from `p`, and an intensity.
 
         The intensity over the squared distance to that point is, in the mean over `rng`, the
-        lamp's irradiance across the ray: spheres are sampled uniformly in the solid angle that they
-        fill, rectangles uniformly in area. Point lamps draw no random numbers.
+        light's irradiance across the ray: spheres are sampled uniformly in the solid angle that
+        they fill, rectangles uniformly in area. Point lights draw no random numbers.
         """
         centre = dr.gather(mi.Point3f, self.positions, light, active)
         intensity: Any = dr.gather(mi.Color3f, self.intensities, light, active)
@@ -114,7 +114,7 @@ def _point_on_sphere(centre: Any, radius: Any, p: Any, u: Any, v: Any) -> tuple[
     """A point uniform in the solid angle that a sphere fills, and its gain on the intensity.
 
     A sphere of radiance I/(pi r²) fills 2 pi (1 - cos a) with sin a = r/d; the irradiance
-    2 I/(d² (1 + cos a)) is that of a point lamp for r = 0. All is written so that r = 0 is no
+    2 I/(d² (1 + cos a)) is that of a point light for r = 0. All is written so that r = 0 is no
     special case, nor its derivative.
     """
     to_centre = centre - p
@@ -161,7 +161,7 @@ class ProfileTable:
         )
 
     def at(self, direction: Any) -> Any:
-        """The profile's value `Float` towards `direction` in the lamp's frame."""
+        """The profile's value `Float` towards `direction` in the light's frame."""
         polar = opaque_matrix(self.frame) @ direction
         squared = polar.x * polar.x + polar.y * polar.y
         on_axis = squared == 0  # where the angles have no derivative
