@@ -53,6 +53,19 @@ class HairMask:
     decided: float
 
 
+@dataclass(frozen=True, eq=False)
+class MaskedCapture:
+    """A `capture`, and which pixels of its cameras are hair: `masks` by the camera's name."""
+
+    capture: Capture
+    masks: Mapping[str, HairMask]
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Those that have a mask."""
+        return [c for c in self.capture.rig.cameras if c.name in self.masks]
+
+
 def hair_masks(
     capture: Capture,
     points: PointCloud | None = None,

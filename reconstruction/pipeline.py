@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -32,7 +32,7 @@ from reconstruction.light_planes import (
     sweep_peaks,
     triangulate,
 )
-from reconstruction.masks import HairMask, hair_masks, usable_masks
+from reconstruction.masks import MaskedCapture, hair_masks, usable_masks
 from reconstruction.methods import METHODS, Method
 from reconstruction.model import Model
 from reconstruction.report.report import Progress, Report, Stage, silent
@@ -128,8 +128,9 @@ def reconstruct(
         masks = usable_masks(capture, every, stage)
         stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
         stage.figures["source"] = {k: m.source for k, m in masks.items()}
+    masked = MaskedCapture(capture, masks)
     if method in ("photometric", "lmvs"):
-        strands = _line_strands(capture, masks, head, method, options, report, progress)
+        strands = _line_strands(masked, head, method, options, report, progress)
         model.write_strands(strands)
         model.write_report(report)
         return report
@@ -141,16 +142,14 @@ def reconstruct(
         head = fitted.mesh
     with report.stage("envelope") as stage:
         envelope, depths = build_envelope(
-            capture, cloud, masks, head, grid=options.grid, margin=options.margin, stage=stage
+            masked, cloud, head, grid=options.grid, margin=options.margin, stage=stage
         )
     with report.stage("orientation") as stage:
-        measured = measure_tangents(
-            capture, cloud.points, masks, depths, envelope, options.measure, stage, progress
-        )
+        measured = measure_tangents(masked, cloud.points, depths, options.measure, stage, progress)
     seen = _surface(measured, cloud, options, report, progress)
     if method == "fused":
         more, segments = line_strands(
-            capture, masks, head, report, options=options.light_codes, progress=progress
+            masked, head, report, options=options.light_codes, progress=progress
         )
         seen += more
         measured = merge(measured, segments, options.light_codes.field_weight)
@@ -166,8 +165,7 @@ def reconstruct(
 
 
 def _line_strands(
-    capture: Capture,
-    masks: Mapping[str, HairMask],
+    masked: MaskedCapture,
     head: Mesh | None,
     method: Literal["photometric", "lmvs"],
     options: ReconstructOptions,
@@ -176,13 +174,7 @@ def _line_strands(
 ) -> Strands:
     """Strands from line stereo alone: only what is seen, none of them rooted."""
     polylines, _ = line_strands(
-        capture,
-        masks,
-        head,
-        report,
-        method=method,
-        options=options.light_codes,
-        progress=progress,
+        masked, head, report, method=method, options=options.light_codes, progress=progress
     )
     with report.stage("strands") as stage:
         radius = options.radius or float(np.clip(HEAD_OF_HAIR / max(len(polylines), 1), 4e-5, 4e-4))

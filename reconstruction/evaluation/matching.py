@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +10,6 @@ import numpy as np
 from reconstruction.arrays import Bools
 from reconstruction.evaluation.oriented_points import Block, Drawn, OrientedPoints, near_pairs
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 
 
@@ -146,11 +143,9 @@ def compare_strands(
     pred: Strands,
     true: Strands,
     *,
-    cameras: Sequence[Camera] | None = None,
-    head: Mesh | None = None,
+    visibility: Visibility | None = None,
     seed: int = 0,
     samples: int | None = 40_000,
-    visibility: Visibility | None = None,
 ) -> dict[str, Any]:
     """Score predicted strands against the true ones.
 
@@ -160,30 +155,21 @@ def compare_strands(
     predicted one, F their harmonic mean.
 
     Returns `{"visible": scores, "all": scores, "directed": {"visible": scores, "all": scores}}`,
-    without the visible ones where there are no `cameras`. Visible precision scores the visible
-    predictions against all of the truth, visible recall the visible truth against all predictions;
-    visible is what is not hidden from every camera by the true strands or the `head` by more than
-    1 mm. Directed ones compare tangents as arrows from root to tip. `scores` maps `1mm_10deg`,
+    without the visible ones where no `visibility` of the true strands is given. Visible precision
+    scores the visible predictions against all of the truth, visible recall the visible truth
+    against all predictions; visible is what is not hidden from every camera by the true strands or
+    the head by more than 1 mm. Directed ones compare tangents as arrows from root to tip. `scores` maps `1mm_10deg`,
     `2mm_20deg`, `3mm_30deg` to `{"precision", "recall", "f", "precision_error", "recall_error"}`.
 
     At most `samples` points of each set are scored (all of them for None), drawn by `seed`, always
     against the whole other set; the `_error`s are the standard errors that this leaves. Without
-    predicted points to score, precision is 0. To score several predictions of one truth, make its
-    `Visibility` once and hand it over.
+    predicted points to score, precision is 0.
 
     Raises `ValueError` when there is no true strand, no camera sees a true point, or strands are
     so long that they cannot be in metres.
     """
     predicted, truth = OrientedPoints(pred), OrientedPoints(true)
-    if cameras is not None and visibility is None:
-        visibility = Visibility(cameras, true, head)
-    comparison = draw(
-        predicted,
-        truth,
-        seed=seed,
-        samples=samples,
-        visibility=visibility if cameras is not None else None,
-    )
+    comparison = draw(predicted, truth, seed=seed, samples=samples, visibility=visibility)
     truth.show(*comparison.of_predicted)
     predicted.show(*comparison.of_truth)
     return comparison.figures()

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.arrays import Array, Bools
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import depth_map, inside_mesh, mesh_depth
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.visual_hull import space_carve, visual_hull
 from reconstruction.light_planes import PointCloud
-from reconstruction.masks import HairMask
+from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 
 _BARE = 2e-3
@@ -23,9 +22,8 @@ _BARE = 2e-3
 
 
 def build_envelope(
-    capture: Capture,
+    masked: MaskedCapture,
     cloud: PointCloud,
-    masks: Mapping[str, HairMask],
     head: Mesh,
     *,
     grid: float,
@@ -42,7 +40,7 @@ def build_envelope(
     triangulated points of hair stand, there is hair. Without a sweep, hair pixels carve nothing,
     and their depth is where the ray enters the envelope.
     """
-    cameras = [c for c in capture.rig.cameras if c.name in masks]
+    masks, cameras = masked.masks, masked.cameras
     bounds = _bounds(cloud, head)
     hull = visual_hull(
         cameras, {k: m.subject for k, m in masks.items()}, spacing=grid, bounds=bounds
@@ -79,7 +77,7 @@ def build_envelope(
     )
     if not inside.any():
         raise CaptureError(
-            f"{capture.path}: no volume is left for hair: check masks, head.obj and poses"
+            f"{masked.capture.path}: no volume is left for hair: check masks, head.obj and poses"
         )
     return envelope, depths
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import ndimage
 
-from reconstruction.arrays import Array, Bools, Floats
+from reconstruction.arrays import Bools, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import inside_mesh
@@ -20,14 +20,14 @@ def hair_volume(
     subject: Mapping[str, Bools],
     head: Mesh | None,
     spacing: float,
-    bounds: Array | None = None,
 ) -> VoxelGrid:
     """Voxels that can hold hair: in the hull of the masks `(H, W)` of the subject, off the head.
 
-    A point that three views cannot see is of no use to line stereo; with two cameras, two do.
+    `spacing` is the voxels' edge in metres. A point that three views cannot see is of no use to
+    line stereo; with two cameras, two do.
     """
     used = {c.name: subject[c.name] for c in cameras if subject[c.name].any()}
-    hull = visual_hull(cameras, used, spacing=spacing, bounds=bounds, least_views=3)
+    hull = visual_hull(cameras, used, spacing=spacing, least_views=3)
     inside = hull.inside & ~inside_mesh(hull, head) if head is not None else hull.inside
     return VoxelGrid(hull.origin, hull.spacing, inside)
 

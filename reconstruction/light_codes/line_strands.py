@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.light_codes.light_code_options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.measure_segments import connect_segments, measure_segments
 from reconstruction.light_codes.segments import Segments
-from reconstruction.masks import HairMask
+from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
 
 
 def line_strands(
-    capture: Capture,
-    masks: Mapping[str, HairMask],
+    masked: MaskedCapture,
     head: Mesh | None,
     report: Report,
     *,
     method: Literal["photometric", "lmvs"] = "photometric",
     options: LightCodeOptions = DEFAULTS,
-    bounds: Array | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Array], Segments]:
     """Polylines `(n, 3)` from line stereo, the end that is nearer to the head first.
@@ -37,14 +33,7 @@ def line_strands(
     from. Raises `CaptureError` as `measure_segments` does.
     """
     views, segments = measure_segments(
-        capture,
-        masks,
-        head,
-        report,
-        method=method,
-        options=options,
-        bounds=bounds,
-        progress=progress,
+        masked, head, report, method=method, options=options, progress=progress
     )
     return _roots_first(connect_segments(views, segments, report, options), head), segments
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.surface_strands import surface_strands
@@ -25,30 +24,28 @@ from reconstruction.light_codes.segments import (
     thinned_lines,
     to_segments,
 )
-from reconstruction.masks import HairMask
+from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
 
 
 def build_views(
-    capture: Capture,
-    masks: Mapping[str, HairMask],
+    masked: MaskedCapture,
     head: Mesh | None,
     report: Report,
     *,
     options: LightCodeOptions = DEFAULTS,
-    bounds: Array | None = None,
     progress: Progress = silent,
 ) -> tuple[list[View], VoxelGrid]:
     """The views, and the volume that holds the hair; adds the stage `lightcodes` to the report."""
-    cameras = [c for c in capture.rig.cameras if c.name in masks]
+    capture, masks, cameras = masked.capture, masked.masks, masked.cameras
     hair = {c.name: masks[c.name].hair for c in cameras}
     subject = {c.name: masks[c.name].subject for c in cameras}
     if not any(m.any() for m in hair.values()):
         raise CaptureError(f"{capture.path}: no camera's mask holds hair: check the masks")
     with report.stage("lightcodes") as stage:
         try:
-            volume = hair_volume(cameras, subject, head, options.volume_grid, bounds)
+            volume = hair_volume(cameras, subject, head, options.volume_grid)
         except ValueError as error:
             raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
         if not volume.inside.any():
@@ -62,14 +59,12 @@ def build_views(
 
 
 def measure_segments(
-    capture: Capture,
-    masks: Mapping[str, HairMask],
+    masked: MaskedCapture,
     head: Mesh | None,
     report: Report,
     *,
     method: Literal["photometric", "lmvs"] = "photometric",
     options: LightCodeOptions = DEFAULTS,
-    bounds: Array | None = None,
     progress: Progress = silent,
 ) -> tuple[list[View], Segments]:
     """The views, and the segments that `least_views` of them (all, if there are fewer) agree on.
@@ -77,9 +72,7 @@ def measure_segments(
     Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
     there are no two views of hair, or no segment is left.
     """
-    views, volume = build_views(
-        capture, masks, head, report, options=options, bounds=bounds, progress=progress
-    )
+    views, volume = build_views(masked, head, report, options=options, progress=progress)
     center = volume.centers().mean(axis=0)
     with report.stage("depth") as stage:
         search = (
@@ -124,7 +117,7 @@ def measure_segments(
         )
         if not len(kept):
             raise CaptureError(
-                f"{capture.path}: no segment of {len(segments)} is found alike in "
+                f"{masked.capture.path}: no segment of {len(segments)} is found alike in "
                 f"{least} of {len(views)} views: more cameras with overlapping "
                 "views, sharper or finer pictures, or a lower least_views may help"
             )

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.lights import Light
-from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import LogGaborBank, texture
-from reconstruction.masks import HairMask
+from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Progress, Stage, silent
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
@@ -85,11 +84,9 @@ def light_groups(lights: list[Light], count: int) -> Ints:
 
 
 def measure_tangents(
-    capture: Capture,
+    masked: MaskedCapture,
     points: Array,
-    masks: Mapping[str, HairMask],
     depths: Mapping[str, Array],
-    envelope: VoxelGrid,
     options: MeasureOptions = MeasureOptions(),
     stage: Stage | None = None,
     progress: Progress = silent,
@@ -100,18 +97,19 @@ def measure_tangents(
     a capture without OLAT frames.
     """
     stage = stage or Stage("orientation")
+    capture = masked.capture
     names = capture.olat_lights()
     if not names:
         raise CaptureError(f"{capture.path}: no OLAT frames, which the orientations come from")
     lights = [capture.rig.light(n) for n in names]
     group = light_groups(lights, options.light_groups)
-    cameras = [c for c in capture.rig.cameras if c.name in masks and masks[c.name].hair.any()]
-    evidences, olats = [], {}
+    cameras = [c for c in masked.cameras if masked.masks[c.name].hair.any()]
+    evidences, pictures = [], []
     for done, camera in enumerate(cameras):
         progress("texture", done / len(cameras))
-        mask = masks[camera.name].hair
+        mask = masked.masks[camera.name].hair
         olat = capture.olat(camera.name, names).mean(axis=-1)
-        olats[camera.name] = olat
+        pictures.append((camera, olat))
         details = [
             texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
             for g in np.unique(group)
@@ -141,15 +139,7 @@ def measure_tangents(
         )
     else:
         progress("reflection", 0.0)
-        more, table = reflection_scores(
-            cameras,
-            olats,
-            lights,
-            points,
-            seen,
-            candidates,
-            (tangents.directions, tangents.confidence),
-        )
+        more, table = reflection_scores(pictures, lights, points, seen, candidates, tangents)
         texture_only = tangents
         tangents = decide(scores + options.reflection_weight * (average @ more), candidates)
         turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)

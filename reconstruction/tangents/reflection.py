@@ -8,7 +8,7 @@ points whose texture already says their direction well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
+from reconstruction.tangents.line_evidence import Tangents
 
 FEWEST_LIGHTS = 60
 """Under about one light for each 15 degrees the highlight falls between them."""
@@ -26,6 +27,7 @@ _LARGEST_SUM = 1.4
 _GRAZING = 0.1
 _BRIGHTEST = 6.0
 _BLOCK = 0.03
+_TRUSTED = 0.4  # of the points, the most confident ones
 
 
 def surface_normals(points: Array, towards: Array, neighbours: int = 40) -> Array:
@@ -187,30 +189,29 @@ class Reflection:
 
 
 def reflection_scores(
-    cameras: Sequence[Camera],
-    olats: Mapping[str, AnyFloats],
+    pictures: Sequence[tuple[Camera, AnyFloats]],
     lights: Sequence[Light],
     points: Array,
     seen: Bools,
     candidates: Array,
-    first: tuple[Array, Array],
-    trusted_share: float = 0.4,
+    first: Tangents,
 ) -> tuple[Floats, Reflection]:
     """Scores `(N, D)` of the candidates at all points, and the table that they were read with.
 
-    `seen (N, C)` says which camera sees which point; `first` are directions `(N, 3)` and
-    confidences `(N,)` from texture: the `trusted_share` of the most confident ones teach the table.
+    `pictures` are C cameras, each with what it saw under every one of the L lights `(L, H, W)`;
+    `seen (N, C)` says which camera sees which of `points (N, 3)`, `candidates (D, 3)` are unit
+    directions. `first` are the N points' tangents from texture: the most confident ones fill the
+    table.
     """
-    centers = np.stack([c.center for c in cameras])
+    centers = np.stack([camera.center for camera, _ in pictures])
     away = seen @ centers - seen.sum(axis=1, keepdims=True) * points
     normals = surface_normals(points, away)
-    directions, confidence = first
-    trusted = confidence >= np.quantile(confidence, 1 - trusted_share)
+    trusted = first.confidence >= np.quantile(first.confidence, 1 - _TRUSTED)
     observations = [
-        observe(camera, olats[camera.name], lights, points, normals, seen[:, k])
-        for k, camera in enumerate(cameras)
+        observe(camera, olat, lights, points, normals, seen[:, k])
+        for k, (camera, olat) in enumerate(pictures)
     ]
-    table = Reflection.learn(observations, directions, trusted)
+    table = Reflection.learn(observations, first.directions, trusted)
     scores = np.zeros((len(points), len(candidates)), np.float32)
     for o in observations:
         scores[o.index] += table.scores(o, points, candidates)

@@ -39,9 +39,7 @@ def evaluate_geometry(
     visibility = Visibility(cameras, true, head)
 
     def score(strands: Strands) -> dict[str, Any]:
-        return compare_strands(
-            strands, true, cameras=cameras, head=head, seed=seed, visibility=visibility
-        )
+        return compare_strands(strands, true, seed=seed, visibility=visibility)
 
     progress("our strands against the true ones", 0.2)
     figures = score(model.strands())

@@ -74,8 +74,6 @@ class StrandTruth:
         return compare_strands(
             strands if self._ball is None else self._ball.cut(strands),
             self.strands,
-            cameras=self._capture.rig.cameras,
-            head=self._capture.head,
             samples=self._samples,
             visibility=self._visibility,
         )

@@ -26,12 +26,13 @@ from benchmarks.strand_truth import STEP, StrandTruth
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.import_folder import import_folder
 from reconstruction.evaluation.matching import compare_strands
+from reconstruction.evaluation.visibility import Visibility
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.strands import Strands
 from reconstruction.images.orientation import texture
 from reconstruction.light_codes.measure_segments import build_views
-from reconstruction.masks import hair_masks
+from reconstruction.masks import MaskedCapture, hair_masks
 from reconstruction.methods import Method
 from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
@@ -141,7 +142,9 @@ def study(
     """
     codes = options.light_codes
     masks = hair_masks(capture, None, capture.head)
-    views, volume = build_views(capture, masks, capture.head, Report(), options=codes)
+    views, volume = build_views(
+        MaskedCapture(capture, masks), capture.head, Report(), options=codes
+    )
     found = study_depths(views, volume, truth, codes, range(1, len(views), 8))
     report = Report()
     for name, variants in found.items():
@@ -176,8 +179,7 @@ def run_imported(
         results["variants"][method] = compare_strands(
             model.strands(),
             truth,
-            cameras=capture.rig.cameras,
-            head=capture.head,
+            visibility=Visibility(capture.rig.cameras, truth, capture.head),
             samples=samples,
         )
     save(out / "imported.json", results)

@@ -26,7 +26,7 @@ from reconstruction.light_planes import (
     sweep_peaks,
     triangulate,
 )
-from reconstruction.masks import HairMask
+from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.model import Model
 from reconstruction.pipeline import ReconstructOptions, reconstruct
 from reconstruction.report.plots import plot_report
@@ -151,13 +151,11 @@ def _studies(
     for camera in capture.rig.cameras:
         hair, skin = (model.mask(camera.name, kind, capture) for kind in KINDS)
         masks[camera.name] = HairMask(hair | skin, hair, skin, "user", 1.0)
-    stage = Stage("study")
+    masked, stage = MaskedCapture(capture, masks), Stage("study")
     envelope, depths = build_envelope(
-        capture, cloud, masks, head, grid=options.grid, margin=options.margin, stage=stage
+        masked, cloud, head, grid=options.grid, margin=options.margin, stage=stage
     )
-    measured = measure_tangents(
-        capture, cloud.points, masks, depths, envelope, options.measure, stage, progress
-    )
+    measured = measure_tangents(masked, cloud.points, depths, options.measure, stage, progress)
     system = field_system(envelope, measured.points, measured.directions, measured.confidence)
     solvers = compare_solvers(*system.equations())
     field, _ = solve_field(envelope, measured.points, measured.directions, measured.confidence)

@@ -42,7 +42,7 @@ def front() -> Camera:
 
 
 def test_a_set_matches_itself(front: Camera) -> None:
-    scores = compare_strands(curtain(), curtain(), cameras=[front])
+    scores = compare_strands(curtain(), curtain(), visibility=Visibility([front], curtain()))
     for part in ("visible", "all"):
         for name in NAMES:
             assert scores[part][name]["f"] == 1.0
@@ -75,12 +75,12 @@ def test_angles(angle: float, expected: tuple[int, int, int]) -> None:
 def test_direction_of_travel_counts_only_where_it_is_asked_for(front: Camera) -> None:
     true = curtain()
     flipped = Strands.from_list([true[i][::-1] for i in range(len(true))])
-    scores = compare_strands(flipped, true, cameras=[front])
+    scores = compare_strands(flipped, true, visibility=Visibility([front], true))
     for part in ("visible", "all"):
         for name in NAMES:
             assert scores[part][name]["f"] == 1.0
             assert scores["directed"][part][name]["f"] == 0.0
-    same = compare_strands(true, true, cameras=[front])
+    same = compare_strands(true, true, visibility=Visibility([front], true))
     assert same["directed"] == {part: same[part] for part in ("visible", "all")}
 
 
@@ -111,7 +111,9 @@ def test_half_of_the_truth() -> None:
 
 
 def test_no_prediction_scores_nothing(front: Camera) -> None:
-    scores = compare_strands(Strands.from_list([]), curtain(), cameras=[front])
+    scores = compare_strands(
+        Strands.from_list([]), curtain(), visibility=Visibility([front], curtain())
+    )
     assert scores["visible"]["3mm_30deg"] == dict.fromkeys(
         ("precision", "recall", "f", "precision_error", "recall_error"), 0.0
     )
@@ -121,7 +123,11 @@ def test_no_truth_is_an_error(front: Camera) -> None:
     with pytest.raises(ValueError, match="no true strands"):
         compare_strands(curtain(), Strands.from_list([]))
     with pytest.raises(ValueError, match="no camera sees any"):
-        compare_strands(curtain(), moved(curtain(), (5, 0, 0)), cameras=[front])
+        compare_strands(
+            curtain(),
+            moved(curtain(), (5, 0, 0)),
+            visibility=Visibility([front], moved(curtain(), (5, 0, 0))),
+        )
 
 
 def test_sampling_is_within_its_error_and_repeats() -> None:

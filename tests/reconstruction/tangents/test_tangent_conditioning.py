@@ -11,8 +11,7 @@ import pytest
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.masks import HairMask
+from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.tangents.estimate import MeasureOptions, measure_tangents
 from reconstruction.tangents.line_evidence import LineEvidence
 from reconstruction.tangents.tangent_conditioning import condition_lines
@@ -115,9 +114,8 @@ def test_orientations_come_from_the_sum_of_lights_or_from_each(
     whole = np.ones((80, 80), bool)
     masks = {c.name: HairMask(whole, whole, ~whole, "user", 1.0) for c in cameras}
     depths = {c.name: np.full((80, 80), 1.0) for c in cameras}
-    grid = VoxelGrid(np.zeros(3), 0.01, np.ones((1, 1, 1), bool))
     options = MeasureOptions(light_groups=groups)
-    found = measure_tangents(capture, points, masks, depths, grid, options)
+    found = measure_tangents(MaskedCapture(capture, masks), points, depths, options)
     n = found.points / np.linalg.norm(found.points, axis=1, keepdims=True)
     t = UP - n[:, 2:] * n
     t /= np.linalg.norm(t, axis=1, keepdims=True)

@@ -9,6 +9,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
+    Tangents,
     decide,
     half_sphere,
     line_scores,
@@ -125,7 +126,7 @@ def test_reflection_finds_directions_that_texture_does_not_know() -> None:
     angle = 12 * y + 8 * z
     truth = np.stack([0.2 * np.ones_like(y), np.sin(angle), np.cos(angle)], axis=1)
     truth /= np.linalg.norm(truth, axis=1, keepdims=True)
-    olats = {}
+    pictures = []
     positions = np.stack([light.position for light in lights])
     for c in cameras:
         away = positions[None] - points[:, None]
@@ -139,20 +140,19 @@ def test_reflection_finds_directions_that_texture_does_not_know() -> None:
         x_, y_ = np.rint(c.project(points)[0]).astype(int).T
         image = np.zeros((len(lights), 48, 48))
         image[:, y_, x_] = answer.T
-        olats[c.name] = image
+        pictures.append((c, image))
     first = truth.copy()
     wrong = rng.random(len(points)) > 0.45
     first[wrong] = rng.normal(size=(int(wrong.sum()), 3))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     candidates = half_sphere(800)
     scores, table = reflection_scores(
-        cameras,
-        olats,
+        pictures,
         lights,
         points,
         np.ones((len(points), 2), bool),
         candidates,
-        (first, np.where(wrong, 0.1, 0.9)),
+        Tangents(first, np.where(wrong, 0.1, 0.9)),
     )
     assert table.contrast > 2
     error = degrees_between(decide(scores, candidates).directions, truth)
