@@ -68,7 +68,7 @@ class Board:
         return self.square * np.array([self.columns, self.rows])
 
     def picture(self, per_square: int = 64) -> NDArray[np.uint8]:
-        """What to print: 0 where there is ink, else 255; `per_square` pixels a square."""
+        """What to print `(H, W)`: 0 where there is ink, else 255; `per_square` pixels a square."""
         size = (self.columns * per_square, self.rows * per_square)
         return np.asarray(self._opencv.generateImage(size))
 

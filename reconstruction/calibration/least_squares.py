@@ -13,15 +13,15 @@ from scipy.optimize import least_squares
 from reconstruction.arrays import Array
 
 Linearised = Callable[[Array], tuple[Array, Any]]
-"""Residuals `(m,)` and their derivatives `(m, n)`, dense or sparse."""
+"""Residuals `(M,)` and their derivatives `(M, N)`, dense or sparse."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Parameters `x (n,)` with their `covariance (n, n)`, and the residuals `(m,)` there.
+    """Parameters `x (N,)` with their `covariance (N, N)`, and the residuals `(M,)` there.
 
     `conditioning` is the smallest eigenvalue over the mean one of the normal matrix with unit
-    diagonal, 0 where the data leaves a direction open; `weakest (n,)` is that direction, in units
+    diagonal, 0 where the data leaves a direction open; `weakest (N,)` is that direction, in units
     of the parameters. The covariance is not finite along it then.
     """
 
@@ -33,7 +33,7 @@ class Solution:
 
     @property
     def deviation(self) -> Array:
-        """Standard deviations `(n,)` of the parameters."""
+        """Standard deviations `(N,)` of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -44,7 +44,7 @@ OPEN = 1e-12
 def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:
     """Minimise residuals in units of their standard deviation, within a region of trust.
 
-    `function(x)` of `x (n,)` returns the residuals `(m,)` and their derivatives `(m, n)`. Residuals
+    `function(x)` of `x (N,)` returns the residuals `(M,)` and their derivatives `(M, N)`. Residuals
     beyond `huber` deviations count linearly. The covariance grows with the residuals where they are
     larger than their deviations promised, and never shrinks.
     """
@@ -75,7 +75,7 @@ def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:
 
 
 def numeric(residual: Callable[[Array], Array], step: float = 1e-6) -> Linearised:
-    """`residual` with its derivatives by central differences of `step`."""
+    """`residual (M,)` with its derivatives `(M, N)` by central differences of `step`."""
 
     def function(x: Array) -> tuple[Array, Array]:
         sides = [[residual(x + s * d) for s in (1, -1)] for d in step * np.eye(len(x))]

@@ -103,7 +103,7 @@ def sphere_centre(
 
 
 def find_highlight(image: AnyFloats, saturated: Bools) -> Highlight | None:
-    """The brightest spot of a dark-subtracted grey `image`, None where all is noise.
+    """The brightest spot of a dark-subtracted grey `image (H, W)`, None where all is noise.
 
     Its centre is the mean of its pixels by brightness. A saturated spot's deviation grows with it.
     """

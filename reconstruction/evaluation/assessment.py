@@ -34,9 +34,9 @@ OTHER_UNITS = 10.0
 
 
 class Nearest:
-    """The nearest point of the other set to each of the `drawn (n,)` points.
+    """The nearest point of the other set to each of the `drawn (N,)` points.
 
-    `distance (n,)` in metres, `cosine (n,)` between the tangents, `strand (n,)` that it lies on;
+    `distance (N,)` in metres, `cosine (N,)` between the tangents, `strand (N,)` that it lies on;
     infinite, 0 and -1 where nothing was shown.
     """
 
@@ -58,7 +58,7 @@ class Nearest:
 
     @property
     def angle_deg(self) -> Array:
-        """Between the tangents as lines, 0 to 90 `(n,)`."""
+        """Between the tangents as lines, 0 to 90 `(N,)`."""
         return np.degrees(np.arccos(np.minimum(np.abs(self.cosine), 1.0)))
 
     def figures(self) -> dict[str, Any]:

@@ -22,7 +22,7 @@ PERCENTILES = (5, 25, 50, 75, 95)
 
 
 def spread(values: Array) -> dict[str, float]:
-    """Mean and percentiles of `values (n,)`, n > 0: `mean`, `p5`, `p25`, `p50`, `p75`, `p95`."""
+    """Mean and percentiles of `values (N,)`, n > 0: `mean`, `p5`, `p25`, `p50`, `p75`, `p95`."""
     marks = np.percentile(values, PERCENTILES)
     return {
         "mean": float(values.mean()),
@@ -79,26 +79,26 @@ class Followed:
             self._other.append(pair % count + first)
 
     def shares(self) -> Array:
-        """The largest share of each followed strand that lies on one other strand `(n,)`."""
+        """The largest share of each followed strand that lies on one other strand `(N,)`."""
         which, _, count = self._pairs()
         best = np.zeros(len(self.strands))
         np.maximum.at(best, which, count)
         return best / self._counts
 
     def covered(self) -> Array:
-        """The share of each followed strand that lies on any other strand `(n,)`."""
+        """The share of each followed strand that lies on any other strand `(N,)`."""
         on_any = np.zeros(len(self._block.points))
         on_any[np.concatenate([*self._point, np.zeros(0, np.int64)])] = 1.0
         starts = np.cumsum(self._counts) - self._counts
         return np.asarray(np.add.reduceat(on_any, starts) / self._counts)
 
     def covering(self) -> Array:
-        """How many other strands lie along each followed strand, if only at a point `(n,)`."""
+        """How many other strands lie along each followed strand, if only at a point `(N,)`."""
         which, _, _ = self._pairs()
         return np.bincount(which, minlength=len(self.strands)).astype(float)
 
     def fragments(self) -> Array:
-        """How few other strands cover what of each followed one is covered `(n,)`, 0 for nothing.
+        """How few other strands cover what of each followed one is covered `(N,)`, 0 for nothing.
 
         Always the one next that covers most of what is left.
         """

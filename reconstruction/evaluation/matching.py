@@ -31,7 +31,7 @@ THRESHOLDS = (Threshold(1e-3, 10.0), Threshold(2e-3, 20.0), Threshold(3e-3, 30.0
 
 
 class Matches:
-    """For each threshold, which of the `drawn (n,)` points match a point shown so far.
+    """For each threshold, which of the `drawn (N,)` points match a point shown so far.
 
     `found (T, n)` takes tangents as lines, `directed (T, n)` as arrows from root to tip.
     """
@@ -64,7 +64,7 @@ def scores(
 ) -> dict[str, dict[str, float]]:
     """Precision, recall and F at each threshold, as `compare_strands` returns them.
 
-    With `predicted (n,)` and `true (m,)` only of those of the drawn points.
+    With `predicted (N,)` and `true (m,)` only of those of the drawn points.
     """
     out = {}
     for k, threshold in enumerate(THRESHOLDS):
@@ -158,8 +158,9 @@ def compare_strands(
     without the visible ones where no `visibility` of the true strands is given. Visible precision
     scores the visible predictions against all of the truth, visible recall the visible truth
     against all predictions; visible is what is not hidden from every camera by the true strands or
-    the head by more than 1 mm. Directed ones compare tangents as arrows from root to tip. `scores` maps `1mm_10deg`,
-    `2mm_20deg`, `3mm_30deg` to `{"precision", "recall", "f", "precision_error", "recall_error"}`.
+    the head by more than 1 mm. Directed ones compare tangents as arrows from root to tip. `scores`
+    maps `1mm_10deg`, `2mm_20deg`, `3mm_30deg` to
+    `{"precision", "recall", "f", "precision_error", "recall_error"}`.
 
     At most `samples` points of each set are scored (all of them for None), drawn by `seed`, always
     against the whole other set; the `_error`s are the standard errors that this leaves. Without

@@ -40,7 +40,7 @@ OVERSAMPLING = 5
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """`points (n, 3)`, the `strand (n,)` of each, and its unit `tangents (n, 3)`, root to tip.
+    """`points (N, 3)`, the `strand (N,)` of each, and its unit `tangents (N, 3)`, root to tip.
 
     Where a strand has no length, the tangent is 0.
     """
@@ -138,7 +138,7 @@ class OrientedPoints:
         return Drawn(block.points, block.tangents, block.strand, complete)
 
     def of_strands(self, which: Ints) -> Block:
-        """All points of the strands `which`, in that order."""
+        """All points of the strands `which (M,)`, in that order."""
         counts = np.diff(self.offsets)[which]
         strand = np.repeat(which, counts)
         place = np.arange(len(strand)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -156,14 +156,14 @@ class OrientedPoints:
 
 
 def _directions(before: Floats, after: Floats) -> Floats:
-    """Unit vectors `(n, 3)`; 0 where both points coincide."""
+    """Unit vectors `(N, 3)`; 0 where both points coincide."""
     d = after.astype(float) - before
     norm = np.linalg.norm(d, axis=1, keepdims=True)
     return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
 
 
 def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Ints, Ints]]:
-    """Indices `(n,)`, `(n,)` of points and points of `other` at most `reach` metres apart.
+    """Indices `(N,)`, `(N,)` of points and points of `other` at most `reach` metres apart.
 
     They come in parts of about `MOST_PAIRS`, those of one point together.
     """

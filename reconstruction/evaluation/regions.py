@@ -53,7 +53,7 @@ class HeadSphere:
         return cls(center, radius)
 
     def scalp_regions(self, roots: AnyFloats) -> Ints:
-        """Indices into `SCALP (n,)` of `roots (n, 3)`: z is up and the face looks towards -y.
+        """Indices into `SCALP (N,)` of `roots (N, 3)`: z is up and the face looks towards -y.
 
         Seen from the centre: what rises over 50° is top, the rest in quarters of 90° to the front,
         the sides and the back; below the centre the back is the nape.
@@ -101,7 +101,7 @@ class HairDepth:
         self._grid = grid
 
     def regions(self, points: AnyFloats) -> Ints:
-        """Indices into `DEPTHS (n,)` of `points (n, 3)`; outside the hair is outer."""
+        """Indices into `DEPTHS (N,)` of `points (N, 3)`; outside the hair is outer."""
         ijk = self._grid.index(points)
         on = ((ijk >= 0) & (ijk < self._depth.shape)).all(axis=1)
         depth = np.zeros(len(points), np.float32)

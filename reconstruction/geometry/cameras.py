@@ -135,7 +135,7 @@ class Pinhole:
         )
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Self:
-        """The pinhole seen by a subject that moved by `x -> rotation @ x + translation`.
+        """The pinhole that a moved subject sees: `x -> rotation (3, 3) @ x + translation (3,)`.
 
         Imaging the moved subject from here equals imaging the unmoved one from the result.
         """

@@ -67,7 +67,7 @@ class Lens:
         return np.asarray(_weight(mask, self.to_shot) > 0)
 
     def distort_mask(self, mask: Bools) -> Bools:
-        """The inverse of `undistort_mask`."""
+        """The inverse of `undistort_mask`: a mask `(H, W)` as the lens shows it."""
         return np.asarray(_weight(mask, self.to_undistorted) >= 0.5)
 
     def kept(self) -> float:

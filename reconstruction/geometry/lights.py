@@ -76,7 +76,7 @@ class Light:
         return self.intensity * np.broadcast_to(share, away.shape[:-1])[..., None]
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Light:
-        """The light seen by a subject that moved by `x -> rotation @ x + translation`."""
+        """The light that a moved subject sees: `x -> rotation (3, 3) @ x + translation (3,)`."""
         Q, d = np.asarray(rotation, float), np.asarray(translation, float)
         turned = None if self.orientation is None else self.orientation @ Q
         return replace(self, position=Q.T @ (self.position - d), orientation=turned)
@@ -104,7 +104,7 @@ class Light:
 
 
 def dome_positions(count: int, radius: float, lowest_deg: float = -90.0) -> Array:
-    """`count` nearly evenly spaced points `(count, 3)` on a sphere about the origin.
+    """`count` nearly evenly spaced points `(N, 3)` on a sphere about the origin.
 
     A Fibonacci spiral from the zenith down to the elevation `lowest_deg`; `radius` in metres.
     """

@@ -52,7 +52,7 @@ class Mesh:
         return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Mesh:
-        """The mesh moved by `x -> rotation @ x + translation`."""
+        """The mesh moved by `x -> rotation (3, 3) @ x + translation (3,)`."""
         moved = self.vertices @ np.asarray(rotation, float).T + np.asarray(translation, float)
         return Mesh(moved, self.faces, self.scalp)
 

@@ -43,7 +43,7 @@ class Projector(Pinhole):
         return np.concatenate([normal, -(normal @ self.center)[..., None]], axis=-1)
 
     def row_weight(self, row: ArrayLike, v: ArrayLike) -> Array:
-        """Share of the all-on light that reaches row coordinate `v` when `row` alone is lit."""
+        """Share `(...)` of the all-on light that reaches row `v` when `row` alone is lit."""
         offset = np.asarray(row, float) - np.asarray(v, float)
         return np.asarray(
             ndtr((offset + 0.5) / self.line_sigma) - ndtr((offset - 0.5) / self.line_sigma)

@@ -12,7 +12,7 @@ from reconstruction.arrays import Array
 
 
 def ellipsoid(p: Array, center: ArrayLike, radii: ArrayLike, tilt_deg: float = 0.0) -> Array:
-    """Approximate signed distance to an ellipsoid turned by `tilt_deg` about x."""
+    """Approximate distance `(...)` of `p (..., 3)` to an ellipsoid turned by `tilt_deg` about x."""
     c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
     q = p - np.asarray(center)
     q = np.stack([q[..., 0], c * q[..., 1] - s * q[..., 2], s * q[..., 1] + c * q[..., 2]], -1)
@@ -23,7 +23,10 @@ def ellipsoid(p: Array, center: ArrayLike, radii: ArrayLike, tilt_deg: float = 0
 
 
 def capsule(p: Array, a: ArrayLike, b: ArrayLike, r_a: float, r_b: float) -> Array:
-    """Distance to a rod from `a` to `b` with round ends, whose radius goes from `r_a` to `r_b`."""
+    """Distance `(...)` of `p (..., 3)` to a rod from `a (3,)` to `b (3,)`.
+
+    Its ends are round, its radius goes from `r_a` to `r_b`.
+    """
     a, b = np.asarray(a, float), np.asarray(b, float)
     h = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
     return np.asarray(
@@ -32,11 +35,11 @@ def capsule(p: Array, a: ArrayLike, b: ArrayLike, r_a: float, r_b: float) -> Arr
 
 
 def blend(a: Array, b: Array, width: float) -> Array:
-    """Union whose seam is rounded over `width` metres (polynomial smooth minimum)."""
+    """Union `(...)` whose seam is rounded over `width` metres (polynomial smooth minimum)."""
     h = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
     return b + h * (a - b) - width * h * (1 - h)
 
 
 def carve(a: Array, b: Array, width: float) -> Array:
-    """`a` without `b`, the edge rounded over `width` metres."""
+    """`a (...)` without `b (...)`, the edge rounded over `width` metres."""
     return -blend(-a, b, width)

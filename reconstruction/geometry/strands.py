@@ -61,7 +61,7 @@ class Strands:
         return len(self.offsets) - 1
 
     def __getitem__(self, i: int) -> Floats:
-        """Points `(n, 3)` of strand `i`."""
+        """Points `(N, 3)` of strand `i`."""
         if not 0 <= i < len(self):
             raise IndexError(f"strand {i} of {len(self)}")
         return self.points[self.offsets[i] : self.offsets[i + 1]]
@@ -73,7 +73,7 @@ class Strands:
 
     @property
     def segment_starts(self) -> Ints:
-        """Index of the first point of each segment `(N - S,)`; its second is one further."""
+        """Indices `(N - S,)` of each segment's first point; its second is one further."""
         keep = np.ones(len(self.points), bool)
         keep[self.offsets[1:] - 1] = False
         return np.flatnonzero(keep)
@@ -104,7 +104,7 @@ class Strands:
         return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
 
     def subset(self, which: ArrayLike) -> Strands:
-        """The strands at the indices (or the mask) `which`, in that order."""
+        """The strands at the indices (or the mask) `which (M,)`, in that order."""
         which = np.asarray(which)
         index = np.arange(len(self))[which if which.size else which.astype(np.int64)]
         counts = np.diff(self.offsets)[index]
@@ -114,7 +114,7 @@ class Strands:
         return Strands(self.points[take], offsets, radius)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Strands:
-        """The strands moved by `x -> rotation @ x + translation`."""
+        """The strands moved by `x -> rotation (3, 3) @ x + translation (3,)`."""
         moved = self.points.astype(float) @ np.asarray(rotation, float).T + np.asarray(translation)
         return replace(self, points=moved.astype(np.float32))
 
@@ -147,7 +147,7 @@ class Resampling:
         self.offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
     def __call__(self, index: Ints) -> tuple[Floats, float | Floats]:
-        """Points `(n, 3)` at `index (n,)` among all the resampled ones, and their radius."""
+        """Points `(N, 3)` at `index (N,)` among all the resampled ones, and their radius."""
         p, offsets, arc = self.strands.points, self.strands.offsets, self._arc
         strand = np.searchsorted(self.offsets, index, side="right") - 1
         last = np.diff(self.offsets)[strand] - 1
@@ -166,7 +166,7 @@ class Resampling:
 
 
 def smoothed(line: Array, sigma: float) -> Array:
-    """The polyline `(n, 3)` under a Gaussian of `sigma` metres along it, its ends where they were.
+    """The polyline `(N, 3)` under a Gaussian of `sigma` metres along it, its ends where they were.
 
     Points a third of a millimetre apart and a tenth aside turn by more than ten degrees from one
     to the next: where they lie is well known, where they lead to is not, before this.

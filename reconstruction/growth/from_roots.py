@@ -103,7 +103,7 @@ def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> A
 
 
 def to_polylines(paths: Paths) -> list[Floats]:
-    """The paths as a list of points `(n_i, 3)`."""
+    """The points `(N, 3)` of each path."""
     columns = np.ascontiguousarray(paths.points.transpose(1, 0, 2))
     return [columns[i, :n] for i, n in enumerate(paths.counts)]
 
@@ -189,7 +189,7 @@ def fill_gaps(
     within: float | None = None,
     batch: int = 1500,
 ) -> list[Floats]:
-    """Strands `(n, 3)` through the voxels that no strand passes, traced both ways from random ones.
+    """Strands `(N, 3)` through the voxels that no strand passes, traced both ways from random ones.
 
     Only voxels within `within` metres of a measured one are set out from: Photobooth §3.4 deletes
     strands that meet nothing measured, and the volume between hair and face has no hair. None takes

@@ -136,7 +136,7 @@ def conjugate_gradient_steps(
 
 
 def explicit_steps(A: sparse.csr_array, b: Array, start: Array) -> Iterator[tuple[Array, Array]]:
-    """The heat equation's explicit steps, Δt = h²/6: iterates and residuals, as above."""
+    """The heat equation's explicit steps, Δt = h²/6: iterates and residuals `(F, 6)`."""
     x = np.array(start, dtype=float)
     while True:
         r = b - A @ x
@@ -175,7 +175,7 @@ def conjugate_gradients(
 def explicit_diffusion(
     A: sparse.csr_array, b: Array, start: Array, seconds: float, begin: float | None = None
 ) -> tuple[Array, Series]:
-    """`explicit_steps` for at most `seconds`: the plain reference.
+    """`explicit_steps` from `start (F, 6)` for at most `seconds`: the plain reference.
 
     Returns x and the relative residual against run time.
     """

@@ -41,7 +41,7 @@ class Rooted:
 
 
 def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
-    """Give every loose polyline `(n, 3)` a root; its direction in space is not changed.
+    """Give every loose polyline `(N, 3)` a root; its direction in space is not changed.
 
     An end within 8 mm of the scalp is led to it. Any other goes on as the nearest rooted strand
     that continues it within 45 degrees: where the scalp is at most 40 mm below, down through the

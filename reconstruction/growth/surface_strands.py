@@ -88,7 +88,7 @@ class LineCloud:
         return mean, middle, support
 
     def trace(self, starts: Array, along: Array) -> list[Array]:
-        """Paths `(n, 3)` from `starts (N, 3)`, setting out along `along (N, 3)`."""
+        """Paths `(N, 3)` from `starts (N, 3)`, setting out along `along (N, 3)`."""
         o = self._options
         p, d = starts.copy(), along.copy()
         active = np.arange(len(p))
@@ -111,7 +111,7 @@ class LineCloud:
 def surface_strands(
     lines: Measured, options: SurfaceOptions = SurfaceOptions(), *, seed: int = 0, batch: int = 2000
 ) -> list[Floats]:
-    """Polylines `(n, 3)` through measured lines, both ways from lines that none passes yet.
+    """Polylines `(N, 3)` through measured lines, both ways from lines that none passes yet.
 
     Lines are taken `batch` at a time in an order drawn by `seed`.
     """

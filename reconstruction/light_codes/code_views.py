@@ -60,10 +60,10 @@ def light_beside(camera: Camera, lights: Sequence[Light], subject: ArrayLike = (
 
 
 def nearest_views(views: Sequence[View], subject: ArrayLike, count: int) -> list[list[int]]:
-    """For each view, the other views by their angle to it as seen from `subject`, nearest first.
+    """For each view, the other views by their angle to it as seen from `subject (3,)`.
 
-    At most `count` of them, and none that stands more than a right angle away: they see the other
-    side.
+    Nearest first, at most `count` of them, and none that stands more than a right angle away:
+    they see the other side.
     """
     to = np.stack([v.camera.center for v in views]) - np.asarray(subject, float)
     to /= np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-12)

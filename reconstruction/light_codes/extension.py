@@ -32,7 +32,7 @@ def fewest_views(count: int) -> int:
 def extend(
     views: Sequence[View], strands: list[Array], options: ExtensionOptions = ExtensionOptions()
 ) -> list[Array]:
-    """The polylines with what grows at both of their tips.
+    """The polylines `(N, 3)` with what grows at both of their tips.
 
     At a tip, the views in which the strand's direction runs along the line under it give the new
     direction (Eq. 4 over these); the strand goes on one step that way, and ends where too few are

@@ -27,7 +27,7 @@ def line_strands(
     options: LightCodeOptions = DEFAULTS,
     progress: Progress = silent,
 ) -> tuple[list[Array], Segments]:
-    """Polylines `(n, 3)` from line stereo, the end that is nearer to the head first.
+    """Polylines `(N, 3)` from line stereo, the end that is nearer to the head first.
 
     Without a head it is the higher end. None of them is rooted. Also the segments that they come
     from. Raises `CaptureError` as `measure_segments` does.

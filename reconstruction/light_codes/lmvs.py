@@ -36,7 +36,7 @@ class LmvsSearch(DepthSearch):
     def search(
         self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
     ) -> tuple[Any, ...]:
-        """See `DepthSearch.search`; the agreement is 1 less the cost over a right angle."""
+        """As `DepthSearch.search`; the agreement `(P,)` is 1 less the cost over a right angle."""
         t, options = self.types, self.options
         pixels.code = []  # this method knows no lightcode: nothing is compared, all is equal
         along = self._in_plane(view, x, y)

@@ -130,7 +130,7 @@ def connect_segments(
     report: Report,
     options: LightCodeOptions = DEFAULTS,
 ) -> list[Array]:
-    """Polylines `(n, 3)` through the segments, with what grows from their tips."""
+    """Polylines `(N, 3)` through the segments, with what grows from their tips."""
     with report.stage("connection") as stage:
         # of the segments that ten views agree on, three times as many are right as of those of four
         weights = (segments.confidence * segments.supports) ** 2

@@ -157,7 +157,7 @@ class DepthSearch:
     def search(
         self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
     ) -> tuple[Any, ...]:
-        """Depth, direction, agreement, spread and misfit of every lane, as numpy arrays.
+        """Depth `(P,)`, direction `(P, 3)`, agreement, spread and misfit `(P,)` of every lane.
 
         Lane i tries `counts[i]` depths from `start[i]` on.
         """

@@ -49,7 +49,7 @@ class Motion:
 
     @classmethod
     def none(cls, steps: ArrayLike = ()) -> Motion:
-        """The motion of a subject that kept still."""
+        """The motion at `steps (T,)` of a subject that kept still."""
         index = np.asarray(steps, np.int64)
         n = len(index)
         return cls(index, np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), still=True)

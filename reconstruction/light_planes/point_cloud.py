@@ -77,7 +77,7 @@ class PointCloud:
         return cls(**columns, cameras=first.cameras, projectors=first.projectors)
 
     def subset(self, which: ArrayLike) -> PointCloud:
-        """The points at the indices (or the mask) `which`."""
+        """The points at the indices (or the mask) `which (M,)`."""
         index = np.arange(len(self))[np.asarray(which)]
         columns = {k: getattr(self, k)[index] for k in _COLUMNS}
         return PointCloud(**columns, cameras=self.cameras, projectors=self.projectors)

@@ -268,7 +268,7 @@ def align(
 
 
 def likeness(views: list[_View], images: dict[str, Array], pose: Pose) -> float:
-    """How alike the pictures at the moved points and the reference are: correlation, at most 1.
+    """How alike `images (H, W)` at the moved points and the reference are: correlation, at most 1.
 
     The median over the cameras; what left a picture counts as unlike.
     """

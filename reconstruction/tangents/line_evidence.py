@@ -13,7 +13,7 @@ from reconstruction.geometry.cameras import Camera
 
 
 def half_sphere(count: int) -> Array:
-    """`count` nearly evenly spaced unit vectors `(count, 3)` of the half sphere z >= 0."""
+    """`count` nearly evenly spaced unit vectors `(N, 3)` of the half sphere z >= 0."""
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     z = (np.arange(count) + 0.5) / count
