@@ -33,8 +33,12 @@ def parse_options(kind: type[T], values: Mapping[str, Any], place: str = "option
     try:
         return TypeAdapter(kind).validate_python(dict(values))
     except ValidationError as error:
-        raise BadOptions(
-            "; ".join(
-                ".".join((place, *map(str, e["loc"]))) + f": {e['msg']}" for e in error.errors()
-            )
-        ) from error
+        raise BadOptions(sentence(error, place)) from error
+
+
+def sentence(error: ValidationError, place: str = "") -> str:
+    """Each field that is wrong with its place, below `place`, and why."""
+    above = (place,) if place else ()
+    return "; ".join(
+        f"{'.'.join(map(str, (*above, *e['loc'])))}: {e['msg']}" for e in error.errors()
+    )

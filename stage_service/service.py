@@ -136,9 +136,7 @@ class Service:
             armed_by=request.armed_by,
             head=head,
             masks=self._masks(request.masks) if request.masks is not None else None,
-            extra={"pipeline": request.pipeline.model_dump(mode="json")}
-            if request.pipeline is not None
-            else {},
+            extra={"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {},
         )
         return self.capture(capture)
 

@@ -57,3 +57,18 @@ class InverseRenderingOptions:
     check_every: Count = 10
     halvings: Annotated[int, Field(ge=0)] = 2
     validation_views: Count = 3
+
+
+@options
+class InverseRenderingRequest:
+    """What a job may ask for.
+
+    `hair_pixels` a camera are fitted, one colour before the volume. `max_depth` is the number of
+    vertices a path may have; None measures what the hair needs. Held-out images are judged with
+    `judged_spp` paths a pixel. `fit` is how the fit is run.
+    """
+
+    hair_pixels: Count = 4000
+    judged_spp: Count = 48
+    max_depth: Count | None = None
+    fit: InverseRenderingOptions = field(default_factory=InverseRenderingOptions)

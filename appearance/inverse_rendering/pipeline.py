@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import save_lights
 from appearance.inverse_rendering.held_out import Sampling, held_out_frames, judge
 from appearance.inverse_rendering.loop import Monitor, Outcome, run
-from appearance.inverse_rendering.options import InverseRenderingOptions
+from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
 from appearance.inverse_rendering.problem import Problem
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
@@ -25,29 +24,11 @@ from reconstruction.capture.folder import Capture
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.model import Model, ModelError
-from reconstruction.options import options
 from reconstruction.report.report import Progress, Series, Stage, silent
-
-Count = Annotated[int, Field(gt=0)]
 
 JUDGED_IMAGES = 6
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
-
-
-@options
-class InverseRenderingRequest:
-    """What a job may ask for.
-
-    `hair_pixels` a camera are fitted, one colour before the volume. `max_depth` is the number of
-    vertices a path may have; None measures what the hair needs. Held-out images are judged with
-    `judged_spp` paths a pixel. `fit` is how the fit is run.
-    """
-
-    hair_pixels: Count = 4000
-    judged_spp: Count = 48
-    max_depth: Count | None = None
-    fit: InverseRenderingOptions = Field(default_factory=InverseRenderingOptions)
 
 
 def inverse_rendering(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from appearance.metrics.pictures import comparison_picture
 from appearance.metrics.scores import (
@@ -20,6 +19,7 @@ from appearance.metrics.scores import (
     ssim,
 )
 from appearance.model.fitted_model import FittedModel
+from appearance.model.options import AssessOptions
 from appearance.model.relight import relight
 from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.smoothed import olat_smoothed
@@ -30,26 +30,11 @@ from reconstruction.arrays import AnyFloats, Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.lights import Light
 from reconstruction.model import Model, ModelError
-from reconstruction.options import options
 from reconstruction.report.report import Progress, Stage, silent
 
 METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
 COLUMNS = ("captured", "ours", "diffuse", "three_nearest")
 MAX_DEPTH = 16
-Count = Annotated[int, Field(gt=0)]
-
-
-@options
-class AssessOptions:
-    """How much is compared: cameras and lights are spread evenly over what is there."""
-
-    cameras: Count = 2
-    lights: Count = 5
-    spp: Count = 49
-    baseline_pixels: Count = 100
-    baseline_lights: Count = 48
-    relit_size: Count = 320
-    relit_spp: Count = 36
 
 
 @dataclass(frozen=True, eq=False)

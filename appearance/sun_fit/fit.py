@@ -5,10 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut, Observed, chosen, observe
@@ -22,6 +20,7 @@ from appearance.sun_fit.longitudinal import (
     variance_of_roughness,
 )
 from appearance.sun_fit.mirror_samples import MirrorSamples, binned, mirror_lights, mirror_samples
+from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import (
     Colours,
     Lobe,
@@ -34,27 +33,11 @@ from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
 from reconstruction.arrays import Array, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.model import Model
-from reconstruction.options import options
 from reconstruction.report.report import Progress, Report, Series, Stage, silent
 
 MAX_DEPTH = 16
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
-
-
-Count = Annotated[int, Field(gt=0)]
-
-
-@options
-class FitOptions:
-    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
-
-    hair_pixels: Count = 1000
-    skin_pixels: Count = 200
-    roughness_cameras: Count = 4
-    roughness_spp: Count = 12
-    colour_spp: Count = 16
-    iterations: Count = 5
 
 
 def fit(

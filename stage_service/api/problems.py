@@ -262,10 +262,10 @@ def install_problems(app: FastAPI) -> None:
     async def invalid(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, RequestValidationError)
         errors = [
-            {"field": ".".join(str(p) for p in e["loc"]), "message": e["msg"]}
+            {"loc": ".".join(str(p) for p in e["loc"] if p != "body"), "msg": e["msg"]}
             for e in error.errors()
         ]
-        detail = "; ".join(f"{e['field']}: {e['message']}" for e in errors)
+        detail = "; ".join(f"{e['loc']}: {e['msg']}" for e in errors)
         return problem_response(request.url.path, "invalid-request", detail, errors=errors)
 
     async def http(request: Request, error: Exception) -> JSONResponse:

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.jobs import add_pipeline, wait_for_job
 from stage_service.cli.support import (
-    BAD_INPUT,
     FAILED,
-    CommandError,
     Commands,
     Output,
     add_group,
@@ -53,20 +51,12 @@ def add(commands: Commands) -> None:
 def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
     """Cost a plan; with a rig file, without a service or a device."""
     if args.rig is not None:
-        from pydantic import ValidationError
-
+        from reconstruction.options import parse_options
         from stage_service.config import load_rig_file
         from stage_service.plan.capture_plan import CapturePlan
         from stage_service.plan.resolved import resolve
 
-        try:
-            plan = CapturePlan.model_validate(read_json(args.plan))
-        except ValidationError as error:
-            problems = "; ".join(
-                f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}"
-                for e in error.errors()
-            )
-            raise CommandError(f"{args.plan}: {problems}", BAD_INPUT) from error
+        plan = parse_options(CapturePlan, read_json(args.plan), str(args.plan))
         cost = resolve(plan, load_rig_file(args.rig)).cost.model_dump(mode="json")
     else:
         cost = service.post("/plans:validate", read_json(args.plan))

@@ -74,7 +74,7 @@ class JobQueue:
             "pipeline": pipeline,
             "capture": str(capture.resolve()),
             "model": str(model.resolve()),
-            "options": options.model_dump(mode="json"),
+            "options": options.to_dict(),
         }
         self._client.enqueue(
             {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job}, spec
@@ -123,7 +123,7 @@ def _job(status: WorkflowStatus) -> Job:
         outcome=outcome,
         capture=spec["capture"],
         model=spec["model"],
-        options=JobOptions(**spec["options"]),
+        options=spec["options"],
         progress=read_progress(Path(spec["model"]), status.workflow_id),
         error=error,
         created=_time(status.created_at) or "",

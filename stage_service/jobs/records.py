@@ -6,7 +6,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from appearance.inverse_rendering.options import InverseRenderingRequest
+from appearance.model.options import AssessOptions
+from appearance.sun_fit.options import FitOptions
 from reconstruction.methods import Method
+from stage_service.jobs.pipelines import PIPELINES
 
 JobState = Literal["queued", "running", "done"]
 JobOutcome = Literal["succeeded", "failed", "cancelled"]
@@ -15,14 +19,11 @@ JobOutcome = Literal["succeeded", "failed", "cancelled"]
 class JobOptions(BaseModel):
     """What a pipeline may be told; every field has a default that works.
 
-    `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may look at:
+    `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may observe:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
     against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
     file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering` and `assess` go to the step
-    of that name: fields of `reconstruction.pipeline.ReconstructOptions`,
-    `appearance.sun_fit.fit.FitOptions`,
-    `appearance.inverse_rendering.pipeline.InverseRenderingRequest`,
-    `appearance.model.assess.AssessOptions`.
+    of that name.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,9 +36,13 @@ class JobOptions(BaseModel):
     truth: str | None = None
     seed: int = Field(default=0, ge=0)
     reconstruct: dict[str, Any] = Field(default_factory=dict)
-    fit: dict[str, Any] = Field(default_factory=dict)
-    inverse_rendering: dict[str, Any] = Field(default_factory=dict)
-    assess: dict[str, Any] = Field(default_factory=dict)
+    fit: FitOptions = Field(default_factory=FitOptions)
+    inverse_rendering: InverseRenderingRequest = Field(default_factory=InverseRenderingRequest)
+    assess: AssessOptions = Field(default_factory=AssessOptions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What differs from the defaults, as JSON."""
+        return self.model_dump(mode="json", exclude_defaults=True)
 
 
 class PipelineRequest(BaseModel):
@@ -48,11 +53,13 @@ class PipelineRequest(BaseModel):
     name: str
     options: JobOptions = JobOptions()
 
+    def to_dict(self) -> dict[str, Any]:
+        """The request as JSON that makes it again."""
+        return {"name": self.name, "options": self.options.to_dict()}
+
     @field_validator("name")
     @classmethod
     def _known(cls, name: str) -> str:
-        from stage_service.jobs.pipelines import PIPELINES
-
         if name not in PIPELINES:
             raise ValueError(f"there is no pipeline {name!r}; there are {sorted(PIPELINES)}")
         return name
@@ -80,7 +87,10 @@ class JobError(BaseModel):
 
 
 class Job(BaseModel):
-    """One run of a pipeline. `outcome` is set exactly when `state` is `done`; times are UTC."""
+    """One run of a pipeline. `outcome` is set exactly when `state` is `done`; times are UTC.
+
+    `options` are those that were asked for; defaults are left out.
+    """
 
     model_config = ConfigDict(
         frozen=True,
@@ -88,30 +98,20 @@ class Job(BaseModel):
             "examples": [
                 {
                     "id": "job-20261121-093000-1f2e",
-                    "pipeline": "light_planes",
+                    "pipeline": "reconstruct",
                     "state": "running",
-                    "outcome": None,
                     "capture": "/data/stage/captures/20261121-093000-1f2e",
                     "model": "/data/stage/models/20261121-093000-1f2e",
-                    "options": {"held_out_cameras": ["cam_07"], "environment": "studio"},
+                    "options": {"held_out_cameras": ["cam_07"]},
                     "progress": {
                         "step": "reconstruct",
-                        "steps": [
-                            "compress",
-                            "reconstruct",
-                            "fit",
-                            "assess",
-                            "evaluate",
-                            "results",
-                        ],
+                        "steps": ["reconstruct", "evaluate", "results"],
                         "what": "tracing strands",
-                        "share": 0.28,
+                        "share": 0.23,
                         "step_share": 0.7,
                     },
-                    "error": None,
                     "created": "2026-11-21T09:31:12.000+00:00",
                     "started": "2026-11-21T09:31:13.000+00:00",
-                    "finished": None,
                 }
             ]
         },
@@ -123,7 +123,7 @@ class Job(BaseModel):
     outcome: JobOutcome | None = None
     capture: str
     model: str
-    options: JobOptions
+    options: dict[str, Any]
     progress: JobProgress | None = None
     error: JobError | None = None
     created: str

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from reconstruction.capture.folder import Capture
 from reconstruction.model import Model
-from reconstruction.options import parse_options
 from reconstruction.report.report import Progress
 from stage_service.jobs.records import JobOptions
 
@@ -67,14 +66,13 @@ def reconstruct(context: StepContext) -> Figures:
 
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
-    from appearance.sun_fit.fit import FitOptions
     from appearance.sun_fit.fit import fit as run
 
     run(
         Capture(context.capture),
         Model(context.model),
         held_out=_held_out(context.options),
-        options=parse_options(FitOptions, context.options.fit, "options.fit"),
+        options=context.options.fit,
         progress=context.progress,
         seed=context.options.seed,
     )
@@ -86,7 +84,6 @@ def inverse_rendering(context: StepContext) -> Figures:
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
-    from appearance.inverse_rendering.pipeline import InverseRenderingRequest
     from appearance.inverse_rendering.pipeline import inverse_rendering as run
 
     asked = context.options
@@ -94,9 +91,7 @@ def inverse_rendering(context: StepContext) -> Figures:
         Capture(context.capture),
         Model(context.model),
         held_out=_held_out(asked),
-        request=parse_options(
-            InverseRenderingRequest, asked.inverse_rendering, "options.inverse_rendering"
-        ),
+        request=asked.inverse_rendering,
         progress=context.progress,
         seed=asked.seed,
     )
@@ -105,7 +100,6 @@ def inverse_rendering(context: StepContext) -> Figures:
 
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
-    from appearance.model.assess import AssessOptions
     from appearance.model.assess import assess as run
 
     return run(
@@ -113,7 +107,7 @@ def assess(context: StepContext) -> Figures:
         Model(context.model),
         held_out=_held_out(context.options),
         environment=context.options.environment,
-        options=parse_options(AssessOptions, context.options.assess, "options.assess"),
+        options=context.options.assess,
         seed=context.options.seed,
         progress=context.progress,
     )

@@ -18,6 +18,7 @@ from typing import Any
 from dbos import DBOS, DBOSPortableJSONSerializer
 from dbos import error as dbos_error
 
+from reconstruction.options import parse_options
 from stage_service.jobs.pipelines import PIPELINES, STEPS_VERSION
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, WorkerStopping
 from stage_service.jobs.queue import APP, QUEUE, WORKFLOW, JobQueue, database_url
@@ -62,7 +63,7 @@ class Worker:
         progress = StepProgress(
             model, job, step, PIPELINES[spec["pipeline"]], lambda: self._interrupted(job)
         )
-        options = JobOptions(**spec["options"])
+        options = parse_options(JobOptions, spec["options"])
         context = StepContext(Path(spec["capture"]), model, options, progress, previous)
         with self._slots:
             log.info("%s: %s begins", job, step)

@@ -145,5 +145,11 @@ def _is_ours(error: Exception) -> bool:
 
 
 def _message(error: Exception) -> str:
-    """The error's sentence; a `KeyError` quotes it, which nobody wants to read."""
+    """The error's sentence; a `KeyError` quotes it, pydantic makes paragraphs of it."""
+    from pydantic import ValidationError
+
+    from reconstruction.options import sentence
+
+    if isinstance(error, ValidationError):
+        return sentence(error)
     return str(error.args[0]) if isinstance(error, LookupError) and error.args else str(error)

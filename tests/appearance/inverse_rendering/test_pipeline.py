@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.pipeline import InverseRenderingRequest, inverse_rendering
+from appearance.inverse_rendering.options import InverseRenderingRequest
+from appearance.inverse_rendering.pipeline import inverse_rendering
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance

@@ -6,7 +6,8 @@ import pytest
 
 from appearance.metrics.pictures import comparison_picture
 from appearance.metrics.scores import Exposure
-from appearance.model.assess import AssessOptions, assess, judge, three_nearest
+from appearance.model.assess import assess, judge, three_nearest
+from appearance.model.options import AssessOptions
 from appearance.model.relight import environment_map, three_quarter_view
 from appearance.observations import HeldOut
 from appearance.render.coverage import coverage

@@ -11,9 +11,10 @@ from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
-from appearance.sun_fit.fit import FitOptions, fit
+from appearance.sun_fit.fit import fit
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.longitudinal import variance_of_roughness
+from appearance.sun_fit.options import FitOptions
 from reconstruction.capture.folder import Capture, CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.strands import write_strands

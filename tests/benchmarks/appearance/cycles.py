@@ -20,7 +20,7 @@ from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from appearance.sun_fit.fit import FitOptions
+from appearance.sun_fit.options import FitOptions
 from benchmarks.appearance.hair_inverse import hair_inverse
 from benchmarks.subjects import Subject, cycles_subject
 from reconstruction.arrays import AnyFloats

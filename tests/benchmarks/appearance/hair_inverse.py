@@ -9,7 +9,8 @@ import numpy as np
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
-from appearance.sun_fit.fit import BETA_N, FitOptions, SunFit
+from appearance.sun_fit.fit import BETA_N, SunFit
+from appearance.sun_fit.options import FitOptions
 from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, Stage, silent
 

@@ -17,7 +17,7 @@ from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import mean_scores, scores, scores_unavailable
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
-from appearance.sun_fit.fit import FitOptions
+from appearance.sun_fit.options import FitOptions
 from benchmarks.appearance.hair_inverse import hair_inverse
 from benchmarks.appearance.known_subjects import Captured
 from benchmarks.command import within

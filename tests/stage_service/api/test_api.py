@@ -105,7 +105,7 @@ def test_a_plan_is_costed_without_touching_the_stage(http, world):
     assert "light_999" in problem(refused, "invalid-plan")["problems"][0]
     refused = http.post("/plans:validate", json={"exposures": {}})
     errors = problem(refused, "invalid-request")["errors"]
-    assert errors == [{"field": "body.exposures", "message": "Extra inputs are not permitted"}]
+    assert errors == [{"loc": "exposures", "msg": "Extra inputs are not permitted"}]
 
 
 def test_a_capture_its_frames_and_its_job(http, server, head):
@@ -299,6 +299,31 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
     assert "a model with strands" in problem(refused, "bad-input")["detail"]
 
 
+@pytest.mark.parametrize(
+    ("options", "place"),
+    [
+        ({"heldout": []}, "heldout"),
+        ({"seed": -1}, "seed"),
+        ({"fit": {"hair_pixel": 3}}, "fit.hair_pixel"),
+        ({"inverse_rendering": {"fit": {"stepps": 3}}}, "inverse_rendering.fit.stepps"),
+        (
+            {"inverse_rendering": {"fit": {"effort": {"spp": 0}}}},
+            "inverse_rendering.fit.effort.spp",
+        ),
+        ({"assess": {"cameras": 0}}, "assess.cameras"),
+    ],
+)
+def test_an_option_that_is_unknown_or_bad_is_refused_with_its_place(http, world, options, place):
+    pipeline = {"name": "light_planes", "options": options}
+    for path, body in (("/jobs", {"capture": "any"}), ("/captures", {"plan": SHORT})):
+        refused = problem(http.post(path, json={**body, "pipeline": pipeline}), "invalid-request")
+        (error,) = refused["errors"]
+        assert error["loc"] == f"pipeline.options.{place}"
+        assert f"{error['loc']}: {error['msg']}" == refused["detail"]
+    assert http.get("/jobs").json() == []
+    assert world.pulses == 0
+
+
 def test_every_route_of_the_api_is_there_and_documented(http):
     document = http.get("/openapi.json").json()
     routes = {
@@ -342,6 +367,8 @@ def test_every_route_of_the_api_is_there_and_documented(http):
         for example in model.model_json_schema()["examples"]:
             model.model_validate(example)
         assert model is Problem or schemas[model.__name__]["examples"]
+    assert "hair_pixels" in schemas["FitOptions"]["properties"]
+    assert schemas["Effort"]["properties"]["spp"]["exclusiveMinimum"] == 0
     problem(http.get("/nowhere"), "http")
     problem(http.put("/jobs"), "http")
 

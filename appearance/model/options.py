@@ -1,0 +1,24 @@
+"""What `assess` can be asked for; light, so that a service checks options without Mitsuba."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from reconstruction.options import options
+
+Count = Annotated[int, Field(gt=0)]
+
+
+@options
+class AssessOptions:
+    """How much is compared: cameras and lights are spread evenly over what is there."""
+
+    cameras: Count = 2
+    lights: Count = 5
+    spp: Count = 49
+    baseline_pixels: Count = 100
+    baseline_lights: Count = 48
+    relit_size: Count = 320
+    relit_spp: Count = 36

@@ -1,0 +1,23 @@
+"""What Sun's fit can be asked for; light, so that a service checks options without the fit."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from reconstruction.options import options
+
+Count = Annotated[int, Field(gt=0)]
+
+
+@options
+class FitOptions:
+    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
+
+    hair_pixels: Count = 1000
+    skin_pixels: Count = 200
+    roughness_cameras: Count = 4
+    roughness_spp: Count = 12
+    colour_spp: Count = 16
+    iterations: Count = 5
