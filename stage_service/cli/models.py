@@ -109,18 +109,19 @@ def run_reconstruct(args: argparse.Namespace, output: Output) -> int:
 def run_fit(args: argparse.Namespace, output: Output) -> int:
     """Fit the appearance."""
     from reconstruction.model import Model
+    from reconstruction.options import parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
 
     model, inverse = Model(args.model), args.method == "inverse_rendering"
-    options = JobOptions(
-        held_out_cameras=tuple(args.hold_out_camera),
-        held_out_lights=tuple(args.hold_out_light),
-        environment=args.environment,
-        seed=args.seed,
-        fit={} if inverse else _json(args.options),
-        inverse_rendering=_json(args.options) if inverse else {},
-    )
+    asked = {
+        "held_out_cameras": args.hold_out_camera,
+        "held_out_lights": args.hold_out_light,
+        "environment": args.environment,
+        "seed": args.seed,
+        "inverse_rendering" if inverse else "fit": _json(args.options),
+    }
+    options = parse_options(JobOptions, asked)
     data: dict[str, Any] = {"model": str(model), "method": args.method}
     if not inverse or not model.has("appearance.json"):
         with progress_bar("sun") as progress:
