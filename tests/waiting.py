@@ -13,7 +13,6 @@ from typing import TypeVar
 from simulators.peers.faults import Fault, Faults
 
 T = TypeVar("T")
-LONGEST_S = 60.0
 
 
 def machine_slack() -> int:
@@ -34,11 +33,12 @@ def slowed(faults: tuple[Fault, ...], slack: int) -> Faults:
     return Faults(tuple(replace(f, seconds=min(f.seconds * slack, 60.0)) for f in faults))
 
 
-def until(what: Callable[[], T], seconds: float = LONGEST_S) -> T:
+def until(what: Callable[[], T], seconds: float | None = None) -> T:
     """Poll for what another thread or process brings about; what `what` returns once it is true.
 
     `seconds` only where the deadline is what is tested, and then times `slack`.
     """
+    seconds = 60.0 * machine_slack() if seconds is None else seconds
     deadline = time.monotonic() + seconds
     while not (found := what()):
         assert time.monotonic() < deadline, f"it did not happen within {seconds:g} s"

@@ -49,7 +49,7 @@ def test_next_to_no_light_does_not_arrive_even_by_the_smallest_chance(brightest:
     assert not arriving((brightest, 0.0, 0.0), chance=0.0)[1]
 
 
-def test_a_chance_of_zero_stays_finite():
-    value, lit = arriving((1e-8, 0.0, 1e-8), chance=0.0)
+def test_a_chance_of_zero_counts_as_the_dimmest_light():
+    value, lit = arriving((1e-8, 0.0, 5e-9), chance=0.0)
     assert lit
-    assert np.isfinite(value).all()
+    np.testing.assert_allclose(value, [1.0, 0.0, 0.5], rtol=1e-5)

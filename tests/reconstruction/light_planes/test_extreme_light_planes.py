@@ -146,9 +146,12 @@ def test_rays_within_their_planes_leave_the_masks_alone(
     finite(tmp_path, report)
 
 
-def test_stripes_that_are_all_saturated_are_survived(stage: Shoot, tmp_path: Path) -> None:
+def test_stripes_that_are_all_saturated_are_found_at_their_middle(stage: Shoot, tmp_path: Path) -> None:
     report = reconstruct(stage(full_scale=0.02), Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
+    off = np.abs(np.linalg.norm(PointCloud.load(tmp_path / "points.npz").points, axis=1) - RADIUS)
+    assert np.median(off) < 5e-4  # the middle of a flat top
+    assert np.quantile(off, 0.9) < 1.5e-3
 
 
 def test_empty_masks_are_an_error(stage: Shoot, tmp_path: Path) -> None:
@@ -209,6 +212,10 @@ def test_a_single_strand_is_a_result(stage: Shoot, tmp_path: Path) -> None:
     paint_masks(capture, line)
     report = reconstruct(capture, Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
+    points = read_strands(tmp_path / "strands.npz").points
+    off = np.linalg.norm(points[:, None] - strand, axis=-1).min(axis=1)
+    assert np.median(off) < 1.5 * QUICK.grid
+    assert np.quantile(off, 0.9) < 3 * QUICK.grid
 
 
 def test_one_line_of_voxels_grows_one_strand() -> None:

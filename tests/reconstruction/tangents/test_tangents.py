@@ -76,6 +76,11 @@ def test_one_camera_leaves_a_plane() -> None:
     t = np.array([0.0, 0.0, 1.0])
     e = evidence_of(camera((0.0, -1.0, 0.0)), t)
     one = decide(line_scores(e, np.zeros((1, 3)), candidates, np.array([True])), candidates)
+    # In the plane of line and ray only the weight differs, the squared sine to the ray along y.
+    plane = np.array([t, [0, 0.6, 0.8], [0, -0.6, 0.8], [1, 0, 0]])
+    score = line_scores(e, np.zeros((1, 3)), plane, np.array([True]))[0]
+    assert score[1:3] == pytest.approx(0.64 * score[0], rel=1e-4)
+    assert score[3] < 0
     two = evidence_of(camera((1.0, 0.0, 0.0)), t)
     both = line_scores(e, np.zeros((1, 3)), candidates, np.array([True])) + line_scores(
         two, np.zeros((1, 3)), candidates, np.array([True])

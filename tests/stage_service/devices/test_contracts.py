@@ -70,7 +70,7 @@ def simulators(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigFile]:
             env=os.environ,
         )
     devices = folder / "devices.toml"
-    until(lambda: devices.exists() or process.poll() is not None, 120.0)
+    until(lambda: devices.exists() or process.poll() is not None)
     assert devices.exists(), (folder / "log").read_text()
     yield load_rig_file(folder / "rig.toml", devices)
     process.terminate()

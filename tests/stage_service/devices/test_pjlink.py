@@ -214,14 +214,18 @@ def test_an_answer_out_of_the_protocol_is_refused(answer: bytes) -> None:
 
 
 def test_lower_case_answers_are_read() -> None:
+    asked = b""
+
     def answers(link: socket.socket) -> None:
+        nonlocal asked
         link.sendall(b"pjlink 0\r")
-        link.recv(100)
+        asked = link.recv(100)
         link.sendall(b"%1powr=ok\r")
 
     port, thread = peer(answers)
     PjLinkProjector("front", "127.0.0.1", port).switch(True)
     thread.join()
+    assert asked == b"%1POWR 1\r"
 
 
 def test_several_lamps_are_read() -> None:
