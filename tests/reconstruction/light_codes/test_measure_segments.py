@@ -82,3 +82,61 @@ def test_fibres_are_found_in_views_that_are_all_saturated(fibres: Any, tmp_path:
     run(fibres.shoot(tmp_path / "capture", brightness=50.0, full_scale=1.0), tmp_path / "model")
     strands = read_strands(tmp_path / "model" / "strands.npz")
     assert compare_strands(strands, fibres.strands, samples=None)["all"]["2mm_20deg"]["f"] > 0.8
+
+
+def test_what_cannot_be_done_without_is_named(fibres: Any, tmp_path: Path) -> None:
+    dark = fibres.shoot(tmp_path / "dark", brightness=0.0)
+    with pytest.raises(CaptureError, match=r"no hair pixel has a direction|is found alike"):
+        run(dark, tmp_path / "m")
+    for name in (c.name for c in fibres.cameras):
+        mask = tmp_path / "dark" / "masks" / f"{name}.png"
+        cv2.imwrite(str(mask), 0 * cv2.imread(str(mask)))
+    with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
+        run(Capture(dark.path), tmp_path / "m")
+    unlit = Capture(dark.path)
+    unlit.steps = tuple(s for s in unlit.steps if s.kind != "olat")
+    with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
+        run(unlit, tmp_path / "m")
+
+
+def test_cameras_that_look_away_leave_no_volume(
+    make_fibres: Any, fibre_cameras: Any, tmp_path: Path
+) -> None:
+    stage = make_fibres()
+    turned = [c.moved(np.eye(3), c.R[0] * 0.5) for c in fibre_cameras(4)]
+    capture = make_fibres(cameras=turned).shoot(tmp_path / "capture")
+    assert len(stage.cameras) == 8
+    for camera in turned:  # masks of what is not there: the cameras' rays do not meet
+        mask = np.full((camera.height, camera.width), 255, np.uint8)
+        cv2.imwrite(str(tmp_path / "capture" / "masks" / f"{camera.name}.png"), mask)
+    with pytest.raises(CaptureError):
+        run(Capture(capture.path), tmp_path / "m")
+
+
+def test_strands_are_cut_at_the_balls_surface() -> None:
+    line = np.stack([np.linspace(-0.05, 0.05, 11), np.zeros(11), np.zeros(11)], axis=1)
+    outside = line + np.array([0, 0.5, 0])
+    bent = np.array([[-0.05, 0, 0], [0, 0, 0], [0, 0.05, 0], [0.005, 0.05, 0], [0.005, 0, 0]])
+    found = Ball((0, 0, 0), 0.02).cut(Strands.from_list([line, outside, bent]))
+    assert len(found) == 3
+    assert np.linalg.norm(found.points, axis=1).max() < 0.02
+    np.testing.assert_allclose(found.lengths()[0], 0.04, atol=1.1e-3)
+    assert len(Ball((0, 0, 0), 0.02).cut(Strands.from_list([outside]))) == 0
+
+
+def test_part_of_a_capture_keeps_what_was_asked(shot: Capture) -> None:
+    some = part_of(shot, cameras=3, lights=5)
+    assert [c.name for c in some.rig.cameras] == ["c0", "c4", "c7"]
+    assert len(some.olat_lights()) == 5
+    assert len(shot.olat_lights()) == 36
+
+
+def test_a_hull_is_cut_to_a_ball_and_its_grid_with_it() -> None:
+    hull = VoxelGrid(np.array([-0.05, -0.05, -0.05]), 2e-3, np.ones((60, 50, 50), bool))
+    center, radius = np.array([0.0, 0.01, -0.01]), 0.02013  # no centre lies on its surface
+    part = Ball(tuple(center), radius).within(hull, 0.0)
+    assert max(part.inside.shape) <= 22
+    distance = np.linalg.norm(part.centers() - center, axis=1)
+    assert distance.max() <= radius
+    assert len(distance) == (np.linalg.norm(hull.centers() - center, axis=1) <= radius).sum()
+    assert not Ball((1.0, 0.0, 0.0), 0.02).within(hull, 0.0).inside.any()

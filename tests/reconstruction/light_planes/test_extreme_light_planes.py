@@ -146,7 +146,9 @@ def test_rays_within_their_planes_leave_the_masks_alone(
     finite(tmp_path, report)
 
 
-def test_stripes_that_are_all_saturated_are_found_at_their_middle(stage: Shoot, tmp_path: Path) -> None:
+def test_stripes_that_are_all_saturated_are_found_at_their_middle(
+    stage: Shoot, tmp_path: Path
+) -> None:
     report = reconstruct(stage(full_scale=0.02), Model(tmp_path), options=QUICK)
     finite(tmp_path, report)
     off = np.abs(np.linalg.norm(PointCloud.load(tmp_path / "points.npz").points, axis=1) - RADIUS)
