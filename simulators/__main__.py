@@ -134,9 +134,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--truth", type=Path, help="write the true strands, head, poses here")
     parser.add_argument("--truth-only", type=Path, help="write the truth here and end")
-    parser.add_argument("--cache", type=Path, help="keep the lamps' responses here between runs")
+    parser.add_argument("--cache", type=Path, help="keep the lights' responses here between runs")
     parser.add_argument(
-        "--spp", type=int, default=Quality.lamps, help="paths per pixel (default: %(default)s)"
+        "--spp", type=int, default=Quality.lights, help="paths per pixel (default: %(default)s)"
     )
     parser.add_argument(
         "--processes",

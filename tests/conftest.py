@@ -121,11 +121,11 @@ class Flat:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
 
-    def lamps(self, camera: str) -> Response:
+    def lights(self, camera: str) -> Response:
         """Each lamp by itself."""
         return self._flat(camera, 0.1 * (1 + np.arange(len(self.rig.lights))))
 
-    def lamps_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
+    def lights_together(self, camera: str, pose: int, power: NDArray[np.float64]) -> Response:
         """All lamps at these powers."""
         return self._flat(camera, np.array([0.1 * (1 + np.arange(len(power))) @ power]))
 

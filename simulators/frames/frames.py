@@ -37,9 +37,9 @@ class Snapshot:
 class FrameMaker:
     """Makes counts of snapshots and keeps the responses that it needs again.
 
-    At pose 0 the lamps' responses are kept one by one, so that every light vector is a weighted
-    sum; at other poses, where only the closing frames light lamps, one picture per light vector
-    is rendered. Sweeps are kept for the last two poses of each camera. `cache` keeps the lamps'
+    At pose 0 the lights' responses are kept one by one, so that every light vector is a weighted
+    sum; at other poses, where only the closing frames have lights, one picture per light vector
+    is rendered. Sweeps are kept for the last two poses of each camera. `cache` keeps the lights'
     responses on disk under `key`, which must name everything that they depend on. Threads may ask
     for frames of different cameras at the same time.
     """
@@ -59,7 +59,7 @@ class FrameMaker:
         self._seed = seed
         self._cache = cache
         self._key = key
-        self._lamps: dict[str, Response] = {}
+        self._lights: dict[str, Response] = {}
         self._moved: dict[str, OrderedDict[Hashable, Response]] = {
             c.name: OrderedDict() for c in rig.cameras
         }
@@ -78,14 +78,14 @@ class FrameMaker:
         c = self._rig.camera(camera)
         flat = np.zeros((c.height * c.width, 3), np.float32)
         if shot.power.any():
-            self._add_lamps(flat, camera, shot)
+            self._add_lights(flat, camera, shot)
         if shot.show.level > 0:
             self._add_projectors(flat, camera, shot)
         return flat.reshape(c.height, c.width, 3)
 
-    def _add_lamps(self, flat: Floats, camera: str, shot: Snapshot) -> None:
+    def _add_lights(self, flat: Floats, camera: str, shot: Snapshot) -> None:
         if shot.pose == 0:
-            response = self._all_lamps(camera)
+            response = self._all_lights(camera)
             lit = np.flatnonzero(shot.power)
             weights = shot.power[lit].astype(np.float32)
             flat[response.pixels] += np.tensordot(weights, response.images[lit], 1)
@@ -93,7 +93,7 @@ class FrameMaker:
         response = _kept(
             self._moved[camera],
             (shot.pose, shot.power.tobytes()),
-            lambda: self._responder.lamps_together(camera, shot.pose, shot.power),
+            lambda: self._responder.lights_together(camera, shot.pose, shot.power),
             4,
         )
         flat[response.pixels] += response.images[0]
@@ -109,23 +109,23 @@ class FrameMaker:
             elif shot.show.projector == name:
                 flat[response.pixels] += power * response.image(shot.show.row)
 
-    def _all_lamps(self, camera: str) -> Response:
-        if camera not in self._lamps:
+    def _all_lights(self, camera: str) -> Response:
+        if camera not in self._lights:
             file = self._file(camera)
             if file is not None and file.is_file():
                 with np.load(file) as stored:
-                    self._lamps[camera] = Response(stored["pixels"], stored["images"])
+                    self._lights[camera] = Response(stored["pixels"], stored["images"])
             else:
-                self._lamps[camera] = self._responder.lamps(camera)
+                self._lights[camera] = self._responder.lights(camera)
                 if file is not None:
-                    _store(file, self._lamps[camera])
-        return self._lamps[camera]
+                    _store(file, self._lights[camera])
+        return self._lights[camera]
 
     def _file(self, camera: str) -> Path | None:
         if self._cache is None:
             return None
         name = hashlib.sha256(f"{self._key} {camera}".encode()).hexdigest()[:32]
-        return self._cache / f"lamps_{name}.npz"
+        return self._cache / f"lights_{name}.npz"
 
 
 def cache_key(*parts: Any) -> str:

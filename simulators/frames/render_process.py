@@ -34,14 +34,14 @@ class RenderProcess:
         theirs.close()
         self._lock = threading.Lock()
 
-    def lamps(self, camera: str) -> Response:
-        """See `Responder.lamps`; raises `RenderError`."""
-        answer: Response = self._call("lamps", camera)
+    def lights(self, camera: str) -> Response:
+        """See `Responder.lights`; raises `RenderError`."""
+        answer: Response = self._call("lights", camera)
         return answer
 
-    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lamps_together`; raises `RenderError`."""
-        answer: Response = self._call("lamps_together", camera, pose, power)
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """See `Responder.lights_together`; raises `RenderError`."""
+        answer: Response = self._call("lights_together", camera, pose, power)
         return answer
 
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:
@@ -83,13 +83,13 @@ class RenderPool:
         self._processes = [RenderProcess(make) for _ in range(min(count, len(cameras)))]
         self._lane = {name: i % len(self._processes) for i, name in enumerate(cameras)}
 
-    def lamps(self, camera: str) -> Response:
-        """See `Responder.lamps`; raises `RenderError`."""
-        return self._of(camera).lamps(camera)
+    def lights(self, camera: str) -> Response:
+        """See `Responder.lights`; raises `RenderError`."""
+        return self._of(camera).lights(camera)
 
-    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lamps_together`; raises `RenderError`."""
-        return self._of(camera).lamps_together(camera, pose, power)
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """See `Responder.lights_together`; raises `RenderError`."""
+        return self._of(camera).lights_together(camera, pose, power)
 
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:
         """See `Responder.sweep`; raises `RenderError`."""

@@ -21,12 +21,11 @@ from simulators.subject.subject import Subject
 class Quality:
     """Paths per pixel and lights per vertex: what a frame costs and how noisy the truth is.
 
-    `lamps` paths serve all lamps of a camera at once, `sweep` paths all rows of a camera and pose,
-    `together` paths one light vector. The demo's capture takes five to six
-    minutes of rendering on two cores with these numbers.
+    `lights` paths serve all lights of a camera at once, `sweep` paths all rows of a camera and
+    pose, `together` paths one light vector.
     """
 
-    lamps: int = 16
+    lights: int = 16
     sweep: int = 16
     together: int = 24
     depth: int = 16
@@ -34,7 +33,7 @@ class Quality:
 
     @classmethod
     def scaled(cls, spp: int) -> Quality:
-        """The default proportions with `spp` paths for the lamps."""
+        """The default proportions with `spp` paths for the lights."""
         return cls(spp, spp, spp + spp // 2)
 
 
@@ -52,7 +51,8 @@ class Response:
 
     @classmethod
     def halved(cls, pixels: Ints, images: Floats) -> Response:
-        """In half the memory; the brightest value becomes 1024, far from overflow in sums of it."""
+        """`images (N, P, 3)` of `pixels (P,)` in half the memory; the brightest value becomes
+        1024, far from overflow in sums of it."""
         scale = float(images.max(initial=0.0)) / 1024 or 1.0
         return cls(pixels, (images * np.float32(1 / scale)).astype(np.float16), scale)
 
@@ -68,14 +68,14 @@ class Response:
 class Responder(Protocol):
     """Renders responses; slow calls, one at a time."""
 
-    def lamps(self, camera: str) -> Response:
-        """The answer at pose 0 to each lamp alone, in the rig's order."""
+    def lights(self, camera: str) -> Response:
+        """The answer at pose 0 to each light alone, `images (L, P, 3)` in the rig's order."""
 
-    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
-        """The one answer at `pose` to all lamps at `power (L,)` together."""
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """The one answer at `pose`, `images (1, P, 3)`, to all lights at `power (L,)` together."""
 
     def sweep(self, camera: str, pose: int) -> Mapping[str, Response]:
-        """The answer at `pose` to each row of each projector, by projector name."""
+        """By projector name: the answer at `pose` to each of its rows, `images (rows, P, 3)`."""
 
 
 def reproducible(
@@ -107,8 +107,8 @@ class MitsubaResponder:
         self._seed = seed
         self._scene: Any = None
 
-    def lamps(self, camera: str) -> Response:
-        """See `Responder.lamps`."""
+    def lights(self, camera: str) -> Response:
+        """See `Responder.lights`."""
         from appearance.render.olat import render_olat
 
         seen, pixels = self._view(camera, 0)
@@ -116,15 +116,15 @@ class MitsubaResponder:
             self._built(),
             seen,
             self._rig.lights,
-            spp=self._quality.lamps,
+            spp=self._quality.lights,
             max_depth=self._quality.depth,
             seed=self._seeds(camera, 0, 1),
             pixels=pixels,
         )
         return Response(pixels, images)
 
-    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lamps_together`; a vertex asks a sample of the lit lamps."""
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """See `Responder.lights_together`; a vertex asks a sample of those that are lit."""
         from appearance.render.olat import render_olat
 
         seen, pixels = self._view(camera, pose)

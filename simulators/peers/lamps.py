@@ -65,7 +65,7 @@ class Lamps:
         self._dead_man = False
 
     def power(self) -> Array:
-        """Share of full intensity `(count,)` that each lamp gives right now, 0 to 1."""
+        """Share of full intensity `(L,)` that each lamp gives right now, 0 to 1."""
         with self._lock:
             self._look()
             return np.where(self._on | self._stuck, self._level / FULL, 0.0)

@@ -45,7 +45,8 @@ class HeadField:
 
 
 def hair_distance(points: ArrayLike) -> Array:
-    """What hair slides along: the skin, filled in front so that hair passes beside the face."""
+    """What hair slides along, metres `(N,)` at `points (N, 3)`: the skin, filled in front so
+    that hair passes beside the face."""
     p = np.asarray(points, float)
     skin = skin_distance(np.where(p[..., 2:] < NECK_END + 0.01, _above_cut(p), p))
     guard = ellipsoid(p, [0, -0.062, -0.040], [0.066, 0.075, 0.105])

@@ -25,7 +25,7 @@ LAMP_RADIUS = 4e-3  # metres: what a mirror shows of a lamp that is called a poi
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PropSamples:
     """Samples that a camera takes of a prop, `(P, S)` of them in the flat `pixels (P,)`.
 
     `points` and `normals (P, S, 3)`, and `albedo (P, S)`, 0 where the ray misses.
@@ -50,7 +50,7 @@ class BoardProp:
     white: float = 0.8
     black: float = 0.04
 
-    def see(self, camera: Camera, offsets: Array) -> Seen:
+    def see(self, camera: Camera, offsets: Array) -> PropSamples:
         """Samples at pixel centres plus `offsets (S, 2)`."""
         pixels, rays = _rays(camera, offsets, self._outline())
         origin = (camera.center - self.translation) @ self.rotation
@@ -65,7 +65,7 @@ class BoardProp:
         albedo = np.where(self.board.ink(at), self.black, self.white) * on
         points = camera.center + distance[..., None] * rays
         normal = np.broadcast_to(-self.rotation[:, 2], points.shape)
-        return Seen(pixels, points, normal, albedo)
+        return PropSamples(pixels, points, normal, albedo)
 
     def digest(self) -> str:
         """A text of everything that frames depend on."""
@@ -91,7 +91,7 @@ class SphereProp:
     albedo: float
     mirror: bool = False
 
-    def see(self, camera: Camera, offsets: Array) -> Seen:
+    def see(self, camera: Camera, offsets: Array) -> PropSamples:
         """Samples at pixel centres plus `offsets (S, 2)`."""
         box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
         pixels, rays = _rays(camera, offsets, self.centre + self.radius * box)
@@ -101,7 +101,7 @@ class SphereProp:
         distance = along - np.sqrt(np.maximum(inside, 0))
         points = camera.center + distance[..., None] * rays
         normals = (points - self.centre) / self.radius
-        return Seen(pixels, points, normals, np.where(inside > 0, self.albedo, 0.0))
+        return PropSamples(pixels, points, normals, np.where(inside > 0, self.albedo, 0.0))
 
     def digest(self) -> str:
         """A text of everything that frames depend on."""
@@ -138,8 +138,8 @@ class PropResponder:
         self._prop = prop
         self._samples = samples
 
-    def lamps(self, camera: str) -> Response:
-        """See `Responder.lamps`."""
+    def lights(self, camera: str) -> Response:
+        """See `Responder.lights`."""
         device = self._rig.camera(camera)
         if isinstance(self._prop, SphereProp) and self._prop.mirror:
             return _glints(self._prop, device, self._rig.lights)
@@ -155,9 +155,9 @@ class PropResponder:
             image[:] = (share[..., None] * arriving).mean(axis=1)
         return Response(seen.pixels, images)
 
-    def lamps_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lamps_together`."""
-        response = self.lamps(camera)
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """See `Responder.lights_together`."""
+        response = self.lights(camera)
         images = np.tensordot(power.astype(np.float32), response.images, 1)
         return Response(response.pixels, images[None].astype(np.float32))
 

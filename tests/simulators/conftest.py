@@ -49,12 +49,12 @@ class Known:
         self.rig = rig
         self.calls: list[tuple[Any, ...]] = []
 
-    def lamps(self, camera: str) -> Response:
+    def lights(self, camera: str) -> Response:
         self.calls.append(("lamps", camera))
         levels = 0.1 * (1 + np.arange(len(self.rig.lights)))
         return self._response(levels)
 
-    def lamps_together(self, camera: str, pose: int, power: np.ndarray) -> Response:
+    def lights_together(self, camera: str, pose: int, power: np.ndarray) -> Response:
         self.calls.append(("together", camera, pose))
         return self._response(np.array([0.1 * (1 + np.arange(len(power))) @ power]))
 

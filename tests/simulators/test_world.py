@@ -25,11 +25,11 @@ class Counting:
     def __init__(self):
         self.calls = []
 
-    def lamps(self, camera):
+    def lights(self, camera):
         self.calls.append("lamps")
         return Response(np.arange(4), np.arange(1, 6, dtype=np.float32)[:, None, None] * ONES)
 
-    def lamps_together(self, camera, pose, power):
+    def lights_together(self, camera, pose, power):
         self.calls.append(("together", pose))
         return Response(np.arange(4), np.float32(100 + pose) * ONES)
 

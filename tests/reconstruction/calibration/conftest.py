@@ -92,7 +92,7 @@ def noisy_sightings(true_rig: Rig, board: Board) -> dict[str, dict[str, Sighting
     for pose in POSES:
         responder = PropResponder(true_rig, board_pose(pose, board), samples=3)
         for k, camera in enumerate(true_rig.cameras):
-            response = responder.lamps_together(camera.name, 0, np.full(4, 0.5))
+            response = responder.lights_together(camera.name, 0, np.full(4, 0.5))
             image = np.zeros((HEIGHT * WIDTH, 3))
             image[response.pixels] = response.images[0]
             counts = Sensor().expose(image.reshape(HEIGHT, WIDTH, 3), 0.02, (pose, k))

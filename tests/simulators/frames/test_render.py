@@ -12,7 +12,7 @@ from simulators.frames.responses import MitsubaResponder, Quality, reproducible
 from simulators.subject.drift import Drift
 from simulators.subject.subject import make_subject
 
-QUALITY = Quality(lamps=128, sweep=16, together=256, depth=4, sweep_depth=2)
+QUALITY = Quality(lights=128, sweep=16, together=256, depth=4, sweep_depth=2)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def responder(tiny_rig, subject):
 
 
 def test_each_lamp_lights_the_subject_from_its_side(responder, tiny_rig):
-    response = responder.lamps("cam_a")
+    response = responder.lights("cam_a")
     assert response.images.shape == (5, len(response.pixels), 3)
     assert 60 < len(response.pixels) < 256
     assert (response.images >= 0).all()
@@ -44,8 +44,8 @@ def test_each_lamp_lights_the_subject_from_its_side(responder, tiny_rig):
 def test_all_lamps_together_are_the_sum_of_each(responder):
     """Two estimators of one picture: every lamp alone, and a sample of them at each vertex."""
     power = np.array([1, 0.5, 0, 0.25, 1])
-    each = responder.lamps("cam_a")
-    together = responder.lamps_together("cam_a", 1, power)
+    each = responder.lights("cam_a")
+    together = responder.lights_together("cam_a", 1, power)
     assert np.array_equal(each.pixels, together.pixels)
     weighted = np.tensordot(power, each.images, 1)
     assert together.images[0].mean() == pytest.approx(weighted.mean(), rel=0.06)
@@ -61,13 +61,13 @@ def test_rows_light_bands_of_the_subject(responder):
 
 
 def test_the_same_seed_renders_the_same_bytes(responder):
-    first, second = (responder.lamps("cam_b") for _ in range(2))
+    first, second = (responder.lights("cam_b") for _ in range(2))
     assert first.images.tobytes() == second.images.tobytes()
 
 
 def test_an_error_in_the_renderer_reaches_the_caller(responder):
     with pytest.raises(RenderError, match="no camera 'nobody'"):
-        responder.lamps("nobody")
+        responder.lights("nobody")
 
 
 def test_a_subject_that_moves_is_seen_to_move(tiny_rig, subject):
@@ -77,7 +77,7 @@ def test_a_subject_that_moves_is_seen_to_move(tiny_rig, subject):
     camera = tiny_rig.camera("cam_a")
 
     def middle(pose):
-        pixels = still.lamps_together("cam_a", pose, np.ones(5)).pixels
+        pixels = still.lights_together("cam_a", pose, np.ones(5)).pixels
         return np.array([(pixels % 16).mean(), (pixels // 16).mean()])
 
     k = max(range(3), key=lambda k: np.linalg.norm(drift.pose(k)[1][[0, 2]]))

@@ -175,16 +175,16 @@ class Slow:
     def __init__(self, known, gate):
         self.known, self.gate = known, gate
 
-    def lamps(self, camera):
+    def lights(self, camera):
         assert self.gate.wait(10)
-        return self.known.lamps(camera)
+        return self.known.lights(camera)
 
 
 def test_busy_while_the_frame_is_rendered(start):
     gate = threading.Event()
 
     class Known:
-        def lamps(self, camera):
+        def lights(self, camera):
             return Response(np.arange(100), np.full((5, 100, 3), 0.5, np.float32))
 
     bench = start(responder=Slow(Known(), gate))
@@ -201,7 +201,7 @@ def test_busy_while_the_frame_is_rendered(start):
 
 def test_a_renderer_that_fails_is_the_cameras_error(start):
     class Broken:
-        def lamps(self, camera):
+        def lights(self, camera):
             raise RuntimeError("no libLLVM")
 
     bench = start(responder=Broken())

@@ -36,7 +36,7 @@ def test_other_names_are_no_props(name: str) -> None:
 
 def test_a_diffuse_sphere_shines_by_lambert_and_inverse_square() -> None:
     sphere = SphereProp(np.zeros(3), 0.05, 0.6)
-    response = PropResponder(RIG, sphere).lamps("front")
+    response = PropResponder(RIG, sphere).lights("front")
     middle = np.rint(CAMERA.project(np.zeros(3))[0]).astype(int)
     at = int(np.flatnonzero(response.pixels == middle[1] * 64 + middle[0])[0])
     ray = CAMERA.rays(middle.astype(float))
