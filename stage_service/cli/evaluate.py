@@ -53,9 +53,9 @@ def add(commands: Commands) -> None:
         "table",
         run_table,
         "the README's table of figures, as Markdown",
-        "Print a row for each results.json of 'hairstage demo': F of the strands at 1 mm/10° over "
-        "visible points beside the baselines, PSNR / SSIM of held-out lights and camera, fitted "
-        "and true roughness, and what the job warned of.",
+        "Print a column for each results.json of 'hairstage demo': F of the strands at 1 mm/10° "
+        "over visible and all points beside the baselines, PSNR / SSIM of held-out lights and "
+        "camera, fitted and true roughness, and what the job warned of.",
     )
     table.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="results.json")
 

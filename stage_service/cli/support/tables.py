@@ -24,7 +24,7 @@ _APPEARANCE = {
 def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     """The tables of the demo's `results.json` in `out`, and where everything is."""
     geometry = geometry_table({"ours": results["geometry"], **results["baselines"]})
-    images = Table("pictures (PSNR dB / SSIM)", "held-out lights", "held-out camera")
+    images = Table("pictures (PSNR / SSIM)", "held-out lights", "held-out camera")
     for name in results["images"][_GROUPS[0]]:
         images.add_row(name, *(_picture(results, group, name) for group in _GROUPS))
     fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]
@@ -45,40 +45,46 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
 
 
 def markdown_table(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """The README's table of figures: a row for each of several demos' results by name, and their
+    """The README's table of figures: a column for each of several demos' results by name, and their
     warnings below it."""
-    columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
-        "ours": lambda r: _f(r["geometry"]),
-        "hull + smooth field": lambda r: _f(r["baselines"]["hull_smooth_field"]),
-        "hull + vertical": lambda r: _f(r["baselines"]["hull_vertical"]),
-    }
+    figures: dict[str, Callable[[Mapping[str, Any]], str]] = {}
+    for over in ("visible", "all"):
+        for name, title in _STRANDS.items():
+            figures[f"F at 1 mm/10°, {over} points: {title}"] = partial(_f, over=over, name=name)
     for group, title in zip(_GROUPS, ("lights", "camera"), strict=True):
         for method in ("ours", "diffuse", "three_nearest"):
-            columns[f"{title}: {method.replace('_', ' ')}"] = partial(
-                _picture, group=group, name=method
-            )
-    columns["β_M (true)"] = lambda r: " ".join(
+            label = "three nearest lights" if method == "three_nearest" else method
+            figures[f"held-out {title}: {label}"] = partial(_picture, group=group, name=method)
+    figures["β_M (true)"] = lambda r: " ".join(
         form.format(r["appearance"][which]["beta_m"])
         for which, form in (("fitted", "{:.2f}"), ("true", "({:.2f})"))
     )
-    rows = [["subject", *columns], ["---"] * (1 + len(columns))]
-    notes = []
+    head, notes = [""], []
     for number, (name, result) in enumerate(results.items(), 1):
         warnings = result.get("warnings", [])
-        mark = f" [{number}]" if warnings else ""
-        rows.append([name + mark, *(cell(result) for cell in columns.values())])
+        head.append(f"{name} [{number}]" if warnings else name)
         notes += [f"[{number}] {w}" for w in warnings]
+    rows = [head, ["---"] * len(head)]
+    rows += [[title, *(figure(r) for r in results.values())] for title, figure in figures.items()]
     table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
     return "\n\n".join([table, *notes])
 
 
-def _f(figures: Mapping[str, Any]) -> str:
-    return f"{100 * figures['visible'][_THRESHOLDS[0]]['f']:.1f} %"
+_STRANDS = {
+    "ours": "ours",
+    "hull_smooth_field": "hull + smooth field",
+    "hull_vertical": "hull + vertical",
+}
+
+
+def _f(results: Mapping[str, Any], over: str, name: str) -> str:
+    scores = results["geometry"] if name == "ours" else results["baselines"][name]
+    return f"{100 * scores[over][_THRESHOLDS[0]]['f']:.1f} %"
 
 
 def _picture(results: Mapping[str, Any], group: str, name: str) -> str:
     scores = results["images"][group][name]
-    return f"{scores['psnr']:.2f} / {scores['ssim']:.2f}"
+    return f"{scores['psnr']:.1f} dB / {scores['ssim']:.2f}"
 
 
 def _numbers(value: Any) -> str:
