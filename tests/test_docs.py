@@ -1,4 +1,4 @@
-"""The pages must fit the command line: commands and options that they name are there."""
+"""The pages must fit the house: commands, options, files and names that they give are there."""
 
 from __future__ import annotations
 
@@ -7,14 +7,24 @@ import importlib.util
 import re
 import shlex
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from benchmarks.__main__ import MODULES
 
+from reconstruction.model import FILES
 from stage_service.cli import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "THIRD_PARTY.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+FLOORS = ("reconstruction", "appearance", "stage_service", "simulators")
+ROOMS = [ROOT, ROOT / "tests", *(ROOT / floor for floor in FLOORS)]
+MADE = {"runs/", "build/"}
+"""Folders that commands make."""
 CODE = re.compile(r"`([^`]+)`")
 
 
@@ -71,11 +81,62 @@ def test_commands_on_the_pages_are_there(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_options_and_modules_on_the_pages_are_there(page: Path) -> None:
-    options = {name for action in actions(build_parser()) for name in action.option_strings}
+    parsers = [build_parser(), argparse.ArgumentParser()]
+    for name in MODULES:
+        import_module(MODULES[name]).BENCHMARK.add_options(parsers[1])
+    options = {name for p in parsers for action in actions(p) for name in action.option_strings}
     named = re.findall(r"`(--[a-z][a-z-]*)", page.read_text())
     assert sorted(set(named) - options) == []
     modules = re.findall(r"`python -m ([a-z_.0-9]+)", page.read_text())
     assert [m for m in modules if importlib.util.find_spec(m) is None] == []
+
+
+def paths(page: Path) -> Iterator[str]:
+    """Code that reads as a path of the repository: a folder's or a module's, from any floor on."""
+    for code in CODE.findall(page.read_text()):
+        if re.fullmatch(r"[a-z_0-9.]+(/[A-Za-z_0-9.-]+)*/?", code) and (
+            code.endswith((".py", "/")) or code.split("/")[0] in {*FLOORS, "tests", "deploy"}
+        ):
+            yield code
+
+
+def is_there(path: str, rooms: list[Path]) -> bool:
+    return any((room / path).exists() for room in rooms) or any(path.startswith(m) for m in MADE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_paths_on_the_pages_are_there(page: Path) -> None:
+    """From the root, from a floor or from a room on."""
+    inside = [p for floor in FLOORS for p in (ROOT / floor).rglob("*") if p.is_dir()]
+    others = {"images/", "masks/", "plots/", "capture/", "model/", "truth/", "logs/"}
+    absent = [p for p in paths(page) if p not in others and not is_there(p, [*ROOMS, *inside])]
+    assert absent == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_on_the_pages_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)", page.read_text())
+    local = [link for link in links if "://" not in link]
+    assert [link for link in local if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_lines_of_the_pages_are_not_too_long(page: Path) -> None:
+    lines = page.read_text().splitlines()
+    assert [f"{i}: {line}" for i, line in enumerate(lines, 1) if len(line) > 120] == []
+
+
+def test_every_page_is_in_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text()
+    pages = [f"docs/{p.name}" for p in PAGES if p.parent.name == "docs"]
+    assert [p for p in pages if f"({p})" not in readme] == []
+
+
+def test_a_model_has_the_files_that_the_page_lists() -> None:
+    page = (ROOT / "docs" / "files.md").read_text()
+    table = page.split("## A model folder")[1].split("\n\n")[1]
+    rows = re.findall(r"^\| `([^`]+)` \| (.*) \|$", table, re.MULTILINE)
+    assert dict(rows) == FILES
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from http import HTTPStatus
+from textwrap import fill
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -247,7 +248,8 @@ def errors_page() -> str:
     ]
     for kind in KINDS.values():
         status = f"{kind.status} {HTTPStatus(kind.status).phrase}"
-        parts += ["", f"## {kind.slug}", "", f"{kind.title} ({status}). {kind.help}"]
+        text = f"{kind.title} ({status}). {kind.help}"
+        parts += ["", f"## {kind.slug}", "", fill(text, 120, break_on_hyphens=False)]
     return "\n".join(parts) + "\n"
 
 

@@ -10,7 +10,7 @@ from benchmarks.command import DATA, LeftOut, data_folder
 from benchmarks.strand_truth import Ball
 from reconstruction.geometry.lights import dome_positions
 
-CAMERAS, LIGHTS = 24, 36
+CAMERAS = 24
 SIDE = 256
 """Pixels of a picture's edge."""
 
@@ -32,19 +32,21 @@ class Patch:
     ball: Ball
 
 
-def rig_text(target: tuple[float, float, float], side: int = SIDE) -> str:
-    """A rig file: 24 cameras on the upper hemisphere, 36 lights on a sphere, 24 beside cameras."""
+def rig_text(
+    target: tuple[float, float, float], side: int = SIDE, cameras: int = CAMERAS
+) -> str:
+    """A rig file: cameras on the upper hemisphere, a light beside each, and half as many more."""
     optics = Optics(target, math.degrees(2 * math.atan(side * PITCH / 2 / DISTANCE)))
-    cameras = [
+    devices = [
         optics.device("cameras", k, [p + t for p, t in zip(place, target, strict=True)])
         + f"width = {side}\nheight = {side}"
-        for k, place in enumerate(dome_positions(CAMERAS, DISTANCE, 5.0).tolist())
+        for k, place in enumerate(dome_positions(cameras, DISTANCE, 5.0).tolist())
     ]
-    dome = f"lights = {LIGHTS}\nradius = {DISTANCE}\nbeside_cameras_at = 0.03"
-    return rig_file("light_codes", dome, cameras, levels(all_on=0.15))
+    dome = f"lights = {cameras * 3 // 2}\nradius = {DISTANCE}\nbeside_cameras_at = 0.03"
+    return rig_file("light_codes", dome, devices, levels(all_on=0.15))
 
 
-def patch(name: str, *, side: int = SIDE, spp: int = SPP) -> Patch:
+def patch(name: str, *, side: int = SIDE, cameras: int = CAMERAS, spp: int = SPP) -> Patch:
     """The patch of a subject in `TARGETS`. Raises `LeftOut` where Sintel's strands are missing."""
     subject, head, data = name, None, data_folder()
     if name == "sintel":
@@ -52,6 +54,6 @@ def patch(name: str, *, side: int = SIDE, spp: int = SPP) -> Patch:
             raise LeftOut(f"no folder of data that holds Sintel's strands: name it in ${DATA}")
         subject, head = (str(data / "sintel" / f) for f in ("sintel.npz", "sintel_head.obj"))
     target = TARGETS[name]
-    rig = rig_text(target, side)
+    rig = rig_text(target, side, cameras)
     capture = SimulatedCapture(f"patch-{name}", rig, subject, head, 0.0, spp)
     return Patch(capture, Ball(target, side * PITCH / 2))
