@@ -168,11 +168,11 @@ def furnace_table(cases: Sequence[Case] = CASES) -> str:
     for c in cases:
         figures = zip(formats, *(astuple(m) for m in compare(c)), strict=True)
         said = [f.format(value) for f, *pair in figures for value in pair]
-        rows.append([*case_cells(c), *said])
+        rows.append([*_given(c), *said])
     return markdown([*given, *(cell for pair in pairs for cell in (pair, ""))], rows)
 
 
-def case_cells(c: Case) -> list[str]:
+def _given(c: Case) -> list[str]:
     """What is given in a row of the furnace table."""
     given = [c.beta_m, c.beta_n, c.theta_deg, c.h, c.eta, c.tilt_deg, c.sigma_a]
     return [f"{g:.6g}" for g in given]

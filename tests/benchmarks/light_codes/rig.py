@@ -32,9 +32,7 @@ class Patch:
     ball: Ball
 
 
-def rig_text(
-    target: tuple[float, float, float], side: int = SIDE, cameras: int = CAMERAS
-) -> str:
+def rig_text(target: tuple[float, float, float], side: int = SIDE, cameras: int = CAMERAS) -> str:
     """A rig file: cameras on the upper hemisphere, a light beside each, and half as many more."""
     optics = Optics(target, math.degrees(2 * math.atan(side * PITCH / 2 / DISTANCE)))
     devices = [
