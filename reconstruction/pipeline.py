@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from dataclasses import asdict
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
+from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.rooting import root_all
@@ -22,11 +22,9 @@ from reconstruction.head.fitted import FittedHead, digitised_points, lay_head, s
 from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.images.segmentation import Network
-from reconstruction.light_codes.light_code_options import LightCodeOptions
 from reconstruction.light_codes.line_strands import line_strands, merge
 from reconstruction.light_planes import (
     Motion,
-    MotionOptions,
     PointCloud,
     solve_motion,
     sweep_peaks,
@@ -35,55 +33,18 @@ from reconstruction.light_planes import (
 from reconstruction.masks import MaskedCapture, hair_masks, usable_masks
 from reconstruction.methods import METHODS, Method
 from reconstruction.model import Model
+from reconstruction.reconstruct_options import ReconstructOptions
 from reconstruction.report.report import Progress, Report, Stage, silent
-from reconstruction.tangents.estimate import Measured, MeasureOptions, measure_tangents
+from reconstruction.tangents.estimate import Measured, measure_tangents
 
 HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
+LEAST_CONFIDENCE = 0.1
+"""Of a measured tangent to count."""
 
-@dataclass(frozen=True)
-class ReconstructOptions:
-    """What the reconstruction is asked for.
-
-    `held_out` cameras take no part at all. `grid` is the voxels' edge and `step` the growth's, both
-    in metres; `roots` strands are grown from the scalp, then gaps are filled. `max_length` (metres)
-    is the hair's, which the user knows. `margin` (metres) is how far in front of the seen surface
-    the envelope reaches. `network` holds the fields of `segmentation.Network`, which tells hair
-    from skin where the user's masks do not. `scalp_points` is a file of digitised points of the
-    scalp to lay a head under, where the capture has no `head.obj` or a better one is wanted, and
-    `head_mesh` (OBJ) the head to lay there instead of the generic one. `scalp_normals` holds the
-    field to the scalp's normals as the paper does; hair that lies flat on the head is bent wrongly
-    by that. `surface` says how strands are traced through the measured lines themselves before any
-    follow the field; its `apart` is taken from `measure`, its `longest` from `max_length`; None
-    leaves them out. `to_measured` ends strands from the scalp at their last measured voxel. Gaps
-    are filled `within` metres of what was measured (None: 3 mm, or two voxels): give more where
-    pixels are wider. `radius` of the strands in metres; None takes the one that keeps a head of
-    hair's coverage. `explicit_seconds` of explicit diffusion are run beside the solver for the
-    report.
-    """
-
-    held_out: tuple[str, ...] = ()
-    grid: float = 2e-3
-    step: float = 5e-4
-    roots: int = 8000
-    max_length: float = 0.3
-    margin: float = 2e-3
-    least_confidence: float = 0.1
-    network: dict[str, Any] | None = None
-    scalp_points: str | None = None
-    head_mesh: str | None = None
-    scalp_normals: bool = False
-    to_measured: bool = False
-    within: float | None = None
-    spacing: float = 2e-3
-    radius: float | None = None
-    seed: int = 0
-    explicit_seconds: float = 1.0
-    motion: MotionOptions = MotionOptions()  # noqa: RUF009  frozen
-    measure: MeasureOptions = MeasureOptions()  # noqa: RUF009  frozen
-    surface: SurfaceOptions | None = SurfaceOptions()  # noqa: RUF009  frozen
-    light_codes: LightCodeOptions = LightCodeOptions()  # noqa: RUF009
+SPACING = 2e-3
+"""Metres between a strand's points as it is written."""
 
 
 def reconstruct(
@@ -118,7 +79,7 @@ def reconstruct(
         model.write_points(cloud)
     with report.stage("masks") as stage:
         # a held-out camera's mask says where to compare pictures; nothing here looks at it
-        network = None if options.network is None else Network(**options.network)
+        network = None if options.network is None else Network(options.network)
         every = hair_masks(whole, cloud if len(cloud) else None, head, network=network)
         if network is not None:
             stage.figures["network"] = network.to_dict()
@@ -152,7 +113,7 @@ def reconstruct(
             masked, head, report, options=options.light_codes, progress=progress
         )
         seen += more
-        measured = merge(measured, segments, options.light_codes.field_weight)
+        measured = merge(measured, segments)
     with report.stage("field") as stage:
         scalp = find_scalp(head, envelope)
         field = _field(envelope, measured, scalp, options, stage)
@@ -270,8 +231,6 @@ def _surface(
     progress: Progress,
 ) -> list[AnyFloats]:
     """Polylines through the measured lines; none of them rooted."""
-    if options.surface is None:
-        return []
     with report.stage("surface") as stage:
         if not len(cloud):
             stage.leave_out(
@@ -281,8 +240,8 @@ def _surface(
             )
             return []
         progress("tracing the surface", 0.0)
-        surface = replace(options.surface, apart=options.measure.thin, longest=options.max_length)
-        good = measured.where(measured.confidence >= options.least_confidence)
+        surface = SurfaceOptions(apart=options.measure.thin, longest=options.max_length)
+        good = measured.where(measured.confidence >= LEAST_CONFIDENCE)
         polylines = surface_strands(good, surface, seed=options.seed)
         stage.figures.update(strands=len(polylines), options=asdict(surface))
     return list(polylines)
@@ -295,7 +254,7 @@ def _field(
     options: ReconstructOptions,
     stage: Stage,
 ) -> OrientationField:
-    keep = measured.confidence >= options.least_confidence
+    keep = measured.confidence >= LEAST_CONFIDENCE
     if not keep.any():
         raise CaptureError("no hair pixel has a direction: are the OLAT frames in focus and lit?")
     kept = measured.where(keep)
@@ -304,10 +263,9 @@ def _field(
         kept.points,
         kept.directions,
         kept.confidence,
-        (scalp.points, scalp.normals) if options.scalp_normals else None,
-        FieldOptions(explicit_seconds=options.explicit_seconds),
     )
-    stage.series += series
+    if series is not None:
+        stage.series.append(series)
     stage.figures.update(
         unknowns=int((~field.measured).sum()),
         measured_voxels=int(field.measured.sum()),
@@ -316,13 +274,6 @@ def _field(
         scalp_cm2=scalp.area * 1e4,
         scalp_marked=scalp.marked,
     )
-    if not options.scalp_normals:
-        stage.leave_out(
-            "scalp normals as boundary data",
-            "hair that lies on the head leaves the scalp almost flat, not along its normals; the "
-            "option scalp_normals puts them in",
-            "nothing in time",
-        )
     if field.empty.any():
         stage.warn(f"{int(field.empty.sum())} voxels hang together with no measurement: left empty")
     return field
@@ -342,8 +293,8 @@ def grow(
     """
     roots, normals = sample_roots(scalp, options.roots, options.seed)
     progress("growing strands", 0.1)
-    tracing = Tracing(options.step, options.max_length)
-    rooted = grow_from_roots(field, roots, normals, tracing, to_measured=options.to_measured)
+    tracing = Tracing(max_length=options.max_length)
+    rooted = grow_from_roots(field, roots, normals, tracing)
     coverage = Coverage(field)
     for path in rooted:
         coverage.add(path)
@@ -361,7 +312,7 @@ def grow(
     radius = options.radius
     if radius is None:
         radius = float(np.clip(HEAD_OF_HAIR / len(result.strands), 4e-5, 4e-4))
-    strands = Strands.from_list(result.strands, radius).resampled(options.spacing)
+    strands = Strands.from_list(result.strands, radius).resampled(SPACING)
     stage.figures.update(
         strands=len(strands),
         from_roots=len(rooted),
@@ -374,7 +325,7 @@ def grow(
         covered=filled,
         metres=float(strands.lengths().sum()),
         radius=radius,
-        options=asdict(options) | {"measure": asdict(options.measure)},
+        options=asdict(options),
     )
     if result.dropped:
         stage.warn(f"{result.dropped} strands through gaps reached no root and were dropped")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.laplace import conjugate_gradients, explicit_diffusion, grid_laplacian
+from reconstruction.growth.laplace import conjugate_gradients, grid_laplacian
 from reconstruction.report.report import Series
 
 _PAD = 2
@@ -136,18 +135,8 @@ class OrientationField:
         return np.array([shape[1] * shape[2], shape[2], 1])
 
 
-@dataclass(frozen=True)
-class FieldOptions:
-    """How a field is solved.
-
-    `tolerance` is the relative residual at which conjugate gradients stop; `explicit_seconds` how
-    long the explicit reference runs beside it (0: not at all); `least_coherence` the difference of
-    the two largest eigenvalues under which a voxel counts as degenerate.
-    """
-
-    tolerance: float = 1e-4
-    explicit_seconds: float = 0.0
-    least_coherence: float = 0.5
+LEAST_COHERENCE = 0.5
+"""Difference of the two largest eigenvalues under which a voxel counts as degenerate."""
 
 
 def gather(
@@ -187,32 +176,26 @@ def solve_field(
     points: AnyFloats,
     directions: AnyFloats,
     weights: AnyFloats | None = None,
-    boundary: tuple[AnyFloats, AnyFloats] | None = None,
-    options: FieldOptions = FieldOptions(),
-) -> tuple[OrientationField, list[Series]]:
+    tolerance: float = 1e-4,
+) -> tuple[OrientationField, Series | None]:
     """Spread measured lines through the envelope: Laplace's equation for each tensor entry.
 
-    `points (N, 3)` with `directions (N, 3)` and `weights (N,)` are the measured lines, `boundary`
-    more points and directions (the scalp and its normals) that yield to measurements where both
-    hit a voxel. Both are Dirichlet data; the envelope's surface passes no flux. That is the state
-    of rest of Photobooth Eq. 3. Also returns error against run time of the solver and, if asked
-    for, of the explicit steps that the paper takes.
+    `points (N, 3)` with `directions (N, 3)` and `weights (N,)` are the measured lines: Dirichlet
+    data; the envelope's surface passes no flux. That is the state of rest of Photobooth Eq. 3,
+    solved to a relative residual of `tolerance`. The paper holds the field to the scalp's normals
+    as well; hair that lies flat on the head is turned wrongly by that. Also returns error against
+    run time, None where nothing is unknown.
 
     Raises `ValueError` for an empty envelope or when no datum falls into it.
     """
-    system = field_system(grid, points, directions, weights, boundary)
+    system = field_system(grid, points, directions, weights)
     values, free = system.values.copy(), system.free
-    series: list[Series] = []
+    series = None
     if len(free):
-        A, b, start = system.equations()
-        values[free], fast = conjugate_gradients(A, b, start, options.tolerance)
-        series.append(fast)
-        if options.explicit_seconds > 0:
-            begin = time.perf_counter()
-            series.append(explicit_diffusion(A, b, start, options.explicit_seconds, begin)[1])
+        values[free], series = conjugate_gradients(*system.equations(), tolerance)
     directions_, eigenvalues = principal(values)
     coherence = eigenvalues[:, 0] - eigenvalues[:, 1]
-    degenerate = ~system.empty & (coherence < options.least_coherence)
+    degenerate = ~system.empty & (coherence < LEAST_COHERENCE)
     directions_[system.empty | degenerate] = 0
     field = OrientationField(
         grid, values, directions_, coherence, system.measured, system.empty, degenerate
@@ -224,25 +207,24 @@ def solve_field(
 class FieldSystem:
     """What `solve_field` solves, on the M voxels of the envelope.
 
-    `values (M, 6)` are tensors, 0 where not `fixed (M,)`; `measured (M,)` and `empty (M,)` as in
-    the field; `free (F,)` numbers the unknowns.
+    `values (M, 6)` are tensors, 0 where not `measured (M,)`; `empty (M,)` as in the field; `free
+    (F,)` numbers the unknowns.
     """
 
     laplacian: sparse.csr_array
     values: Array
-    fixed: Bools
     measured: Bools
     empty: Bools
 
     @property
     def free(self) -> Ints:
         """Numbers `(F,)` of the voxels to solve for."""
-        return np.flatnonzero(~self.fixed & ~self.empty)
+        return np.flatnonzero(~self.measured & ~self.empty)
 
     def equations(self) -> tuple[sparse.csr_array, Array, Array]:
         """`A (F, F)`, `b (F, 6)` and a start `(F, 6)`: the mean of the data, so of trace 1."""
         rows = self.laplacian[self.free]
-        known = np.flatnonzero(self.fixed)
+        known = np.flatnonzero(self.measured)
         b = -(rows[:, known] @ self.values[known])
         return rows[:, self.free], b, np.broadcast_to(self.values[known].mean(axis=0), b.shape)
 
@@ -252,7 +234,6 @@ def field_system(
     points: AnyFloats,
     directions: AnyFloats,
     weights: AnyFloats | None = None,
-    boundary: tuple[AnyFloats, AnyFloats] | None = None,
 ) -> FieldSystem:
     """The linear system of `solve_field`, which says what the arguments are and what it raises."""
     count = int(grid.inside.sum())
@@ -264,16 +245,10 @@ def field_system(
     measured[voxels] = True
     values = np.zeros((count, 6))
     values[voxels] = data
-    fixed = measured.copy()
-    if boundary is not None and len(boundary[0]):
-        voxels, data, _ = gather(grid, *boundary, np.ones(len(boundary[0])))
-        new = ~measured[voxels]
-        values[voxels[new]] = data[new]
-        fixed[voxels] = True
-    if not fixed.any():
+    if not measured.any():
         raise ValueError("no orientation was measured inside the hair's envelope")
     laplacian = grid_laplacian(grid.inside)
     pieces, piece = connected_components(laplacian, directed=False)
     has_data = np.zeros(pieces, bool)
-    has_data[piece[fixed]] = True
-    return FieldSystem(laplacian, values, fixed, measured, ~has_data[piece])
+    has_data[piece[measured]] = True
+    return FieldSystem(laplacian, values, measured, ~has_data[piece])

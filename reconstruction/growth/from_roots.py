@@ -114,15 +114,13 @@ def grow_from_roots(
     normals: AnyFloats,
     tracing: Tracing = Tracing(),
     *,
-    to_measured: bool = False,
     threads: int | None = None,
 ) -> list[Floats]:
     """Strands from `roots (N, 3)`, setting out along the scalp's `normals (N, 3)`.
 
     A root whose envelope stays clear of the skin is led to it along the normal, by at most 12 mm.
-    `to_measured` ends a strand at the last measured voxel that it passes and keeps none
-    that passes none, as Photobooth §3.4 does; without it they go on, since what a strand passes
-    inside the envelope is hair as well. Those shorter than 5 mm are not kept.
+    Photobooth §3.4 ends a strand at the last measured voxel that it passes; here they go on, since
+    what a strand passes inside the envelope is hair as well. Those shorter than 5 mm are not kept.
 
     Two thousand strands at a time on `threads` (one per core where None), so that memory grows with
     what is kept alone; the strands do not depend on it.
@@ -144,8 +142,6 @@ def grow_from_roots(
         traced = trace(field, starts[which], n[which], tracing)
         out = []
         for root, path in zip(p[which].astype(np.float32), to_polylines(traced), strict=True):
-            if to_measured:
-                path = path[: _last_measured(field, path) + 1]
             if (len(path) - 1) * step < _SHORTEST_FROM_ROOT:
                 continue
             near = np.linalg.norm(root - path[0]) < step
@@ -155,12 +151,6 @@ def grow_from_roots(
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         parts = pool.map(some, range(0, len(at), _TOGETHER))
         return [path for part in parts for path in part]
-
-
-def _last_measured(field: OrientationField, path: Floats) -> int:
-    """Index of the path's last point in a measured voxel, 0 where there is none."""
-    number = field.voxel(path)
-    return int(np.flatnonzero((number >= 0) & field.measured[number]).max(initial=0))
 
 
 class Coverage:

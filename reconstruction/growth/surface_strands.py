@@ -16,39 +16,32 @@ from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.strands import smoothed
 from reconstruction.tangents.estimate import Measured
 
+# Lengths as multiples of how far lines are apart.
+BANDWIDTH = 0.8
+NEIGHBOURS = 16
+ANGLE_DEG, SAME_DEG = 35.0, 20.0
+PULL = 0.6
+LEAST_SUPPORT = 0.5
+SPACING = 0.4
+
 
 @dataclass(frozen=True)
 class SurfaceOptions:
     """How strands are traced through measured lines; lengths as multiples of `apart`, metres.
 
-    `apart` is about how far the lines are from one another. Those within 2.5 `bandwidth`s that
-    turn by at most `angle_deg` lead a strand, at most `neighbours` of them; every `step` it moves
-    `pull` of the way to their middle. It ends where their confidences, each less the further
-    away, add up to less than `least_support`, and at `longest` metres. Lines closer than `spacing`
-    to a strand that runs along them within `same_deg` start no other; strands shorter than
+    `apart` is about how far the lines are from one another. Those within 2.5 `BANDWIDTH`s that
+    turn by at most `ANGLE_DEG` lead a strand, at most `NEIGHBOURS` of them; every `step` it moves
+    `PULL` of the way to their middle. It ends where their confidences, each less the further
+    away, add up to less than `LEAST_SUPPORT`, and at `longest` metres. Lines closer than `SPACING`
+    to a strand that runs along them within `SAME_DEG` start no other; strands shorter than
     `shortest` are not kept, the others are smoothed along their length by a Gaussian of `smooth`.
     """
 
     apart: float = 1.25e-3
-    bandwidth: float = 0.8
-    angle_deg: float = 35.0
-    neighbours: int = 16
     step: float = 0.4
-    pull: float = 0.6
-    least_support: float = 0.5
     longest: float = 0.3
-    spacing: float = 0.4
-    same_deg: float = 20.0
     shortest: float = 2.4
     smooth: float = 1.0
-
-    def __post_init__(self) -> None:
-        lengths = (self.apart, self.bandwidth, self.step, self.longest, self.spacing)
-        if not all(length > 0 for length in lengths) or not self.neighbours > 0:
-            raise ValueError(
-                "apart, bandwidth, step, longest, spacing and neighbours must be positive, "
-                f"got {lengths} and {self.neighbours}"
-            )
 
 
 class LineCloud:
@@ -57,7 +50,7 @@ class LineCloud:
     def __init__(self, lines: Measured, options: SurfaceOptions) -> None:
         self._lines = lines
         self._options = options
-        self._bandwidth = options.bandwidth * options.apart
+        self._bandwidth = BANDWIDTH * options.apart
         self.step = options.step * options.apart
         self.tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
 
@@ -66,8 +59,7 @@ class LineCloud:
 
         Of the lines around `p (N, 3)` that run as `along (N, 3)` does; that itself where none does.
         """
-        o = self._options
-        k = min(o.neighbours, len(self._lines.points))
+        k = min(NEIGHBOURS, len(self._lines.points))
         distance, index = self.tree.query(
             p, k=np.arange(1, k + 1), distance_upper_bound=2.5 * self._bandwidth, workers=-1
         )
@@ -75,7 +67,7 @@ class LineCloud:
         index = np.where(there, index, 0)
         d = self._lines.directions[index]
         cosine = np.einsum("nki,ni->nk", d, along)
-        there &= np.abs(cosine) >= np.cos(np.radians(o.angle_deg))
+        there &= np.abs(cosine) >= np.cos(np.radians(ANGLE_DEG))
         near = np.exp(-(np.where(there, distance, 0) ** 2) / (2 * self._bandwidth**2))
         weight = np.where(there, near * self._lines.confidence[index], 0.0)
         support = weight.sum(axis=1)
@@ -89,17 +81,16 @@ class LineCloud:
 
     def trace(self, starts: Array, along: Array) -> list[Array]:
         """Paths `(N, 3)` from `starts (N, 3)`, setting out along `along (N, 3)`."""
-        o = self._options
         p, d = starts.copy(), along.copy()
         active = np.arange(len(p))
         rows, counts = [p.copy()], np.ones(len(p), np.int64)
-        for _ in range(int(o.longest / self.step)):
+        for _ in range(int(self._options.longest / self.step)):
             mean, middle, support = self.sample(p, d)
-            good = support >= o.least_support
+            good = support >= LEAST_SUPPORT
             active, d = active[good], mean[good]
             if not len(active):
                 break
-            p = p[good] + self.step * d + o.pull * middle[good]
+            p = p[good] + self.step * d + PULL * middle[good]
             row = np.zeros_like(starts)
             row[active] = p
             rows.append(row)
@@ -149,8 +140,8 @@ def _spend(
     points = np.concatenate(paths)
     tangents = np.concatenate([np.gradient(path, axis=0) for path in paths])
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-    near = cloud.tree.query_ball_point(points, options.spacing * options.apart, workers=-1)
+    near = cloud.tree.query_ball_point(points, SPACING * options.apart, workers=-1)
     owner = np.repeat(np.arange(len(points)), [len(n) for n in near])
     line = np.fromiter((j for n in near for j in n), np.int64, len(owner))
     cosine = np.einsum("ni,ni->n", lines.directions[line], tangents[owner])
-    spent[line[np.abs(cosine) >= np.cos(np.radians(options.same_deg))]] = True
+    spent[line[np.abs(cosine) >= np.cos(np.radians(SAME_DEG))]] = True

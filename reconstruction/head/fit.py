@@ -1,4 +1,4 @@
-"""A head mesh under points: the generic head, or the user's, posed and then bent onto them."""
+"""A head mesh under points: the generic head, or the user's, posed and then deformed onto them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import MOTIONS, Pose, Surface, find_pose, similarity, tukey
-from reconstruction.head.shape import ShapeOptions, bend
+from reconstruction.head.shape import deform
 
 FEWEST = 10
 """Points under which no head is fitted: a pose alone has seven unknowns."""
@@ -48,16 +48,16 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class HeadFit:
-    """The template on the points: posed (`pose`), then bent (`mesh`, with the template's scalp).
+    """The template on the points: posed (`pose`), then deformed (`mesh`, its scalp kept).
 
-    `posed` and `bent` are the distances before and after bending; `outliers (N,)` the points that
-    did not count in the end; `folded` how many faces turned over against the posed template.
+    `posed` and `deformed` are the distances before and after; `outliers (N,)` the points that did
+    not count in the end; `folded` how many faces turned over against the posed template.
     """
 
     mesh: Mesh
     pose: Pose
     posed: Distances
-    bent: Distances
+    deformed: Distances
     outliers: Bools
     folded: int
     warnings: tuple[str, ...]
@@ -68,7 +68,7 @@ class HeadFit:
         return {
             "scale": self.pose.scale,
             "posed": vars(self.posed),
-            "bent": vars(self.bent),
+            "deformed": vars(self.deformed),
             "outlier_share": float(self.outliers.mean()),
             "folded_faces": self.folded,
             "pose_deviation": dict(zip(MOTIONS, deviation, strict=True)),
@@ -88,7 +88,6 @@ def fit_head(
     turn: float | None = None,
     guides: tuple[AnyFloats, AnyFloats] | None = None,
     any_unit: bool = False,
-    shape: ShapeOptions = ShapeOptions(),  # noqa: B008  frozen
     seed: int = 0,
 ) -> HeadFit:
     """Fit `template` (the generic head where None) to `points (N, 3)`, both with z upwards.
@@ -98,8 +97,8 @@ def fit_head(
     in five. `landmarks` are places `(L, 3)` on the template and the same places `(L, 3)` among the
     points, L at least 3; without them all turns about z are tried, or those about `turn` (radians).
     `guides` are further points and normals `(G, 3)` that only roughly lie on the head: they take
-    part in the pose, and the mesh is not bent onto them. Points are in the template's unit, metres,
-    unless `any_unit`. Raises `HeadFitError`.
+    part in the pose alone. Points are in the template's unit, metres, unless `any_unit`. Raises
+    `HeadFitError`.
     """
     template = generic_head() if template is None else template
     at: Array = np.asarray(points, np.float64).reshape(-1, 3)
@@ -137,7 +136,7 @@ def fit_head(
             f"expected {_SCALES[0]} to {_SCALES[1]}: are the points a head's, in metres?"
         )
     posed = Mesh(pose(template.vertices), template.faces, template.scalp)
-    mesh = bend(posed, faces, at, facing, size, shape)
+    mesh = deform(posed, faces, at, facing, size)
     before, _ = _distances(posed, faces, at, size)
     after, outliers = _distances(mesh, faces, at, size)
     folded = int(((posed.face_normals() * mesh.face_normals()).sum(axis=1) < 0).sum())

@@ -174,7 +174,7 @@ def _report(points: HeadPoints, fit: HeadFit, name: str, stage: Stage) -> None:
         "points": len(points.points),
         "source": points.source,
         "template": name,
-        "rms_mm": fit.bent.to_mesh_rms * 1e3,
+        "rms_mm": fit.deformed.to_mesh_rms * 1e3,
         "posed_rms_mm": fit.posed.to_mesh_rms * 1e3,
         "used_share": 1 - float(fit.outliers.mean()),
         "fit": fit.figures(),

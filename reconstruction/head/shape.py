@@ -22,19 +22,17 @@ from reconstruction.head.pose import Surface, tukey
 _NEAR = 8
 
 
-@dataclass(frozen=True)
-class ShapeOptions:
-    """How a mesh is bent.
+HANDLES = 200
+"""That carry the displacement."""
 
-    `handles` carry the displacement; `stiffness` is the penalty on the difference of neighbouring
-    handles against the mean squared distance, round by round; `anchor` the same on displacement as
-    such, which fades the displacement out where there are no points.
-    """
+STIFFNESS = (10.0, 1.0, 0.1, 0.01)
+"""Penalties on the difference of neighbouring handles against the mean squared distance."""
 
-    handles: int = 200
-    stiffness: tuple[float, ...] = (10.0, 1.0, 0.1, 0.01)
-    anchor: float = 1e-3
-    rounds: int = 4
+ROUNDS = 4
+"""Of finding nearest points, under each stiffness."""
+
+ANCHOR = 1e-3
+"""Penalty on displacement as such, which fades it out where there are no points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,21 +68,20 @@ class Handles:
         return sparse.csr_array((w.ravel(), (row, near.ravel())), shape=(len(points), len(self.at)))
 
 
-def bend(
+def deform(
     mesh: Mesh,
     faces: Bools,
     points: Array,
     normals: Array | None,
     size: float,
-    options: ShapeOptions = ShapeOptions(),
 ) -> Mesh:
-    """`mesh`, already posed, bent smoothly so that its `faces (F,) bool` lie on `points (N, 3)`.
+    """The posed `mesh` deformed smoothly: its `faces (F,) bool` lie on `points (N, 3)`.
 
     `size` is the head's radius in the points' unit.
     """
     places, own, face = surface_samples(mesh, 0.08 * size)
     places, own = places[faces[face]], own[faces[face]]
-    handles = Handles.on(mesh.vertices[np.unique(mesh.faces)], options.handles)
+    handles = Handles.on(mesh.vertices[np.unique(mesh.faces)], HANDLES)
     spread, moves = handles.weights(places), handles.weights(mesh.vertices)
     count = len(handles.at)
     i, j = handles.links.T
@@ -93,8 +90,8 @@ def bend(
         (np.r_[one, one, -one, -one], (np.r_[i, j, i, j], np.r_[i, j, j, i])), shape=(count, count)
     ).toarray() / len(i)
     shift = np.zeros((count, 3))
-    for stiffness in options.stiffness:
-        for _ in range(options.rounds):
+    for stiffness in STIFFNESS:
+        for _ in range(ROUNDS):
             now = places + spread @ shift
             distance, index = Surface(now, own).nearest(points, 0.3 * size)
             n = own[index]
@@ -109,7 +106,7 @@ def bend(
             J = sparse.hstack([share * n[used, k : k + 1] for k in range(3)]).tocsr()
             w = weight[used] / weight.sum()
             normal = (J.T @ (J * w[:, None])).toarray()
-            hold = np.kron(np.eye(3), stiffness * tie + options.anchor / count * np.eye(count))
+            hold = np.kron(np.eye(3), stiffness * tie + ANCHOR / count * np.eye(count))
             solved = np.linalg.solve(normal + hold, J.T @ (w * r))
             shift = solved.reshape(3, count).T
     return Mesh(mesh.vertices + moves @ shift, mesh.faces, mesh.scalp)

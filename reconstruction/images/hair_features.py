@@ -13,7 +13,8 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.capture.folder import Capture
-from reconstruction.images.orientation import LogGaborBank, texture
+from reconstruction.images.orientation import responses, texture
+from reconstruction.reconstruct_options import LogGaborBank
 
 MATTE_CONTRAST = 1.29  # sqrt(1/6 - 1/16) / (1/4): cosine over all directions, deviation over mean
 
@@ -53,7 +54,7 @@ def line_strength(lit: AnyFloats, subject: Bools) -> Array:
     The log-Gabor bank's mean answer at a wavelength of three pixels, averaged in the subject by a
     Gaussian of three pixels; 0 outside.
     """
-    answers = _BANK.responses(texture(lit, subject, 5.0)).mean(axis=0).astype(np.float64)
+    answers = responses(_BANK, texture(lit, subject, 5.0)).mean(axis=0).astype(np.float64)
     near = ndimage.gaussian_filter(subject.astype(np.float64), 3.0)
     mean = ndimage.gaussian_filter(np.where(subject, answers, 0.0), 3.0) / np.maximum(near, 1e-6)
     return np.asarray(np.where(subject, np.log(np.maximum(mean, 1e-4)), 0.0))

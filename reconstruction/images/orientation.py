@@ -11,94 +11,79 @@ import numpy as np
 from scipy import fft, ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+from reconstruction.reconstruct_options import LogGaborBank
 
 _FAINTEST = 1e-5
 """Relative detail that is rounding in single precision and not texture."""
 
 
-@dataclass(frozen=True)
-class LogGaborBank:
-    """A bank of log-Gabor filters: exp(−log²(ρλ)/(2σ_λ²)) · exp(−Δ²/(2σ_φ²)).
+BANDWIDTH = float(np.log(2))
+"""σ_λ of every filter, natural logarithm."""
 
-    Sun Eq. 13 with the square that its print lost; ρ is the frequency in cycles per pixel, Δ the
-    angle to the filter's own. `wavelength` λ in pixels, `bandwidth` σ_λ (natural logarithm),
-    `count` filters over half a turn, `spread` σ_φ in units of 180°/count. The filters are
-    one-sided in frequency, so that the magnitude of an answer does not depend on whether the
+
+def filters(bank: LogGaborBank, height: int, width: int) -> Iterator[Floats]:
+    """The bank's `count` transfer functions `(height, width)`, in the layout of `fft2`.
+
+    exp(−log²(ρλ)/(2σ_λ²)) · exp(−Δ²/(2σ_φ²)): Sun Eq. 13 with the square that its print lost; ρ is
+    the frequency in cycles per pixel, Δ the angle to the filter's own. Filter k answers to lines at
+    k · 180°/count from +x towards +y: its own frequencies are perpendicular to the lines. Filters
+    are one-sided in frequency, so that the magnitude of an answer does not depend on whether the
     pixel lies on a line or between two.
     """
+    fy = np.fft.fftfreq(height)[:, None]
+    fx = np.fft.fftfreq(width)[None, :]
+    rho = np.hypot(fx, fy)
+    rho[0, 0] = 1.0
+    radial = np.exp(-(np.log(rho * bank.wavelength) ** 2) / (2 * BANDWIDTH**2))
+    radial[0, 0] = 0.0
+    angle = np.arctan2(fy, fx)
+    sigma = bank.spread * np.pi / bank.count
+    for k in range(bank.count):
+        own = k * np.pi / bank.count + np.pi / 2
+        delta = (angle - own + np.pi) % (2 * np.pi) - np.pi
+        yield np.asarray(radial * np.exp(-(delta**2) / (2 * sigma**2)), np.float32)
 
-    wavelength: float = 3.0
-    bandwidth: float = float(np.log(2))
-    count: int = 128
-    spread: float = 2.0
 
-    def __post_init__(self) -> None:
-        if self.wavelength < 2 or self.bandwidth <= 0 or self.count < 4 or self.spread <= 0:
-            raise ValueError(
-                "a log-Gabor bank needs wavelength >= 2 pixels, bandwidth > 0, count >= 4 and "
-                f"spread > 0, got {self}"
-            )
+def responses(bank: LogGaborBank, images: AnyFloats) -> Floats:
+    """Magnitudes `(count, H, W)` of the answers to an image `(H, W)`, mirrored at its edges.
 
-    def filters(self, height: int, width: int) -> Iterator[Floats]:
-        """The `count` transfer functions `(height, width)`, in the layout of `fft2`.
+    Of a stack `(N, H, W)`, the sum of the magnitudes.
+    """
+    images = np.asarray(images, np.float32)
+    stack = images[None] if images.ndim == 2 else images
+    out = np.zeros((bank.count, *stack.shape[1:]), np.float32)
+    one = np.empty_like(out)
+    for image in stack:
+        _answer(bank, image, one)
+        out += one
+    return out
 
-        Filter k answers to lines at k · 180°/count from +x towards +y: its own frequencies are
-        perpendicular to the lines.
-        """
-        fy = np.fft.fftfreq(height)[:, None]
-        fx = np.fft.fftfreq(width)[None, :]
-        rho = np.hypot(fx, fy)
-        rho[0, 0] = 1.0
-        radial = np.exp(-(np.log(rho * self.wavelength) ** 2) / (2 * self.bandwidth**2))
-        radial[0, 0] = 0.0
-        angle = np.arctan2(fy, fx)
-        sigma = self.spread * np.pi / self.count
-        for k in range(self.count):
-            own = k * np.pi / self.count + np.pi / 2
-            delta = (angle - own + np.pi) % (2 * np.pi) - np.pi
-            yield np.asarray(radial * np.exp(-(delta**2) / (2 * sigma**2)), np.float32)
 
-    def responses(self, images: AnyFloats) -> Floats:
-        """Magnitudes `(count, H, W)` of the answers to an image `(H, W)`, mirrored at its edges.
+def _answer(bank: LogGaborBank, image: Floats, out: Floats) -> None:
+    """Write the magnitudes `(count, H, W)` of the answers to one image into `out`.
 
-        Of a stack `(N, H, W)`, the sum of the magnitudes.
-        """
-        images = np.asarray(images, np.float32)
-        stack = images[None] if images.ndim == 2 else images
-        out = np.zeros((self.count, *stack.shape[1:]), np.float32)
-        one = np.empty_like(out)
-        for image in stack:
-            self.answer(image, one)
-            out += one
-        return out
-
-    def answer(self, image: Floats, out: Floats) -> None:
-        """Write the magnitudes `(count, H, W)` of the answers to one image into `out`.
-
-        A filter's frequencies lie in a narrow wedge: only its rows (or columns, if these are fewer)
-        are transformed first, and of the result only what lies on the image.
-        """
-        shape = image.shape
-        margin = int(
-            min(4 * self.wavelength * max(1.0, self.count / (np.pi * self.spread * 6)), 48)
-        )
-        mode: Literal["reflect", "edge"] = "reflect" if min(shape) > margin else "edge"
-        padded = np.pad(image, margin, mode=mode)
-        h, w = (fft.next_fast_len(n) for n in padded.shape)
-        spectrum = fft.fft2(padded, (h, w))
-        inner = tuple(slice(margin, margin + n) for n in shape)
-        for k, (axis, lines, transfer) in enumerate(_wedges(self, h, w)):
-            some = spectrum.take(lines, axis=1 - axis) * transfer
-            some = fft.ifft(some, axis=axis, overwrite_x=True)
-            across = (slice(None), inner[1]) if axis == 1 else (inner[0], slice(None))
-            full = np.zeros((h, shape[1]) if axis == 1 else (shape[0], w), np.complex64)
-            if axis == 1:
-                full[lines] = some[across]
-                answer = fft.ifft(full, axis=0, overwrite_x=True)[inner[0]]
-            else:
-                full[:, lines] = some[across]
-                answer = fft.ifft(full, axis=1, overwrite_x=True)[:, inner[1]]
-            np.abs(answer, out=out[k])
+    A filter's frequencies lie in a narrow wedge: only its rows (or columns, if these are fewer)
+    are transformed first, and of the result only what lies on the image.
+    """
+    shape = image.shape
+    margin = int(min(4 * bank.wavelength * max(1.0, bank.count / (np.pi * bank.spread * 6)), 48))
+    mode: Literal["reflect", "edge"] = "reflect" if min(shape) > margin else "edge"
+    padded = np.pad(image, margin, mode=mode)
+    h, w = (fft.next_fast_len(n) for n in padded.shape)
+    spectrum = fft.fft2(padded, (h, w))
+    inner = tuple(slice(margin, margin + n) for n in shape)
+    for k, (axis, lines, transfer) in enumerate(_wedges(bank, h, w)):
+        some = spectrum.take(lines, axis=1 - axis) * transfer
+        some = fft.ifft(some, axis=axis, overwrite_x=True)
+        across = (slice(None), inner[1]) if axis == 1 else (inner[0], slice(None))
+        full = np.zeros((h, shape[1]) if axis == 1 else (shape[0], w), np.complex64)
+        if axis == 1:
+            full[lines] = some[across]
+            answer = fft.ifft(full, axis=0, overwrite_x=True)[inner[0]]
+        else:
+            full[:, lines] = some[across]
+            answer = fft.ifft(full, axis=1, overwrite_x=True)[:, inner[1]]
+        np.abs(answer, out=out[k])
 
 
 _NEGLIGIBLE = 1e-6
@@ -112,7 +97,7 @@ def _wedges(bank: LogGaborBank, height: int, width: int) -> list[tuple[int, Ints
     Axis 1 has rows `(R, width)`, axis 0 columns `(height, C)`.
     """
     out = []
-    for transfer in bank.filters(height, width):
+    for transfer in filters(bank, height, width):
         there = transfer > _NEGLIGIBLE * transfer.max()
         rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
         if len(rows) * width <= len(columns) * height:
@@ -149,23 +134,16 @@ def texture(image: AnyFloats, mask: Bools, scale: float = 4.0) -> Floats:
     return np.where(lit, np.clip(ratio, -1.0, 3.0), 0.0).astype(np.float32)
 
 
-Merge = Literal["angles", "responses"]
-
-
 def orientations(
     images: AnyFloats,
     mask: Bools,
     bank: LogGaborBank = LogGaborBank(),
-    merge: Merge = "angles",
 ) -> OrientationMap:
     """The orientation at every pixel of `mask (H, W)` from `images (N, H, W)`, one per lighting.
 
-    By `angles`, each lighting's winner and confidence are merged as doubled angles (Sun Eq. 2
-    averages π-periodic angles directly; θ and θ + π would cancel), weighted by the answer's
-    strength. By `responses`, the lightings' answers themselves are added, each by its brightness,
-    and the winner taken once: a line too faint to win under any one light still adds up under many,
-    so noise turns a third to a quarter of the pixels that it turns by `angles`. The isotropic part
-    of that sum, which noise leaves, does not count for confidence.
+    The lightings' answers are added, each by its brightness, and the winner taken once: a line too
+    faint to win under any one light still adds up under many. (Sun Eq. 2 averages each lighting's
+    winner.) The isotropic part of that sum, which noise leaves, does not count for confidence.
 
     A winner is refined below the bank's bins by the parabola through its neighbours.
     """
@@ -177,49 +155,26 @@ def orientations(
             f"expected images (N, {mask.shape[0]}, {mask.shape[1]}) like the mask, "
             f"got {images.shape}"
         )
-    responses = np.empty((bank.count, *mask.shape), np.float32)
-    if merge == "responses":
-        angle, confidence = _of_summed_responses(images, mask, bank, responses)
-    else:
-        angle, confidence = _of_averaged_angles(images, mask, bank, responses)
+    answers = np.empty((bank.count, *mask.shape), np.float32)
+    total = np.zeros_like(answers)
+    bright = float(np.abs(images[:, mask]).mean()) if mask.any() and len(images) else 0.0
+    for image in images:
+        local = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), 4.0)
+        lit = np.maximum(local, 0) / max(bright, 1e-30)
+        _answer(bank, texture(image, mask) * lit, answers)
+        total += answers
+    said = total.max(axis=0) > _FAINTEST
+    total -= total.min(axis=0)
+    angle, confidence = _winner(total)
+    confidence = np.where(said, confidence, 0.0)
     return OrientationMap(
         angle.astype(np.float32) % np.float32(np.pi),
         np.where(mask, np.clip(confidence, 0, 1), 0).astype(np.float32),
     )
 
 
-def _of_averaged_angles(
-    images: AnyFloats, mask: Bools, bank: LogGaborBank, responses: Floats
-) -> tuple[Array, Array]:
-    total = np.zeros(mask.shape, np.complex128)
-    weight = np.zeros(mask.shape)
-    for image in images:
-        bank.answer(texture(image, mask), responses)
-        angle, confidence, strength = _winner(responses)
-        total += strength * confidence * np.exp(2j * angle)
-        weight += strength
-    return (np.angle(total) / 2) % np.pi, np.abs(total) / np.maximum(weight, 1e-12)
-
-
-def _of_summed_responses(
-    images: AnyFloats, mask: Bools, bank: LogGaborBank, responses: Floats
-) -> tuple[Array, Array]:
-    total = np.zeros_like(responses)
-    bright = float(np.abs(images[:, mask]).mean()) if mask.any() and len(images) else 0.0
-    for image in images:
-        local = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), 4.0)
-        bank.answer(texture(image, mask) * (np.maximum(local, 0) / max(bright, 1e-30)), responses)
-        total += responses
-    said = total.max(axis=0) > _FAINTEST
-    total -= total.min(axis=0)
-    angle, confidence, _ = _winner(total)
-    return angle, np.where(said, confidence, 0.0)
-
-
-def _winner(
-    responses: Floats,
-) -> tuple[Array, Array, Array]:
-    """Angle of the strongest answer below a bin, its confidence and strength; each `(H, W)`."""
+def _winner(responses: Floats) -> tuple[Array, Array]:
+    """Angle and confidence `(H, W)` of the strongest of the answers `(count, H, W)`."""
     count = len(responses)
     peak = responses[0].copy()
     best = np.zeros(peak.shape, np.int64)
@@ -238,4 +193,4 @@ def _winner(
     waves = np.stack([np.cos(phase), np.sin(phase), np.ones(count)]).astype(np.float32)
     real, imaginary, strength = (waves @ responses.reshape(count, -1)).reshape(3, *peak.shape)
     share = np.hypot(real, imaginary) / np.maximum(strength, 1e-12)
-    return angle, np.where(peak > _FAINTEST, share, 0.0).astype(float), peak.astype(float)
+    return angle, np.where(peak > _FAINTEST, share, 0.0).astype(float)

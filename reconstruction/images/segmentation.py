@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,74 +11,63 @@ import cv2
 import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array, Bools
+from reconstruction.reconstruct_options import NetworkOptions
 
 
 class NetworkError(ValueError):
     """A network that cannot be used; the message names its file, what it gave, what is wanted."""
 
 
-@dataclass(frozen=True)
 class Network:
-    """A network from a picture `(1, 3, h, w)` to scores `(1, C, h', w')` of C classes.
+    """A network as `NetworkOptions` has it; raises `NetworkError` where the file is none."""
 
-    It gets RGB in sRGB, exposed so that the 99th percentile is white, as (value - `mean`) / `std`
-    with values in [0, 1], scaled to `size` (width, height); None leaves the camera's own. Of
-    several classes number `hair` must win; one class is hair where its score, a probability in
-    [0, 1] or else a logit, says more than even. Raises `NetworkError` where the file is not a
-    network.
-    """
-
-    file: str
-    size: tuple[int, int] | None = None
-    hair: int = 1
-    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    def __init__(self, options: NetworkOptions) -> None:
+        self.options = options
 
     def hair_pixels(self, image: AnyFloats) -> Bools:
         """The hair's pixels `(H, W)` of a scene-linear picture `(H, W, 3)`; raises as above."""
+        o = self.options
         height, width = image.shape[:2]
-        picture = cv2.resize(
-            _srgb(image), self.size or (width, height), interpolation=cv2.INTER_AREA
-        )
-        planes = ((picture - self.mean) / self.std).transpose(2, 0, 1)[None].astype(np.float32)
+        picture = cv2.resize(_srgb(image), o.size or (width, height), interpolation=cv2.INTER_AREA)
+        planes = ((picture - o.mean) / o.std).transpose(2, 0, 1)[None].astype(np.float32)
         self._net.setInput(np.ascontiguousarray(planes))
         try:
             scores = np.asarray(self._net.forward())
         except cv2.error as error:
             raise NetworkError(
-                f"{self.file}: does not take a picture {planes.shape}: {error.err}; give the size "
+                f"{o.file}: does not take a picture {planes.shape}: {error.err}; give the size "
                 "(width, height) that it was made for"
             ) from error
         if scores.ndim != 4 or scores.shape[0] != 1 or not np.isfinite(scores).all():
             raise NetworkError(
-                f"{self.file}: expected finite scores (1, classes, h, w), got {scores.shape}"
+                f"{o.file}: expected finite scores (1, classes, h, w), got {scores.shape}"
             )
-        if scores.shape[1] > 1 and not 0 <= self.hair < scores.shape[1]:
+        if scores.shape[1] > 1 and not 0 <= o.hair < scores.shape[1]:
             raise NetworkError(
-                f"{self.file}: hair is class {self.hair}, but it tells {scores.shape[1]} classes"
+                f"{o.file}: hair is class {o.hair}, but it tells {scores.shape[1]} classes"
             )
         # scores are enlarged, not masks: the edge stays smooth
         planes = [cv2.resize(s, (width, height)) for s in scores[0]]
         if len(planes) > 1:
-            return np.asarray(np.argmax(planes, axis=0) == self.hair)
+            return np.asarray(np.argmax(planes, axis=0) == o.hair)
         probability = scores.min() >= 0 and scores.max() <= 1
         return np.asarray(planes[0] > (0.5 if probability else 0.0))
 
     def to_dict(self) -> dict[str, Any]:
         """What a report says of it: the file, and its SHA-256."""
         return {
-            "file": self.file,
-            "sha256": hashlib.sha256(Path(self.file).read_bytes()).hexdigest(),
+            "file": self.options.file,
+            "sha256": hashlib.sha256(Path(self.options.file).read_bytes()).hexdigest(),
         }
 
     @cached_property
     def _net(self) -> Any:
-        if not Path(self.file).is_file():
-            raise NetworkError(f"{self.file}: no such file; expected an ONNX network")
+        if not Path(self.options.file).is_file():
+            raise NetworkError(f"{self.options.file}: no such file; expected an ONNX network")
         try:
-            return cv2.dnn.readNetFromONNX(self.file)
+            return cv2.dnn.readNetFromONNX(self.options.file)
         except cv2.error as error:
-            raise NetworkError(f"{self.file}: not an ONNX network ({error.err})") from error
+            raise NetworkError(f"{self.options.file}: not an ONNX network ({error.err})") from error
 
 
 def _srgb(image: AnyFloats) -> Array:

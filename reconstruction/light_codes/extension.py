@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from reconstruction.arrays import Array, Ints
 from reconstruction.light_codes.code_views import View
 
+STEP = 5e-4
+"""Metres."""
 
-@dataclass(frozen=True)
-class ExtensionOptions:
-    """`step` metres; a view agrees within `angle_deg`; at most `longest` metres from either tip.
+ANGLE_DEG = 5.0
+"""Within which a view's line agrees with a strand."""
 
-    `least_confidence` of a view's line for it to have a say.
-    """
+LONGEST = 0.05
+"""Metres that grow at most from either tip."""
 
-    step: float = 5e-4
-    angle_deg: float = 5.0
-    longest: float = 0.05
-    least_confidence: float = 0.05
+LEAST_CONFIDENCE = 0.05
+"""Of a view's line for it to have a say."""
 
 
 def fewest_views(count: int) -> int:
@@ -30,7 +28,7 @@ def fewest_views(count: int) -> int:
 
 
 def extend(
-    views: Sequence[View], strands: list[Array], options: ExtensionOptions = ExtensionOptions()
+    views: Sequence[View], strands: list[Array], angle_deg: float = ANGLE_DEG
 ) -> list[Array]:
     """The polylines `(N, 3)` with what grows at both of their tips.
 
@@ -46,20 +44,18 @@ def extend(
     )
     heading = tips - before
     heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-12)
-    grown = _grow(views, tips, heading, options)
+    grown = _grow(views, tips, heading, angle_deg)
     n = len(strands)
     return [np.concatenate([grown[k][::-1], s, grown[n + k]]) for k, s in enumerate(strands)]
 
 
-def _grow(
-    views: Sequence[View], tips: Array, heading: Array, options: ExtensionOptions
-) -> list[Array]:
+def _grow(views: Sequence[View], tips: Array, heading: Array, angle_deg: float) -> list[Array]:
     """The points `(n_i, 3)` that follow each tip."""
     columns: list[tuple[Ints, Array]] = []
     active, p, d = np.arange(len(tips)), tips.copy(), heading.copy()
     least = fewest_views(len(views))
-    for _ in range(int(options.longest / options.step)):
-        normals, aligned = _planes(views, p, d, options)
+    for _ in range(int(LONGEST / STEP)):
+        normals, aligned = _planes(views, p, d, angle_deg)
         going = aligned.sum(axis=1) >= least
         if not going.any():
             break
@@ -69,7 +65,7 @@ def _grow(
         new *= np.where((new * d).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         straight = (new * d).sum(axis=1) > 0.9  # nearly parallel planes leave the direction open
         d = np.where(straight[:, None], new, d)
-        p = p + options.step * d
+        p = p + STEP * d
         columns.append((active, p))
     out: list[list[Array]] = [[] for _ in tips]
     for which, points in columns:
@@ -78,13 +74,11 @@ def _grow(
     return [np.array(points).reshape(-1, 3) for points in out]
 
 
-def _planes(
-    views: Sequence[View], p: Array, d: Array, options: ExtensionOptions
-) -> tuple[Array, Array]:
+def _planes(views: Sequence[View], p: Array, d: Array, angle_deg: float) -> tuple[Array, Array]:
     """Normals `(N, V, 3)` of the planes of the lines under `p (N, 3)`, and which run along `d`."""
     normals = np.zeros((len(p), len(views), 3))
     aligned = np.zeros((len(p), len(views)))
-    least = np.cos(np.radians(options.angle_deg))
+    least = np.cos(np.radians(angle_deg))
     for k, view in enumerate(views):
         camera = view.camera
         xy, depth = camera.project(p)
@@ -92,7 +86,7 @@ def _planes(
         at = np.rint(np.where(on[:, None], xy, 0)).astype(np.int64)
         line = view.lines[at[:, 1], at[:, 0]].astype(float)
         weight = np.linalg.norm(line, axis=1)
-        on &= weight >= options.least_confidence
+        on &= weight >= LEAST_CONFIDENCE
         M = camera.K @ camera.R
         step = d @ M.T
         flow = step[:, :2] - xy * step[:, 2:]

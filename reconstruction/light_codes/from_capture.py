@@ -10,10 +10,11 @@ import numpy as np
 from reconstruction.arrays import Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
-from reconstruction.images.orientation import LogGaborBank, orientations
+from reconstruction.images.orientation import orientations
 from reconstruction.images.silhouettes import background_noise, dark_frame
 from reconstruction.light_codes.code_views import View, furthest_light, light_beside, line_vectors
 from reconstruction.light_codes.codes import along_lines, code_map
+from reconstruction.reconstruct_options import LogGaborBank
 from reconstruction.report.report import Progress, Stage, silent
 
 
@@ -95,7 +96,7 @@ def _view(
             )
         images[i] = (image.mean(axis=-1) - dark) / irradiance
         noise = max(noise, background_noise(images[i]))
-    found = orientations(images, mask, bank, "responses")
+    found = orientations(images, mask, bank)
     smooth = along_lines(images, found.angle)
     codes = code_map(smooth, mask, furthest_light(camera, lights), noise, clipped)
     lines = line_vectors(found.angle, found.confidence)

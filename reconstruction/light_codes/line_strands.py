@@ -10,12 +10,15 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
-from reconstruction.light_codes.light_code_options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.measure_segments import connect_segments, measure_segments
 from reconstruction.light_codes.segments import Segments
 from reconstruction.masks import MaskedCapture
+from reconstruction.reconstruct_options import LightCodeOptions
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
+
+SEGMENT_WEIGHT = 4.0
+"""Of a segment's confidence, in an orientation field that it shares with measured tangents."""
 
 
 def line_strands(
@@ -24,7 +27,7 @@ def line_strands(
     report: Report,
     *,
     method: Literal["photometric", "lmvs"] = "photometric",
-    options: LightCodeOptions = DEFAULTS,
+    options: LightCodeOptions = LightCodeOptions(),
     progress: Progress = silent,
 ) -> tuple[list[Array], Segments]:
     """Polylines `(N, 3)` from line stereo, the end that is nearer to the head first.
@@ -35,15 +38,15 @@ def line_strands(
     views, segments = measure_segments(
         masked, head, report, method=method, options=options, progress=progress
     )
-    return _roots_first(connect_segments(views, segments, report, options), head), segments
+    return _roots_first(connect_segments(views, segments, report), head), segments
 
 
-def merge(measured: Measured, segments: Segments, weight: float) -> Measured:
-    """The measurements of both methods; segments count by their confidence times `weight`."""
+def merge(measured: Measured, segments: Segments) -> Measured:
+    """The measurements of both methods; segments count `SEGMENT_WEIGHT` times their confidence."""
     return Measured(
         np.concatenate([measured.points, segments.points]),
         np.concatenate([measured.directions, segments.directions]),
-        np.concatenate([measured.confidence, weight * segments.confidence]),
+        np.concatenate([measured.confidence, SEGMENT_WEIGHT * segments.confidence]),
     )
 
 

@@ -17,7 +17,7 @@ from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import Pixels, line_through
-from reconstruction.light_codes.search import DepthSearch
+from reconstruction.light_codes.search import LENGTH, SAMPLES, DepthSearch
 
 FAN = np.radians(np.linspace(-50, 50, 5))
 """Inclinations towards the camera at which a line is tried at every depth."""
@@ -41,12 +41,12 @@ class LmvsSearch(DepthSearch):
         pixels.code = []  # this method knows no lightcode: nothing is compared, all is equal
         along = self._in_plane(view, x, y)
         near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
-        step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, options.samples)
+        step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, SAMPLES)
         total = len(self.neighbours[view])
         few = min(COARSE_NEIGHBOURS, total)
-        coarse = _Cost(self.device, pixels, along, few, options.length)
+        coarse = _Cost(self.device, pixels, along, few, LENGTH)
         cost, depth, tilt = _sweep(coarse, near, step, number)
-        fine = _Cost(self.device, pixels, along, total, options.length)
+        fine = _Cost(self.device, pixels, along, total, LENGTH)
         cost = fine(depth, tilt, samples)
         move, turn = 0.5 * options.step, 0.5 * float(FAN[1] - FAN[0])
         for _ in range(ROUNDS):

@@ -10,12 +10,11 @@ from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.surface_strands import surface_strands
+from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.depth_range import depth_range, hair_volume
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.from_capture import views_of
-from reconstruction.light_codes.light_code_options import DEFAULTS, LightCodeOptions
 from reconstruction.light_codes.lmvs import LmvsSearch
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import (
@@ -25,8 +24,20 @@ from reconstruction.light_codes.segments import (
     to_segments,
 )
 from reconstruction.masks import MaskedCapture
+from reconstruction.reconstruct_options import LightCodeOptions
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
+
+VOLUME_GRID = 4e-3
+"""Metres: the voxels in which depths are bounded."""
+
+SUPPORT_DISTANCE, SUPPORT_ANGLE_DEG = 1.5e-3, 15.0
+"""Metres and degrees within which two views found a segment alike."""
+
+CROWD = 3e-4
+"""Metres: lines are averaged in cells of this size before strands are traced through them."""
+
+TRACING = SurfaceOptions(apart=6e-4, step=0.7, shortest=5.0, smooth=2.0)
 
 
 def build_views(
@@ -34,7 +45,7 @@ def build_views(
     head: Mesh | None,
     report: Report,
     *,
-    options: LightCodeOptions = DEFAULTS,
+    options: LightCodeOptions = LightCodeOptions(),
     progress: Progress = silent,
 ) -> tuple[list[View], VoxelGrid]:
     """The views, and the volume that holds the hair; adds the stage `lightcodes` to the report."""
@@ -45,7 +56,7 @@ def build_views(
         raise CaptureError(f"{capture.path}: no camera's mask holds hair: check the masks")
     with report.stage("lightcodes") as stage:
         try:
-            volume = hair_volume(cameras, subject, head, options.volume_grid)
+            volume = hair_volume(cameras, subject, head, VOLUME_GRID)
         except ValueError as error:
             raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
         if not volume.inside.any():
@@ -64,7 +75,7 @@ def measure_segments(
     report: Report,
     *,
     method: Literal["photometric", "lmvs"] = "photometric",
-    options: LightCodeOptions = DEFAULTS,
+    options: LightCodeOptions = LightCodeOptions(),
     progress: Progress = silent,
 ) -> tuple[list[View], Segments]:
     """The views, and the segments that `least_views` of them (all, if there are fewer) agree on.
@@ -104,8 +115,8 @@ def measure_segments(
             views,
             maps,
             segments,
-            distance=options.support_distance,
-            angle_deg=options.support_angle_deg,
+            distance=SUPPORT_DISTANCE,
+            angle_deg=SUPPORT_ANGLE_DEG,
         )
         supports = np.bincount(segments.supports, minlength=len(views) + 1)
         least = min(options.least_views, len(views))
@@ -124,23 +135,18 @@ def measure_segments(
     return views, kept
 
 
-def connect_segments(
-    views: list[View],
-    segments: Segments,
-    report: Report,
-    options: LightCodeOptions = DEFAULTS,
-) -> list[Array]:
+def connect_segments(views: list[View], segments: Segments, report: Report) -> list[Array]:
     """Polylines `(N, 3)` through the segments, with what grows from their tips."""
     with report.stage("connection") as stage:
         # of the segments that ten views agree on, three times as many are right as of those of four
         weights = (segments.confidence * segments.supports) ** 2
         points, directions, weights = thinned_lines(
-            segments.points, segments.directions, weights, options.crowd
+            segments.points, segments.directions, weights, CROWD
         )
         usual = np.median(weights[weights > 0]) if (weights > 0).any() else 1.0
         lines = Measured(points, directions, np.minimum(weights / usual, 1.0))
-        found = [p.astype(float) for p in surface_strands(lines, options.strands)]
-        grown = extend(views, found, options.extension)
+        found = [p.astype(float) for p in surface_strands(lines, TRACING)]
+        grown = extend(views, found)
         stage.figures.update(
             lines=len(points),
             strands=len(found),

@@ -15,54 +15,21 @@ from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.light_codes.code_views import View, nearest_views
 from reconstruction.light_codes.codes import unpack
 from reconstruction.light_codes.device_views import DeviceViews
-from reconstruction.light_codes.objective import (
-    Pixels,
-    agreement,
-    line_through,
-)
+from reconstruction.light_codes.objective import Pixels, agreement, line_through
+from reconstruction.reconstruct_options import SearchOptions
 
 FEW_SAMPLES = 3
 """Points of a segment in the first stage. Sun's compares lightcodes alone there, which change too
 little from one strand to the next: its best 24 depths of 160 held the best in 88 % of pixels."""
 
-MOST_NEIGHBOURS = 31  # and the reference itself: their bits fill a word
+SAMPLES, LENGTH = 25, 5e-3
+"""Points of a segment that are compared in the second stage, and metres from its end to its end."""
 
+LEAST_CONFIDENCE = 0.1
+"""Of a pixel's line for it to be a reference."""
 
-@dataclass(frozen=True)
-class SearchOptions:
-    """How depths are searched.
-
-    `step` metres between depths. `samples` points of a segment, `length` metres end to end, are
-    compared in up to `neighbours` nearest visible views. The `candidates` best depths of each pixel
-    by `FEW_SAMPLES` points go on to all of them; 0 gives them all depths (brute force). The first
-    stage takes every `coarse`th depth; the second also those between a candidate and the next.
-    `least_confidence` of a pixel's line for it to be a reference. Segments whose planes' `spread`
-    is lower are dropped as nearly parallel. `variant` as in `array_backend.chosen_variant`.
-    """
-
-    step: float = 2.5e-4
-    samples: int = 25
-    length: float = 5e-3
-    neighbours: int = 16
-    candidates: int = 8
-    coarse: int = 1
-    least_confidence: float = 0.1
-    least_spread: float = 0.05
-    variant: str | None = None
-
-    def __post_init__(self) -> None:
-        if not self.step > 0 or not self.length > 0:
-            raise ValueError(f"step and length must be positive, got {self.step}, {self.length}")
-        few = self.samples < 1 or self.candidates < 0 or self.coarse < 1
-        if few or not 1 <= self.neighbours <= MOST_NEIGHBOURS:
-            raise ValueError(
-                f"need samples >= 1, 1 <= neighbours <= {MOST_NEIGHBOURS}, candidates >= 0, "
-                f"coarse >= 1, got {self.samples}, {self.neighbours}, {self.candidates}, "
-                f"{self.coarse}"
-            )
-
-
-DEFAULTS = SearchOptions()
+LEAST_SPREAD = 0.05
+"""Segments whose planes spread less are dropped as nearly parallel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +62,7 @@ class DepthSearch:
         if len(views) < 2:
             raise ValueError(f"line stereo needs at least two views of hair, got {len(views)}")
         self.views, self.options = tuple(views), options
-        self.types = array_types(options.variant)
+        self.types = array_types()
         self.device = DeviceViews(self.types, views)
         self.neighbours = nearest_views(views, subject, options.neighbours)
 
@@ -140,7 +107,7 @@ class DepthSearch:
         Where `far` is not above `near` there is nothing to search, as off the mask.
         """
         own, options = self.views[view], self.options
-        asked = own.mask & (own.confidence >= options.least_confidence) & (far > near)
+        asked = own.mask & (own.confidence >= LEAST_CONFIDENCE) & (far > near)
         y, x = np.nonzero(asked)
         if not len(x) or not self.neighbours[view]:
             return _nothing()
@@ -149,7 +116,7 @@ class DepthSearch:
         counts = np.ceil((far[y, x] - start) / options.step).astype(np.uint32) + 1
         found = self.search(pixels, x, y, start, counts, view)
         depth, direction, agree, spread, misfit = found
-        keep = (seen_by > 0) & (spread >= options.least_spread) & (agree > 0)
+        keep = (seen_by > 0) & (spread >= LEAST_SPREAD) & (agree > 0)
         return DepthMap(
             *(a[keep] for a in (x, y, depth, direction, agree, spread, misfit, seen_by))
         )
@@ -179,12 +146,10 @@ def _search(
     t = device.types
     near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
     step = dr.opaque(t.Float, options.step)
-    apart = options.length / max(options.samples - 1, 1)
-    fine = _Depths(device, pixels, near, step, options.samples, apart)
+    fine = _Depths(device, pixels, near, step, SAMPLES, LENGTH / (SAMPLES - 1))
     if options.candidates:
         every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
-        apart = options.length / FEW_SAMPLES
-        wide = _Depths(device, pixels, near, every * step, FEW_SAMPLES, apart)
+        wide = _Depths(device, pixels, near, every * step, FEW_SAMPLES, LENGTH / FEW_SAMPLES)
         steps = best_coarse(wide, coarse, options.candidates)
         between = range(1 - every, every)
         steps = [t.UInt32(dr.maximum(t.Int32(k * every) + j, 0)) for k in steps for j in between]

@@ -2,7 +2,7 @@
 
 from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.point_cloud import PointCloud
-from reconstruction.light_planes.tracking import MotionOptions, solve_motion
+from reconstruction.light_planes.tracking import solve_motion
 from reconstruction.light_planes.triangulation import (
     TriangulateOptions,
     sweep_peaks,
@@ -11,7 +11,6 @@ from reconstruction.light_planes.triangulation import (
 
 __all__ = [
     "Motion",
-    "MotionOptions",
     "PointCloud",
     "TriangulateOptions",
     "solve_motion",

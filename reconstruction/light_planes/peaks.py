@@ -21,22 +21,18 @@ WINDOW = 2 * REACH + 1
 CLEAN = 0.1  # rows: what a stripe's centre is off by even without noise, on fibres of many depths
 
 
-@dataclass(frozen=True)
-class PeakOptions:
-    """What counts as a stripe of direct light.
+NOISE_FACTOR, FAINTEST = 6.0, 0.01
+"""A maximum stands so many deviations above the dark frame, and reaches this share of the camera's
+bright maxima (95th percentile)."""
 
-    A maximum must stand `noise_factor` deviations above the dark frame and reach `faintest` of the
-    camera's bright maxima (95th percentile); at least `direct_share` of all the light that the
-    sweep brings to the pixel must be in the stripe (indirect light comes from every row); the
-    stripe must correlate with the projector's line profile by `correlation`. Up to `per_pixel`
-    maxima are kept: hair lets a ray hit several fibres.
-    """
+DIRECT_SHARE = 0.15
+"""Of all the light that the sweep brings to the pixel: indirect light comes from every row."""
 
-    noise_factor: float = 6.0
-    faintest: float = 0.01
-    direct_share: float = 0.15
-    correlation: float = 0.9
-    per_pixel: int = 2
+CORRELATION = 0.9
+"""Of a stripe with the projector's line profile."""
+
+PER_PIXEL = 2
+"""Maxima that are kept: hair lets a ray hit several fibres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,22 +59,19 @@ class Peaks:
     missing_rows: tuple[int, ...] = field(default=())
 
 
-def find_peaks(
-    capture: Capture, camera: str, projector: str, options: PeakOptions | None = None
-) -> Peaks:
+def find_peaks(capture: Capture, camera: str, projector: str) -> Peaks:
     """Read one camera's frames of one projector's sweep in row order and locate its stripes.
 
     A maximum next to a frame that is missing is not used. `KeyError` for unknown names.
     """
-    options = options or PeakOptions()
     device = capture.rig.projector(projector)
     capture.rig.camera(camera)
     sweep = {s.row: s for s in capture.of_kind("scanline") if s.projector == projector}
-    scan = _Scan(capture, camera, sweep, device.height, options.per_pixel)
+    scan = _Scan(capture, camera, sweep, device.height, PER_PIXEL)
     for row in range(-REACH, device.height + REACH):
         scan.push(row)
     noise = scan.noise()
-    floor = max(options.noise_factor * noise, options.faintest * _bright(scan.value[0]))
+    floor = max(NOISE_FACTOR * noise, FAINTEST * _bright(scan.value[0]))
     strong = scan.value > floor
     layer, y, x = np.nonzero(strong)
     window = scan.window[layer, y, x].astype(np.float64)
@@ -87,7 +80,7 @@ def find_peaks(
     share = amplitude / np.maximum(np.maximum(scan.total[y, x], value), amplitude)
     saturated = scan.clipped[strong]
     deviation[saturated] = np.maximum(deviation[saturated], 0.3)
-    keep = ((share >= options.direct_share) & (correlation >= options.correlation)) | saturated
+    keep = ((share >= DIRECT_SHARE) & (correlation >= CORRELATION)) | saturated
     steps = np.array([sweep[r].index if r in sweep else -1 for r in range(device.height)])
     return Peaks(
         camera,

@@ -12,6 +12,9 @@ from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Camera
 
 Pose = tuple[Array, Array]
+WEAKEST = 0.02
+"""Directions whose singular value is below this share of the largest are not determined."""
+
 LEVER = 0.1  # metres: rotations count by what they move at this distance, so that units agree
 
 
@@ -21,17 +24,16 @@ class Determination:
 
     `strength (6,)` are the singular values of its derivatives over the largest, smallest first, and
     `directions (6, 6)` their columns: a turn about the world's origin times `LEVER`, then a shift.
-    Directions weaker than `weakest` were left as they were.
+    Directions weaker than `WEAKEST` were left as they were.
     """
 
     strength: Array
     directions: Array
-    weakest: float
 
     @property
     def rank(self) -> int:
         """How many directions are determined."""
-        return int((self.strength > self.weakest).sum())
+        return int((self.strength > WEAKEST).sum())
 
     def named(self, count: int) -> list[str]:
         """The `count` weakest directions in words."""
@@ -55,7 +57,6 @@ def _in_words(direction: Array) -> str:
 
 def gauss_newton(
     system: Callable[[Pose], tuple[Array, Array]],
-    weakest: float,
     iterations: int,
     start: Pose | None = None,
 ) -> tuple[Pose, Determination]:
@@ -65,7 +66,7 @@ def gauss_newton(
     a shift, both applied after the pose.
     """
     rotation, translation = start if start is not None else (np.eye(3), np.zeros(3))
-    found = Determination(np.zeros(6), np.eye(6), weakest)
+    found = Determination(np.zeros(6), np.eye(6))
     for _ in range(iterations):
         error, rows = system((rotation, translation))
         scale = 1.4826 * float(np.median(np.abs(error)))
@@ -73,8 +74,8 @@ def gauss_newton(
         weight = np.minimum(1.0, 1.345 * scale / size) if scale > 0 else np.ones_like(error)
         values, vectors = np.linalg.eigh(rows.T @ (rows * weight[:, None]))
         relative = np.maximum(values, 0) / max(float(values[-1]), np.finfo(float).tiny)
-        found = Determination(np.sqrt(relative), vectors, weakest)
-        strong = found.strength > weakest
+        found = Determination(np.sqrt(relative), vectors)
+        strong = found.strength > WEAKEST
         basis = vectors[:, strong]
         step = -basis @ ((basis.T @ (rows.T @ (weight * error))) / values[strong])
         turn = Rotation.from_rotvec(step[:3] / LEVER).as_matrix()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from scipy import ndimage
@@ -20,7 +19,7 @@ from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import dark_frame
-from reconstruction.light_planes.motion import Between, Motion
+from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.light_planes.registration import (
     Registration,
@@ -37,6 +36,7 @@ from reconstruction.light_planes.rigid_fit import (
     gauss_newton,
     numeric,
 )
+from reconstruction.reconstruct_options import MotionOptions
 from reconstruction.report.report import Progress, Stage, silent
 
 SIGMA = 1.5
@@ -46,24 +46,13 @@ ALIKE = 0.6
 """Likeness under which a tracking frame does not show what the reference shows."""
 
 
+STILL_PX = 0.03
+"""Motions under this, or within the noise of all cameras together, are none."""
+
+MOST_POINTS = 12000
+"""Points of a camera that take part."""
+
 STILL: Pose = (np.eye(3), np.zeros(3))
-
-
-@dataclass(frozen=True)
-class MotionOptions:
-    """How the motion is solved.
-
-    `still_px`: motions under this, or within the noise of all cameras together, are none.
-    `weakest`: directions whose singular value is below this share of the largest are not
-    determined, and stay at zero. `points`: at most so many points a camera.
-    """
-
-    method: Literal["direct", "registered"] = "direct"
-    between: Between = "interpolate"
-    still_px: float = 0.03
-    weakest: float = 0.02
-    points: int = 12000
-    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +103,7 @@ def solve_motion(
     if len(steps) < 2:
         stage.leave_out("motion solve", f"{len(steps)} tracking frames", "the whole stage")
         return Motion.none([s.index for s in steps])
-    views = _views(capture, steps[0], points, options, stage)
+    views = _views(capture, steps[0], points, stage)
     if not views:
         stage.warn("no camera could be registered: the subject is taken to have kept still")
         return Motion.none([s.index for s in steps])
@@ -123,7 +112,7 @@ def solve_motion(
         present, images = _present(capture, step, views)
         quick = [v.template.register(images[v.camera.name], iterations=1) for v in present]
         largest = max([largest, *(r.largest() for r in quick)])
-        moved |= _moved(quick, options.still_px)
+        moved |= _moved(quick)
         # what moved far is registered with so large a residual that it passes for noise
         moved |= bool(present) and likeness(present, images, STILL) < ALIKE
     stage.figures["largest_2d_motion_px"] = largest
@@ -154,9 +143,9 @@ def _solve_all(
             continue
         found = [(v, v.template.register(images[v.camera.name], iterations=15)) for v in present]
         pairs += len(found)
-        pose, determined, residual = from_registrations(found, options.weakest)
+        pose, determined, residual = from_registrations(found)
         if options.method == "direct":
-            pose, determined = align(present, images, pose, options.weakest)
+            pose, determined = align(present, images, pose)
         if likeness(present, images, pose) < ALIKE:
             lost.append(step.index)
             continue
@@ -206,7 +195,7 @@ def _solve_all(
 
 
 def from_registrations(
-    found: list[tuple[_View, Registration]], weakest: float
+    found: list[tuple[_View, Registration]],
 ) -> tuple[Pose, Determination, float]:
     """The motion that best explains 2D registrations (Photobooth Eq. 2), robustly.
 
@@ -229,7 +218,7 @@ def from_registrations(
             shifts.append([*shift, angle * view.spread])
         return np.concatenate(shifts) - target
 
-    pose, determined = gauss_newton(lambda p: (residual(p), numeric(residual, p)), weakest, 12)
+    pose, determined = gauss_newton(lambda p: (residual(p), numeric(residual, p)), 12)
     return pose, determined, float(np.sqrt(np.mean(residual(pose) ** 2)))
 
 
@@ -237,7 +226,6 @@ def align(
     views: list[_View],
     images: dict[str, Array],
     start: Pose,
-    weakest: float,
 ) -> tuple[Pose, Determination]:
     """The motion under which every camera's picture at the moved points equals its reference.
 
@@ -264,7 +252,7 @@ def align(
             rows.append(flow(gradient, view.camera, moved, depth) * inside[:, None])
         return np.concatenate(errors), np.concatenate(rows)
 
-    return gauss_newton(system, weakest, 10, start)
+    return gauss_newton(system, 10, start)
 
 
 def likeness(views: list[_View], images: dict[str, Array], pose: Pose) -> float:
@@ -288,10 +276,8 @@ def likeness(views: list[_View], images: dict[str, Array], pose: Pose) -> float:
     return float(np.median(out))
 
 
-def _views(
-    capture: Capture, reference: Step, points: PointCloud, options: MotionOptions, stage: Stage
-) -> list[_View]:
-    rng = np.random.default_rng(options.seed)
+def _views(capture: Capture, reference: Step, points: PointCloud, stage: Stage) -> list[_View]:
+    rng = np.random.default_rng(0)
     views = []
     for camera in capture.rig.cameras:
         if not capture.has(reference, camera.name):
@@ -303,8 +289,8 @@ def _views(
         if len(seen) < 30:
             stage.warn(f"{camera.name} triangulated {len(seen)} points: not used for motion")
             continue
-        if len(seen) > options.points:
-            seen = seen[np.sort(rng.choice(len(seen), options.points, replace=False))]
+        if len(seen) > MOST_POINTS:
+            seen = seen[np.sort(rng.choice(len(seen), MOST_POINTS, replace=False))]
         pixels = camera.project(seen)[0]
         image = _picture(capture, reference, camera.name)
         mask = np.zeros(image.shape, bool)
@@ -336,13 +322,13 @@ def _present(
     return present, {v.camera.name: _picture(capture, step, v.camera.name) for v in present}
 
 
-def _moved(frame: list[Registration], still_px: float) -> bool:
+def _moved(frame: list[Registration]) -> bool:
     """Whether the cameras' registrations of one frame together stand out of their noise.
 
     Their squares over their variances average 1 for a still subject, with a deviation of
     sqrt(2 / count): four of those decide.
     """
-    if max((r.largest() for r in frame), default=0.0) <= still_px:
+    if max((r.largest() for r in frame), default=0.0) <= STILL_PX:
         return False
     tiny = np.finfo(float).tiny
     squares = np.concatenate(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,39 +13,41 @@ from reconstruction.geometry.projectors import Projector
 from reconstruction.images.silhouettes import NoSilhouette, silhouette
 from reconstruction.light_planes.consensus import flatten, support, supported
 from reconstruction.light_planes.motion import Motion
-from reconstruction.light_planes.peaks import CLEAN, PeakOptions, Peaks, find_peaks
+from reconstruction.light_planes.peaks import CLEAN, Peaks, find_peaks
 from reconstruction.light_planes.plane_conditioning import row_pitch
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Progress, Stage, silent
 
+MIN_ANGLE_DEG = 10.0
+"""Rays that meet their plane flatter are not used."""
+
+MAX_DEVIATION = 2.5e-3
+"""Metres: the largest standard deviation along the ray."""
+
+HULL_MARGIN = 1.0
+"""Pixels that a point may project outside a silhouette."""
+
+NEIGHBOURS, ISOLATION = 8, 1.6
+"""See `consensus.supported`."""
+
+RADIUS, ROUGHNESS = 2.5e-3, 3e-4
+"""Metres: a neighbourhood's size, and how far fibres lie off its plane (`consensus.flatten`)."""
+
 
 @dataclass(frozen=True)
 class TriangulateOptions:
-    """How points are made and which are kept.
+    """What a study leaves out of making points.
 
-    `min_angle_deg`: rays that meet their plane flatter are not used. `max_deviation` (metres): the
-    largest standard deviation along the ray. `hull_margin` (pixels): how far outside a silhouette a
-    point may project. `neighbours`, `isolation`: see `consensus.supported`. `fuse`: points of one
-    pixel that agree become one. `flatten`: use each neighbourhood's plane, see
-    `consensus.flatten`; `radius` (metres) is its size, `roughness` (metres) how far fibres lie off.
+    `hull`: points outside a silhouette go. `fuse`: points of one pixel that agree become one.
+    `flatten`: points move to their neighbourhood's plane.
     """
 
-    peaks: PeakOptions = field(default_factory=PeakOptions)
-    min_angle_deg: float = 10.0
-    max_deviation: float = 2.5e-3
     hull: bool = True
-    hull_margin: float = 1.0
-    neighbours: int = 8
-    isolation: float = 1.6
     fuse: bool = True
     flatten: bool = True
-    radius: float = 2.5e-3
-    roughness: float = 3e-4
 
 
-def sweep_peaks(
-    capture: Capture, options: PeakOptions | None = None, progress: Progress = silent
-) -> list[Peaks]:
+def sweep_peaks(capture: Capture, progress: Progress = silent) -> list[Peaks]:
     """The stripes of every camera and projector, streamed from disk.
 
     Raises `CaptureError` for a capture without scanline frames.
@@ -61,7 +63,7 @@ def sweep_peaks(
     peaks = []
     for i, (camera, projector) in enumerate(pairs):
         progress(f"scanlines of {projector} in {camera}", i / len(pairs))
-        peaks.append(find_peaks(capture, camera, projector, options))
+        peaks.append(find_peaks(capture, camera, projector))
     progress("scanlines", 1.0)
     return peaks
 
@@ -85,11 +87,11 @@ def triangulate(
     options = options or TriangulateOptions()
     stage = stage or Stage("triangulation")
     if peaks is None:
-        peaks = sweep_peaks(capture, options.peaks, progress)
+        peaks = sweep_peaks(capture, progress)
     cameras = tuple(c.name for c in capture.rig.cameras)
     projectors = tuple(p.name for p in capture.rig.projectors)
     clouds = [PointCloud.empty(cameras, projectors)]
-    clouds += [intersect(capture, p, motion, options) for p in peaks if len(p.row)]
+    clouds += [intersect(capture, p, motion) for p in peaks if len(p.row)]
     cloud = PointCloud.merged(clouds)
     counts = {
         "bright_pixels": sum(p.bright for p in peaks),
@@ -107,16 +109,16 @@ def triangulate(
         elif not len(p.row):
             stage.warn(f"{p.camera} saw no stripe of {p.projector}")
     if options.hull:
-        cloud = cloud.subset(inside_hull(capture, cloud.points, options.hull_margin, stage))
+        cloud = cloud.subset(inside_hull(capture, cloud.points, stage))
     counts["inside_hull"] = len(cloud)
     if options.fuse:
         cloud = fuse(cloud)
     counts["after_fusion"] = len(cloud)
-    cloud = cloud.subset(supported(cloud.points, options.neighbours, options.isolation))
-    backing = support(cloud.points, options.radius)
+    cloud = cloud.subset(supported(cloud.points, NEIGHBOURS, ISOLATION))
+    backing = support(cloud.points, RADIUS)
     cloud = replace(cloud, weight=(cloud.weight * backing).astype(np.float32))
     if options.flatten:
-        cloud = flatten(cloud, options.radius, options.roughness)
+        cloud = flatten(cloud, RADIUS, ROUGHNESS)
     counts["points"] = len(cloud)
     stage.figures.update(counts)
     if len(cloud):
@@ -131,9 +133,7 @@ def triangulate(
     return cloud
 
 
-def intersect(
-    capture: Capture, peaks: Peaks, motion: Motion | None, options: TriangulateOptions
-) -> PointCloud:
+def intersect(capture: Capture, peaks: Peaks, motion: Motion | None) -> PointCloud:
     """The points of one camera and projector: each ray cut with its plane, moved to the reference.
 
     The deviation along the ray is that of the row times the shift per row, which grows with
@@ -148,13 +148,13 @@ def intersect(
     ahead = _cut(camera.center, rays, projector, peaks.row + step)[0]
     behind = _cut(camera.center, rays, projector, peaks.row - step)[0]
     usable = np.isfinite(distance) & np.isfinite(ahead) & np.isfinite(behind)
-    usable &= (distance > 0) & (sine >= np.sin(np.radians(options.min_angle_deg)))
+    usable &= (distance > 0) & (sine >= np.sin(np.radians(MIN_ANGLE_DEG)))
     distance, ahead, behind = (np.where(usable, d, 1.0) for d in (distance, ahead, behind))
     per_row = np.abs(ahead - behind) / (2 * step)
     along = peaks.deviation * per_row
     points = camera.center + distance[:, None] * rays
     across = distance / np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / np.sqrt(12)
-    usable &= (along <= options.max_deviation) & (projector.project(points)[1] > 0)
+    usable &= (along <= MAX_DEVIATION) & (projector.project(points)[1] > 0)
     outer = rays[:, :, None] * rays[:, None, :]
     covariance = (along**2)[:, None, None] * outer
     covariance += (across**2)[:, None, None] * (np.eye(3) - outer)
@@ -184,10 +184,8 @@ def intersect(
     )
 
 
-def inside_hull(
-    capture: Capture, points: Array, margin: float, stage: Stage | None = None
-) -> Bools:
-    """Which `points (N, 3)` lie in every camera's silhouette, `margin` pixels of play allowed.
+def inside_hull(capture: Capture, points: Array, stage: Stage | None = None) -> Bools:
+    """Which `points (N, 3)` lie in every camera's silhouette, `HULL_MARGIN` pixels of play allowed.
 
     A camera that does not have the point in its picture, or has no silhouette, says nothing.
     """
@@ -205,7 +203,8 @@ def inside_hull(
         pixels, depth = camera.project(points)
         seen = (depth > 0) & camera.inside(pixels)
         x, y = np.rint(pixels[seen]).astype(int).T
-        far = outside[np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)] > margin
+        y, x = np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)
+        far = outside[y, x] > HULL_MARGIN
         keep[np.flatnonzero(seen)[far]] = False
     return keep
 

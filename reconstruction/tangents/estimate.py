@@ -10,8 +10,9 @@ import numpy as np
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.lights import Light
-from reconstruction.images.orientation import LogGaborBank, texture
+from reconstruction.images.orientation import responses, texture
 from reconstruction.masks import MaskedCapture
+from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
@@ -25,28 +26,8 @@ from reconstruction.tangents.line_evidence import (
 from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
 from reconstruction.tangents.tangent_conditioning import condition_lines
 
-
-@dataclass(frozen=True)
-class MeasureOptions:
-    """How tangents are measured.
-
-    The `bank` answers to pictures under `light_groups` groups of neighbouring lights, which show
-    different fibres: 1 is the sum of all OLAT frames, the number of lights is each light alone.
-    `candidates` directions are scored at each point, averaged over `radius` metres. Points closer
-    than `thin` metres are merged first. `tolerance` (metres) is how far behind a camera's own depth
-    a point may lie and still count as seen. The scores of the reflection under single lights count
-    `reflection_weight` times those of the texture.
-    """
-
-    bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)  # noqa: RUF009
-    texture_scale: float = 5.0
-    light_groups: int = 24
-    candidates: int = 500
-    radius: float = 10e-3
-    neighbours: int = 48
-    thin: float = 2e-3
-    reflection_weight: float = 6.0
-    tolerance: float = 4e-3
+CANDIDATES = 500
+"""Directions that are scored at each point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +95,7 @@ def measure_tangents(
             texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
             for g in np.unique(group)
         ]
-        support = line_support(options.bank.responses(np.stack(details)))
+        support = line_support(responses(options.bank, np.stack(details)))
         evidences.append(LineEvidence(camera, support, mask, depths[camera.name]))
     points = thinned(
         points if len(points) else np.concatenate([_lifted(e) for e in evidences]), options.thin
@@ -124,8 +105,8 @@ def measure_tangents(
     stage.figures["lines"] = condition_lines(evidences, points, seen).figures()
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
-    candidates = half_sphere(options.candidates)
-    scores = np.zeros((len(points), options.candidates), np.float32)
+    candidates = half_sphere(CANDIDATES)
+    scores = np.zeros((len(points), CANDIDATES), np.float32)
     for k, evidence in enumerate(evidences):
         scores += line_scores(evidence, points, candidates, seen[:, k])
     average = pool(points, options.radius, options.neighbours)

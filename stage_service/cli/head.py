@@ -61,7 +61,7 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
     turn = None if args.turn_deg is None else float(np.radians(args.turn_deg))
     fit = fit_head(points, normals, shape, part=args.part, turn=turn)
     write_obj(args.out, fit.mesh)
-    rms, used = 1e3 * fit.bent.to_mesh_rms, 1 - float(fit.outliers.mean())
+    rms, used = 1e3 * fit.deformed.to_mesh_rms, 1 - float(fit.outliers.mean())
     lines = [f"{args.out}: {rms:.2f} mm rms from {used:.0%} of {len(points)} points"]
     lines += [f"warning: {w}" for w in fit.warnings]
     output.result(

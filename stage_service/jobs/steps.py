@@ -47,14 +47,15 @@ def compress(context: StepContext) -> Figures:
 def reconstruct(context: StepContext) -> Figures:
     """Strands from the capture: `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`."""
     from reconstruction.model import Model
-    from reconstruction.pipeline import ReconstructOptions
+    from reconstruction.options import parse_options
     from reconstruction.pipeline import reconstruct as run
+    from reconstruction.reconstruct_options import ReconstructOptions
 
     asked = context.options
-    options = _options(
+    options = parse_options(
         ReconstructOptions,
-        "reconstruct",
         {"held_out": asked.held_out_cameras, "seed": asked.seed, **asked.reconstruct},
+        "options.reconstruct",
     )
     capture = Capture(context.capture)
     left = [name for name in capture.olat_lights() if name not in asked.held_out_lights]

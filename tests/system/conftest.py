@@ -150,7 +150,7 @@ class TinyStage:
     def pipeline(**options: Any) -> dict[str, Any]:
         """The whole pipeline at a quality for pictures of 24 pixels."""
         quality = {
-            "reconstruct": {"roots": 2000, "grid": 4e-3, "within": 0.05, "explicit_seconds": 0.1},
+            "reconstruct": {"roots": 2000, "grid": 4e-3, "within": 0.05},
             "fit": {"iterations": 2},
             "assess": {"spp": 4, "relit_size": 48, "relit_spp": 4},
         }

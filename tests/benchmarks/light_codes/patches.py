@@ -35,15 +35,15 @@ from reconstruction.light_codes.measure_segments import build_views
 from reconstruction.masks import MaskedCapture, hair_masks
 from reconstruction.methods import Method
 from reconstruction.model import Model
-from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.pipeline import reconstruct
+from reconstruction.reconstruct_options import ReconstructOptions
 from reconstruction.report.plots import plot_geometry, plot_report
 from reconstruction.report.report import Progress, Report, Series, silent
 from stage_service.cli.support.tables import geometry_table
 
 METHODS: tuple[Method, ...] = ("lmvs", "photometric", "fused")
 CAMERAS, LIGHTS = (12, 6), (18, 9)
-OPTIONS = ReconstructOptions(explicit_seconds=0.0)
-"""Without the parts of a report that cost time and tell nothing here."""
+OPTIONS = ReconstructOptions()
 
 
 def write_hair_masks(capture: Capture, truth_folder: Path) -> None:

@@ -15,12 +15,12 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.images.orientation import LogGaborBank
+from reconstruction.images.orientation import filters, responses
 from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.depth_range import depth_range
-from reconstruction.light_codes.light_code_options import LightCodeOptions
-from reconstruction.light_codes.search import DepthMap, DepthSearch, SearchOptions
+from reconstruction.light_codes.search import LEAST_CONFIDENCE, DepthMap, DepthSearch
 from reconstruction.light_codes.segments import to_segments
+from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank, SearchOptions
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "depth step, mm": {str(1e3 * s): {"step": s} for s in (1e-3, 5e-4, 2.5e-4, 1.25e-4)},
@@ -61,8 +61,7 @@ def study_depths(
         return maps, time.perf_counter() - begin
 
     asked = sum(
-        int((views[k].mask & (views[k].confidence >= options.search.least_confidence)).sum())
-        for k in which
+        int((views[k].mask & (views[k].confidence >= LEAST_CONFIDENCE)).sum()) for k in which
     )
     brute, _ = found(replace(options.search, candidates=0))
     out: dict[str, dict[str, dict[str, float]]] = {}
@@ -98,14 +97,14 @@ def _same(a: DepthMap, b: DepthMap, within: float) -> int:
 
 
 def opencv_loop(bank: LogGaborBank, image: ArrayLike, margin: int) -> Floats:
-    """`bank.responses` of one image `(H, W)` by `cv2.filter2D`: two kernels for every filter.
+    """`responses` of one image `(H, W)` by `cv2.filter2D`: two kernels for every filter.
 
     A kernel is a filter's transform on the padded image, cut to `margin` pixels around its middle.
     """
     pixels = np.asarray(image, np.float32)
     size = 2 * margin + 1
     out = np.empty((bank.count, *pixels.shape), np.float32)
-    for k, transfer in enumerate(bank.filters(*(4 * size,) * 2)):
+    for k, transfer in enumerate(filters(bank, *(4 * size,) * 2)):
         kernel = np.roll(np.fft.ifft2(transfer), (margin, margin), axis=(0, 1))[:size, :size]
         kernel = kernel[::-1, ::-1]  # OpenCV correlates
         parts = [
@@ -132,7 +131,7 @@ def compare_filters(bank: LogGaborBank, image: ArrayLike, margin: int = 48) -> d
     answers: dict[str, Floats] = {}
 
     def ours() -> Floats:
-        return bank.responses(pixels)
+        return responses(bank, pixels)
 
     def opencv() -> Floats:
         return opencv_loop(bank, pixels, margin)

@@ -12,7 +12,7 @@ import numpy as np
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.field import FieldOptions, OrientationField, solve_field
+from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.light_planes import TriangulateOptions, sweep_peaks, triangulate
@@ -100,7 +100,6 @@ def of_field(
             measured.points,
             measured.directions,
             measured.confidence,
-            options=FieldOptions(),
         )
 
     return measure_growth("field", "voxels", sorted(grids), solve)

@@ -21,14 +21,14 @@ from reconstruction.growth.laplace import compare_solvers
 from reconstruction.head.scalp import find_scalp, sample_roots
 from reconstruction.light_planes import (
     Motion,
-    MotionOptions,
     solve_motion,
     sweep_peaks,
     triangulate,
 )
 from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.model import Model
-from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.pipeline import reconstruct
+from reconstruction.reconstruct_options import MotionOptions, ReconstructOptions
 from reconstruction.report.plots import plot_report
 from reconstruction.report.report import Progress, Report, Stage, silent
 from reconstruction.tangents.estimate import measure_tangents

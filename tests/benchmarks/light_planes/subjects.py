@@ -24,10 +24,8 @@ from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import write_obj
 from reconstruction.geometry.strands import Strands
 from reconstruction.head.fit import fit_head
-from reconstruction.images.orientation import LogGaborBank
-from reconstruction.pipeline import ReconstructOptions
+from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions, ReconstructOptions
 from reconstruction.report.report import Progress
-from reconstruction.tangents.estimate import MeasureOptions
 
 CAMERAS, PROJECTORS = 8, 3
 WIDTH, HEIGHT, ROWS, LIGHTS = 320, 400, 256, 120

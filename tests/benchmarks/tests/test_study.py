@@ -8,8 +8,7 @@ import numpy as np
 from benchmarks.light_codes import study
 
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.images.orientation import LogGaborBank
-from reconstruction.light_codes.light_code_options import LightCodeOptions
+from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank
 
 
 def test_opencvs_loop_gives_what_our_bank_gives() -> None:

@@ -12,7 +12,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import depth_map, inside_mesh, mesh_depth, surface_samples
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.field import FieldOptions, gather, principal, solve_field, to_tensors
+from reconstruction.growth.field import gather, principal, solve_field, to_tensors
 from reconstruction.growth.laplace import (
     Multigrid,
     compare_solvers,
@@ -144,13 +144,14 @@ def test_field_is_linear_between_two_plates_and_keeps_its_data() -> None:
     grid = box(3, 3, 11)
     ends = np.array([[i, j, k] for i in range(3) for j in range(3) for k in (0, 10)]) * 1e-3
     lines = np.where(ends[:, 2:] == 0, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    field, series = solve_field(grid, ends, lines, options=FieldOptions(tolerance=1e-10))
+    field, series = solve_field(grid, ends, lines, tolerance=1e-10)
     xx = field.tensors.reshape(3, 3, 11, 6)[1, 1, :, 0]
     np.testing.assert_allclose(xx, np.linspace(1, 0, 11), atol=1e-8)
     assert field.measured.sum() == 18
     assert field.degenerate.reshape(3, 3, 11)[1, 1, 5]  # x and y equally likely: no direction
     assert not field.directions[field.degenerate].any()
-    assert series[0].name.startswith("multigrid")
+    assert series is not None
+    assert series.name.startswith("multigrid")
 
 
 def test_trace_and_eigenvalues_stay_in_range() -> None:
@@ -160,7 +161,7 @@ def test_trace_and_eigenvalues_stay_in_range() -> None:
         grid,
         rng.random((60, 3)) * 13e-3,
         rng.normal(size=(60, 3)),
-        options=FieldOptions(tolerance=1e-8),
+        tolerance=1e-8,
     )
     np.testing.assert_allclose(field.tensors[:, :3].sum(axis=1), 1, atol=1e-6)
     values = principal(field.tensors)[1]
@@ -177,13 +178,6 @@ def test_a_piece_without_data_is_empty_not_invented() -> None:
     assert field.empty[far].all()
     assert not field.empty[field.voxel(np.zeros((1, 3)))].any()
     assert field.empty.sum() == 64
-
-
-def test_measurement_wins_over_boundary() -> None:
-    grid = box(3, 3, 3)
-    at = np.zeros((1, 3))
-    field, _ = solve_field(grid, at, np.array([[1.0, 0, 0]]), None, (at, np.array([[0, 0, 1.0]])))
-    assert abs(field.directions[0, 0]) > 0.999
 
 
 def test_points_just_outside_go_to_the_nearest_voxel() -> None:

@@ -229,18 +229,3 @@ def test_a_neighbour_across_the_way_is_no_way_to_the_root() -> None:
     rooted = [line((-0.02, 0, 0.05), (0.02, 0, 0.05))]
     loose = [line((0, 0, 0.052), (0, 0, 0.10))]
     assert root_all(rooted, loose, flat_scalp()).dropped == 1
-
-
-def test_a_strand_can_end_at_the_last_measured_point() -> None:
-    """Measured between 5 and 10 mm above the root, in half of the columns."""
-    field = analytic(up, (9, 5, 41))
-    centers = field.grid.centers()
-    height = centers[:, 2] - centers[:, 2].min()
-    measured = (centers[:, 0] > 0) & (height > 4.5e-3) & (height < 10.5e-3)
-    field = dataclasses.replace(field, measured=measured)
-    roots = np.array([[3e-3, 0, -20e-3], [-3e-3, 0, -20e-3]])
-    normals = np.tile([0, 0, 1.0], (2, 1))
-    paths = grow_from_roots(field, roots, normals, to_measured=True)
-    assert len(paths) == 1, "the strand that meets no measurement is not kept"
-    assert paths[0][-1, 2] == pytest.approx(-10e-3, abs=5.1e-4)
-    assert len(grow_from_roots(field, roots, normals)) == 2

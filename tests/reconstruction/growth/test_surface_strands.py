@@ -93,10 +93,3 @@ def test_lines_in_one_place_and_lines_without_confidence() -> None:
         assert np.isfinite(path).all()
         assert np.ptp(path[:, 2]) < 6e-3  # nothing to follow beyond two bandwidths
     assert surface_strands(replace(same, confidence=np.zeros(30))) == []
-
-
-@pytest.mark.parametrize("name", ["apart", "bandwidth", "step", "longest", "spacing", "neighbours"])
-@pytest.mark.parametrize("value", [0, -1, float("nan")])
-def test_lengths_that_are_none_are_said(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{name}.* must be positive"):
-        replace(SurfaceOptions(), **{name: value})

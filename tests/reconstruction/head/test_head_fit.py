@@ -21,12 +21,9 @@ from reconstruction.head.fit import HeadFit, HeadFitError, fit_head, mark_scalp
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import similarity
 from reconstruction.head.scalp_map import ScalpMap
-from reconstruction.head.shape import ShapeOptions
 
 TURN = Rotation.from_rotvec([0.1, -0.1, -1.9]).as_matrix()
 SHIFT = np.array([0.02, 0.01, 0.1])
-STIFF = ShapeOptions(stiffness=(1.0,), rounds=2)
-"""For tests that are about the pose."""
 
 
 def another_head() -> Mesh:
@@ -75,7 +72,7 @@ def off_the_true_scalp(mesh: Mesh) -> np.ndarray:
     return 1e3 * ClosestPoint(mesh, 8e-3)(vertices)[2]
 
 
-def unbent(fit: HeadFit) -> Mesh:
+def posed(fit: HeadFit) -> Mesh:
     return Mesh(fit.pose(generic_head().vertices), generic_head().faces)
 
 
@@ -96,9 +93,9 @@ def test_the_scalp_is_found_from(where, part, outliers, normals, median) -> None
     assert fit.pose.scale == pytest.approx(1.06, abs=0.05)
     off = off_the_true_scalp(fit.mesh)
     assert np.median(off) < median
-    assert np.median(off) < 0.6 * np.median(off_the_true_scalp(unbent(fit)))
-    assert fit.bent.to_mesh_median < fit.posed.to_mesh_median
-    assert fit.bent.to_points_median < 0.01
+    assert np.median(off) < 0.6 * np.median(off_the_true_scalp(posed(fit)))
+    assert fit.deformed.to_mesh_median < fit.posed.to_mesh_median
+    assert fit.deformed.to_points_median < 0.01
     assert fit.outliers.mean() == pytest.approx(outliers, abs=0.06)
     assert fit.warnings == ()
     json.dumps(fit.figures(), allow_nan=False)
@@ -108,17 +105,17 @@ def test_few_points_give_a_pose() -> None:
     points, normals = seen(everywhere, 30)
     fit = fit_head(points, normals)
     assert np.percentile(off_the_true_scalp(fit.mesh), 95) < 12
-    assert fit.bent.to_points_median > 0.02  # and it shows that most of the head was not seen
+    assert fit.deformed.to_points_median > 0.02  # and it shows that most of the head was not seen
 
 
 def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> None:
     points, normals = seen(crown, 500)
-    fit = fit_head(points, normals, part="scalp", shape=STIFF)
+    fit = fit_head(points, normals, part="scalp")
     assert any("hardly determine" in w for w in fit.warnings)
     assert any("give landmarks" in w for w in fit.warnings)
     vertices = generic_head().vertices[::1500]
     known = another_head().vertices[::1500]
-    fit = fit_head(points, normals, part="scalp", shape=STIFF, landmarks=(vertices, known))
+    fit = fit_head(points, normals, part="scalp", landmarks=(vertices, known))
     assert not any("give landmarks" in w for w in fit.warnings)
     assert np.degrees(Rotation.from_matrix(fit.pose.rotation @ TURN.T).magnitude()) < 15
 
@@ -136,7 +133,7 @@ def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> N
 def test_another_unit_is_an_error_that_says_so(factor: float, words: str) -> None:
     points, normals = seen(everywhere, 300)
     with pytest.raises(HeadFitError, match=words):
-        fit_head(factor * points, normals, shape=STIFF)
+        fit_head(factor * points, normals)
 
 
 @pytest.mark.parametrize(
@@ -227,14 +224,12 @@ def test_the_scalp_is_marked_on_other_heads_of_any_unit(
     head = the_head_in(shared_data("heads") / file, above)
     marked, fit = mark_scalp(head)
     assert fit.pose.scale == pytest.approx(scale, rel=0.02)
-    assert fit.bent.to_mesh_median < 1e-3 * scale < fit.posed.to_mesh_median
+    assert fit.deformed.to_mesh_median < 1e-3 * scale < fit.posed.to_mesh_median
     assert marked.scalp is not None
     own, generic = marked.face_areas()[marked.scalp].sum(), generic_head()
     assert own / scale**2 == pytest.approx(generic.face_areas()[generic.scalp].sum(), rel=0.15)
     assert ScalpMap.of(marked).stretch().min() > 0.3
     points, normals, _ = surface_samples(marked, 0.02 * scale)
     here = marked.vertices[::500]  # and then it is a template like any other
-    again = fit_head(
-        1.02 * points, normals, marked, landmarks=(here, here), any_unit=True, shape=STIFF
-    )
+    again = fit_head(1.02 * points, normals, marked, landmarks=(here, here), any_unit=True)
     assert again.pose.scale == pytest.approx(1.02, rel=1e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,11 @@ from reconstruction.capture.folder import Capture
 from reconstruction.images.segmentation import Network, NetworkError
 from reconstruction.images.silhouettes import silhouette
 from reconstruction.masks import hair_masks
+from reconstruction.reconstruct_options import NetworkOptions
+
+
+def network_of(file: str, **options: Any) -> Network:
+    return Network(NetworkOptions(file, **options))
 
 
 def varint(number: int) -> bytes:
@@ -59,15 +65,15 @@ def left_half_bright() -> NDArray[np.float64]:
 
 def test_the_class_of_hair_wins_pixel_by_pixel(tmp_path: Path) -> None:
     bright = one_layer(tmp_path / "two.onnx", [[-1, -1, -1], [1, 1, 1]], [1.5, -1.5])
-    hair = Network(bright).hair_pixels(left_half_bright())
+    hair = network_of(bright).hair_pixels(left_half_bright())
     assert hair[:, :32].all()
     assert not hair[:, 32:].any()
-    assert np.array_equal(Network(bright, hair=0).hair_pixels(left_half_bright()), ~hair)
+    assert np.array_equal(network_of(bright, hair=0).hair_pixels(left_half_bright()), ~hair)
 
 
 def test_one_score_is_a_logit_or_a_probability(tmp_path: Path) -> None:
-    logit = Network(one_layer(tmp_path / "logit.onnx", [[1, 1, 1]], [-1.5]))
-    share = Network(one_layer(tmp_path / "share.onnx", [[1 / 3, 1 / 3, 1 / 3]], [0.0]))
+    logit = network_of(one_layer(tmp_path / "logit.onnx", [[1, 1, 1]], [-1.5]))
+    share = network_of(one_layer(tmp_path / "share.onnx", [[1 / 3, 1 / 3, 1 / 3]], [0.0]))
     for network in (logit, share):
         assert network.hair_pixels(left_half_bright())[:, :32].all()
         assert not network.hair_pixels(left_half_bright())[:, 32:].any()
@@ -75,7 +81,7 @@ def test_one_score_is_a_logit_or_a_probability(tmp_path: Path) -> None:
 
 def test_pictures_are_scaled_to_the_networks_size_and_masks_back(tmp_path: Path) -> None:
     bright = one_layer(tmp_path / "two.onnx", [[-1, -1, -1], [1, 1, 1]], [1.5, -1.5])
-    hair = Network(bright, size=(32, 16)).hair_pixels(left_half_bright())
+    hair = network_of(bright, size=(32, 16)).hair_pixels(left_half_bright())
     assert hair.shape == (64, 64)
     assert hair[:, :30].all()
     assert not hair[:, 34:].any()
@@ -83,31 +89,31 @@ def test_pictures_are_scaled_to_the_networks_size_and_masks_back(tmp_path: Path)
 
 def test_mean_and_deviation_shift_what_the_network_sees(tmp_path: Path) -> None:
     file = one_layer(tmp_path / "plain.onnx", [[1, 1, 1]], [0.0])
-    shifted = Network(file, mean=(0.5, 0.5, 0.5), std=(0.2, 0.2, 0.2))
+    shifted = network_of(file, mean=(0.5, 0.5, 0.5), std=(0.2, 0.2, 0.2))
     assert shifted.hair_pixels(left_half_bright())[:, :32].all()
     assert not shifted.hair_pixels(left_half_bright())[:, 32:].any()
 
 
 def test_a_dark_picture_is_no_number_out_of_range(tmp_path: Path) -> None:
-    network = Network(one_layer(tmp_path / "logit.onnx", [[1, 1, 1]], [-1.5]))
+    network = network_of(one_layer(tmp_path / "logit.onnx", [[1, 1, 1]], [-1.5]))
     assert not network.hair_pixels(np.zeros((64, 64, 3))).any()
 
 
 def test_files_that_are_no_networks_are_named(tmp_path: Path) -> None:
     with pytest.raises(NetworkError, match=r"absent\.onnx: no such file"):
-        Network(str(tmp_path / "absent.onnx")).hair_pixels(left_half_bright())
+        network_of(str(tmp_path / "absent.onnx")).hair_pixels(left_half_bright())
     (tmp_path / "broken.onnx").write_bytes(b"xx")
     with pytest.raises(NetworkError, match=r"broken\.onnx: not an ONNX network"):
-        Network(str(tmp_path / "broken.onnx")).hair_pixels(left_half_bright())
+        network_of(str(tmp_path / "broken.onnx")).hair_pixels(left_half_bright())
     two = one_layer(tmp_path / "two.onnx", [[0, 0, 0], [0, 0, 0]], [0, 1])
     with pytest.raises(NetworkError, match="hair is class 7, but it tells 2 classes"):
-        Network(two, hair=7).hair_pixels(left_half_bright())
+        network_of(two, hair=7).hair_pixels(left_half_bright())
 
 
 def test_masks_ask_the_network_of_what_is_lit_and_say_so(
     tmp_path: Path, sphere_capture: Capture, shoot: Callable[..., Capture]
 ) -> None:
-    network = Network(one_layer(tmp_path / "all.onnx", [[0, 0, 0]], [1.0]))
+    network = network_of(one_layer(tmp_path / "all.onnx", [[0, 0, 0]], [1.0]))
     masks = hair_masks(sphere_capture, network=network)
     for name, mask in masks.items():
         assert mask.source == "network"

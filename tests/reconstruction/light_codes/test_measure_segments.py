@@ -17,16 +17,19 @@ from reconstruction.evaluation.matching import compare_strands
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.images.orientation import LogGaborBank
-from reconstruction.light_codes.light_code_options import LightCodeOptions
-from reconstruction.light_codes.search import SearchOptions
 from reconstruction.model import Model
-from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.pipeline import reconstruct
+from reconstruction.reconstruct_options import (
+    LightCodeOptions,
+    LogGaborBank,
+    ReconstructOptions,
+    SearchOptions,
+)
 
 QUICK = ReconstructOptions(
     light_codes=LightCodeOptions(
         bank=LogGaborBank(count=16, spread=1.0, wavelength=5.0),
-        search=SearchOptions(candidates=8, samples=9, step=5e-4),
+        search=SearchOptions(candidates=8, step=5e-4),
         deepest=0.03,
     )
 )

@@ -20,7 +20,8 @@ from reconstruction.light_codes.objective import (
     line_through,
     smallest_axis,
 )
-from reconstruction.light_codes.search import DepthSearch, SearchOptions
+from reconstruction.light_codes.search import DepthSearch
+from reconstruction.reconstruct_options import SearchOptions
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from reconstruction.light_codes.lmvs import LmvsSearch
-from reconstruction.light_codes.search import DepthMap, DepthSearch, SearchOptions
+from reconstruction.light_codes.search import DepthMap, DepthSearch
+from reconstruction.reconstruct_options import SearchOptions
 
 
 def error(stage: Any, view: int, found: DepthMap) -> Any:
@@ -106,10 +107,3 @@ def test_a_single_light_leaves_the_lines(make_fibres: Any, fibre_lamps: Any) -> 
     stage = make_fibres(lights=fibre_lamps(1))
     found = DepthSearch(stage.views, (0, 0, 0)).run(0, *stage.range(0))
     assert np.median(error(stage, 0, found)) < 1.0
-
-
-def test_nonsense_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="step and length"):
-        SearchOptions(step=0)
-    with pytest.raises(ValueError, match="neighbours <= 31"):
-        SearchOptions(neighbours=32)

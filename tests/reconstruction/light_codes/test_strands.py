@@ -9,7 +9,7 @@ import pytest
 
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.strands import Strands, smoothed
-from reconstruction.light_codes.extension import ExtensionOptions, extend, fewest_views
+from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.measure_segments import connect_segments
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import count_supports, thinned_lines, to_segments
@@ -51,7 +51,7 @@ def test_tips_grow_along_the_fibre_while_views_agree(make_fibres: Any, fibre_cam
     s = np.linspace(-0.7, 0.7, 200)
     fibre = 0.03 * np.stack([np.sin(s), 0.3 * np.sin(s), np.cos(s)], axis=1)
     stage = make_fibres(strands=Strands.from_list([fibre], 3e-4), cameras=fibre_cameras(12))
-    (grown,) = extend(stage.views, [fibre[70:130]], ExtensionOptions(angle_deg=10.0))
+    (grown,) = extend(stage.views, [fibre[70:130]], angle_deg=10.0)
     whole = np.linalg.norm(np.diff(fibre, axis=0), axis=1).sum()
     length = np.linalg.norm(np.diff(grown, axis=0), axis=1).sum()
     assert 0.8 * whole < length < 1.15 * whole

@@ -27,19 +27,17 @@ from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import NoScalp
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, triangulate
 from reconstruction.model import Model
-from reconstruction.pipeline import ReconstructOptions, reconstruct
+from reconstruction.pipeline import reconstruct
+from reconstruction.reconstruct_options import MeasureOptions, ReconstructOptions
 from reconstruction.report.report import Report, Stage
-from reconstruction.tangents.estimate import MeasureOptions
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(6, 1.2, 0.0))]
 QUICK = ReconstructOptions(
     grid=5e-3,
-    step=1e-3,
     roots=60,
     max_length=0.1,
-    explicit_seconds=0.0,
-    measure=MeasureOptions(light_groups=2, candidates=150),
+    measure=MeasureOptions(light_groups=2),
 )
 Shoot = Callable[..., Capture]
 MakeCamera = Callable[..., Camera]

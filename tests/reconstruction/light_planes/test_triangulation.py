@@ -176,9 +176,9 @@ def test_flattening_moves_noise_onto_the_plane_and_never_widens(sphere_capture: 
 
 
 def test_points_of_one_pixel_that_agree_become_one(sphere_capture: Capture) -> None:
-    cloud = triangulate(
-        sphere_capture, options=TriangulateOptions(flatten=False, neighbours=0)
-    ).subset(np.arange(50))
+    cloud = triangulate(sphere_capture, options=TriangulateOptions(flatten=False)).subset(
+        np.arange(50)
+    )
     shifted = replace(cloud, points=cloud.points - 2e-4 * cloud.view)
     both = fuse(PointCloud.merged([cloud, shifted]))
     assert len(both) == len(fuse(cloud))

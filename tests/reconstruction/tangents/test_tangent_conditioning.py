@@ -12,7 +12,8 @@ from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.masks import HairMask, MaskedCapture
-from reconstruction.tangents.estimate import MeasureOptions, measure_tangents
+from reconstruction.reconstruct_options import MeasureOptions
+from reconstruction.tangents.estimate import measure_tangents
 from reconstruction.tangents.line_evidence import LineEvidence
 from reconstruction.tangents.tangent_conditioning import condition_lines
 

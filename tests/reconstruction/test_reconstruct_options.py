@@ -1,0 +1,56 @@
+"""Options of a reconstruction are checked where they arrive, at any depth."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import pytest
+
+from reconstruction.options import BadOptions, parse_options
+from reconstruction.reconstruct_options import ReconstructOptions
+
+
+def test_nested_json_fills_in_the_defaults() -> None:
+    made = parse_options(
+        ReconstructOptions,
+        {"held_out": ["c1"], "measure": {"bank": {"wavelength": 4}}, "network": {"file": "a.onnx"}},
+    )
+    assert made.held_out == ("c1",)
+    assert made.measure.bank.wavelength == 4.0
+    assert made.measure.thin == ReconstructOptions().measure.thin
+    assert made.network is not None
+    assert made.network.size is None
+
+
+@pytest.mark.parametrize(
+    ("values", "place"),
+    [
+        ({"grid": 0}, "grid"),
+        ({"grid": math.nan}, "grid"),
+        ({"max_length": -0.1}, "max_length"),
+        ({"roots": 2.5}, "roots"),
+        ({"gird": 1e-3}, "gird"),
+        ({"seed": -1}, "seed"),
+        ({"network": {}}, "network.file"),
+        ({"network": {"file": "a.onnx", "std": [1, 1, 0]}}, "network.std.2"),
+        ({"measure": {"thin": 0}}, "measure.thin"),
+        ({"measure": {"bank": {"wavelength": 1}}}, "measure.bank.wavelength"),
+        ({"light_codes": {"search": {"neighbours": 32}}}, "light_codes.search.neighbours"),
+        ({"light_codes": {"search": {"steps": 1}}}, "light_codes.search.steps"),
+        ({"motion": {"between": "jump"}}, "motion.between"),
+    ],
+)
+def test_a_bad_field_is_named_with_its_place(values: dict[str, object], place: str) -> None:
+    with pytest.raises(BadOptions, match=rf"^options\.reconstruct\.{place}: \S"):
+        parse_options(ReconstructOptions, values, "options.reconstruct")
+
+
+def test_options_are_checked_without_what_methods_need() -> None:
+    code = (
+        "import sys, reconstruction.reconstruct_options;"
+        "sys.exit(' '.join({'numpy', 'scipy', 'cv2', 'drjit'} & set(sys.modules)) or 0)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
