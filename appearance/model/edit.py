@@ -1,4 +1,4 @@
-"""Edits of fitted maps: colour by wisp, and roughness by `dataclasses.replace`."""
+"""Edits of a fitted model: colour, all over or by wisp, roughness, length, other strands."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from appearance.bsdf.maps import HairMaps
-from reconstruction.arrays import Array
+from appearance.model.fitted_model import FittedModel
+from reconstruction.arrays import Array, Ints
+from reconstruction.geometry.strands import Strands
 
 
 def wisp_of(strands: ArrayLike, root_uv: Array, cells: tuple[int, int], soft: float = 0.0) -> Array:
@@ -19,8 +22,7 @@ def wisp_of(strands: ArrayLike, root_uv: Array, cells: tuple[int, int], soft: fl
     many cells.
     """
     w, h = cells
-    column, row = (np.minimum((root_uv * cells).astype(int), np.array(cells) - 1)).T
-    cell = column * h + row
+    cell = _cell_of(root_uv, cells)
     chosen = np.asarray(strands, np.int64)
     count = np.bincount(cell, minlength=w * h)
     inside = np.bincount(cell[chosen], minlength=w * h)
@@ -58,3 +60,73 @@ def recoloured(
     root = np.sqrt(fine.sigma_a)
     mixed = (root + share * (np.sqrt(wanted) - root)) ** 2
     return replace(fine, sigma_a=np.where(share > 0, mixed, fine.sigma_a))
+
+
+def roughened(maps: HairMaps, factor: float) -> HairMaps:
+    """`maps` with the longitudinal roughness times `factor`; `ValueError` out of (0.001, 1]."""
+    return replace(maps, beta_m=factor * maps.beta_m)
+
+
+def cut(fitted: FittedModel, length: float) -> FittedModel:
+    """The model with no strand longer than `length` metres; colours stay where they are on them."""
+    if not length > 0:
+        raise ValueError(f"strands can be cut to a length above 0 m, got {length}")
+    strands = fitted.strands
+    share = np.minimum(1.0, length / np.maximum(strands.lengths(), 1e-12))
+    maps, (w, h) = fitted.maps, fitted.maps.shape[1:]
+    if len(maps.sigma_a) > 1:
+        cell = _cell_of(fitted.root_uv, (w, h))
+        count, total = (np.bincount(cell, x, w * h) for x in (None, share))
+        kept = np.divide(total, count, out=np.ones(w * h), where=count > 0).reshape(w, h)
+        maps = replace(
+            maps,
+            sigma_a=_root_part(maps.sigma_a, kept),
+            rotation=_root_part(maps.rotation, kept),
+        )
+    return replace(fitted, strands=_cut(strands, length), maps=maps)
+
+
+def restyled(fitted: FittedModel, strands: Strands) -> FittedModel:
+    """The model with other strands: each takes the place on the scalp of the nearest fitted root.
+
+    Raises `ValueError` where either has no strands.
+    """
+    if not len(strands) or not len(fitted.strands):
+        raise ValueError("restyling needs strands, in the model and in the file")
+    _, nearest = cKDTree(fitted.strands.roots).query(strands.roots)
+    return replace(fitted, strands=strands, placed=fitted.root_uv[nearest])
+
+
+def _cell_of(root_uv: Array, cells: tuple[int, int]) -> Ints:
+    """The cell `(S,)` of each root, v running fastest."""
+    column, row = np.minimum((root_uv * cells).astype(int), np.array(cells) - 1).T
+    return np.asarray(column * cells[1] + row)
+
+
+def _cut(strands: Strands, length: float) -> Strands:
+    """Strands that end after `length` metres, the last point interpolated."""
+    points, first = strands.points.astype(float), strands.offsets[:-1]
+    step = np.zeros(len(points))
+    starts = strands.segment_starts
+    step[starts + 1] = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
+    total = np.cumsum(step)
+    arc = total - total[first][strands.strand_of_point]
+    keep = arc - step < length
+    keep[first] = True
+    beyond = np.flatnonzero(keep & (arc > length))
+    share = ((length - arc[beyond - 1]) / step[beyond])[:, None]
+    points[beyond] = points[beyond - 1] * (1 - share) + points[beyond] * share
+    counts = np.bincount(strands.strand_of_point[keep], minlength=len(strands))
+    radius = strands.radius[keep] if isinstance(strands.radius, np.ndarray) else strands.radius
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    return Strands(points[keep].astype(np.float32), offsets, radius)
+
+
+def _root_part(table: Array, kept: Array) -> Array:
+    """The layers of `table (n_c, w, h, k)` over the share `kept (w, h)` of the strands' lengths."""
+    layers, columns, rows, _ = table.shape
+    at = np.arange(layers)[:, None, None] * kept
+    low = np.minimum(at.astype(int), layers - 2)
+    u, v = np.ogrid[:columns, :rows]
+    share = (at - low)[..., None]
+    return np.asarray(table[low, u, v] * (1 - share) + table[low + 1, u, v] * share)

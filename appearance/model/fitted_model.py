@@ -14,6 +14,7 @@ from appearance.inverse_rendering.found_lights import lights_as_found
 from appearance.render.mixed import Environment, render_mixed
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
+from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
 from reconstruction.arrays import Array, Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
@@ -59,6 +60,20 @@ class FittedModel:
         if capture is not None:
             rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
         return cls(strands, model.head(capture), appearance, maps, placed, rig)
+
+    def save(self, model: Model) -> None:
+        """Write a model that `load` reads back; the fit's report and pictures are not copied."""
+        appearance, hair = self.appearance, self.maps.mean()
+        if self.maps.uniform and hair != appearance.hair:
+            red, green, blue = colour_of_absorption(hair.sigma_a, hair.beta_n)
+            v = float(variance_of_roughness(hair.beta_m))
+            appearance = replace(appearance, hair=hair, colour=(red, green, blue), v=v)
+        model.create().write_strands(self.strands)
+        if self.head is not None:
+            model.write_head(self.head)
+        appearance.save(model)
+        if self.placed is not None or not self.maps.uniform:
+            self.maps.save(model, self.root_uv)
 
     @cached_property
     def root_uv(self) -> Array:

@@ -1,5 +1,5 @@
-"""The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`
-and `reconstruct`, `fit`, `render` in `models.py`. They import what they need when they run."""
+"""The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`.
+They import what they need when they run."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from stage_service.cli import (
     calibrate,
     capture,
     demo,
+    edit,
     evaluate,
+    export,
+    fit,
     head,
     jobs,
     lease,
-    models,
+    reconstruct,
+    render,
     rig,
     serve,
     simulate,
@@ -27,7 +31,7 @@ from stage_service.cli.support import EXIT_CODES, run_command
 
 COMMANDS = (
     *(demo, serve, worker, simulate, capture, lease, jobs),
-    *(verify, models, evaluate, bench, rig, calibrate, head),
+    *(verify, reconstruct, fit, render, edit, export, evaluate, bench, rig, calibrate, head),
 )
 
 

@@ -92,6 +92,18 @@ def _sentence(help: str) -> str:
     return help[0].upper() + help[1:] + "."
 
 
+def add_held_out(parser: argparse.ArgumentParser) -> None:
+    """Add `--hold-out-camera` and `--hold-out-light`."""
+    for kind in ("camera", "light"):
+        parser.add_argument(
+            f"--hold-out-{kind}",
+            action="append",
+            default=[],
+            metavar=kind.upper(),
+            help=f"a {kind} to leave out, to judge the result on (repeat for more)",
+        )
+
+
 def rig_path(text: str) -> Path:
     """The path of a rig file, or of one that comes with hairstage where its name is given."""
     own = Path(__file__).parents[2] / "rigs" / f"{text}.toml"

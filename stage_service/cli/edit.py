@@ -1,0 +1,150 @@
+"""`hairstage edit`: a fitted model in other colours, rougher, shorter, or with other strands."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stage_service.cli.support import BadInput, Commands, Output, add_command
+
+if TYPE_CHECKING:
+    from appearance.bsdf.maps import HairMaps
+    from appearance.model.fitted_model import FittedModel
+    from reconstruction.arrays import Array
+
+WISP_CELLS = 32
+"""Cells of a brush across the scalp's map, where the model's own maps have fewer."""
+DYED_LAYERS = 8
+"""Layers along strands where only a part of their length is dyed."""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    edit = add_command(
+        commands,
+        "edit",
+        run,
+        "a fitted model in other colours, rougher, shorter, or with other strands",
+        "Write the edited MODEL as a new model folder, which render and export take. Several edits "
+        "are made in this order: strands, cut, colour, roughness.",
+    )
+    edit.add_argument("model", type=Path, help="fitted model folder")
+    edit.add_argument("--out", type=Path, required=True, help="the new model folder")
+    edit.add_argument("--capture", type=Path, help="the capture that gives the head")
+    edit.add_argument("--strands", type=Path, help="a strand file to wear the model's appearance")
+    edit.add_argument(
+        "--cut", type=float, metavar="METRES", help="cut strands that are longer to this length"
+    )
+    colour = edit.add_mutually_exclusive_group()
+    colour.add_argument(
+        "--recolour",
+        type=_numbers(3),
+        metavar="R,G,B",
+        help="the colour that dense hair shows, linear RGB above 0 and at most 1",
+    )
+    colour.add_argument(
+        "--pigment",
+        type=_numbers(2),
+        metavar="EU,PHEO",
+        help="concentrations of eumelanin (black-brown) and pheomelanin (red), 0 or more: about "
+        "1.3,0.2 is brown",
+    )
+    edit.add_argument(
+        "--wisp",
+        type=_numbers(3),
+        metavar="U,V,RADIUS",
+        help="colour only strands rooted within RADIUS of (U, V) on the scalp's map (0 to 1)",
+    )
+    edit.add_argument(
+        "--along",
+        type=_numbers(2),
+        default=(0.0, 1.0),
+        metavar="FROM,TO",
+        help="colour only this part of the strands, 0 the root and 1 the tip",
+    )
+    edit.add_argument("--roughen", type=float, metavar="FACTOR", help="times the roughness beta_m")
+
+
+def run(args: argparse.Namespace, output: Output) -> int:
+    """Edit a model."""
+    from appearance.model.edit import cut, restyled, roughened
+    from appearance.model.fitted_model import FittedModel
+    from reconstruction.capture.folder import Capture
+    from reconstruction.files.strands import read_strands
+    from reconstruction.model import Model
+
+    names = ("strands", "cut", "recolour", "pigment", "roughen")
+    edits = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+    if not edits:
+        raise BadInput(f"say what to edit: one of {', '.join('--' + n for n in names)}")
+    if (args.wisp or args.along != (0.0, 1.0)) and not {"recolour", "pigment"} & set(edits):
+        raise BadInput("--wisp and --along say where to colour: give --recolour or --pigment too")
+    if args.out.exists() and any(args.out.iterdir()):
+        raise BadInput(f"--out {args.out} is not empty: choose a new folder")
+    source = Model(args.model)
+    fitted = FittedModel.load(source, Capture(args.capture) if args.capture else None)
+    if args.strands is not None:
+        fitted = restyled(fitted, read_strands(args.strands))
+    if args.cut is not None:
+        fitted = cut(fitted, args.cut)
+    if args.recolour or args.pigment:
+        fitted = fitted.with_maps(_coloured(fitted, args))
+    if args.roughen is not None:
+        fitted = fitted.with_maps(roughened(fitted.maps, args.roughen))
+    model = Model(args.out)
+    fitted.save(model)
+    if source.has("lights.json"):
+        model.write_json("lights.json", source.json("lights.json"))
+    data: dict[str, Any] = {"model": str(model), "strands": len(fitted.strands)}
+    data["edits"] = {k: str(v) if isinstance(v, Path) else v for k, v in edits.items()}
+    output.result(data, f"{model}: {', '.join(edits)}; see it with 'hairstage render {model}'")
+    return 0
+
+
+def _coloured(fitted: FittedModel, args: argparse.Namespace) -> HairMaps:
+    import numpy as np
+
+    from appearance.model.edit import recoloured, wisp_of
+
+    maps, brush = fitted.maps, np.ones((1, 1))
+    if args.wisp is not None:
+        u, v, radius = args.wisp
+        uv = fitted.root_uv
+        inside = np.flatnonzero(np.hypot(uv[:, 0] - u, uv[:, 1] - v) <= radius)
+        if not len(inside):
+            raise BadInput(f"--wisp: no strand is rooted within {radius} of ({u}, {v})")
+        columns, rows = (max(n, WISP_CELLS) for n in maps.shape[1:])
+        brush = wisp_of(inside, uv, (columns, rows))
+    if args.along != (0.0, 1.0):
+        maps = maps.resized((max(len(maps.sigma_a), DYED_LAYERS), *maps.shape[1:]))
+    return recoloured(maps, brush, _absorption(args, maps.beta_n), along=args.along)
+
+
+def _absorption(args: argparse.Namespace, beta_n: float) -> Array:
+    import numpy as np
+
+    from appearance.bsdf.absorption import of_melanin
+    from appearance.sun_fit.longitudinal import absorption_of_colour
+
+    if args.pigment is not None:
+        if min(args.pigment) < 0:
+            raise BadInput(f"--pigment: concentrations must be 0 or more, got {args.pigment}")
+        return np.array(of_melanin(*args.pigment))
+    if not all(0 < c <= 1 for c in args.recolour):
+        raise BadInput(f"--recolour: three numbers above 0 and at most 1, got {args.recolour}")
+    return absorption_of_colour(args.recolour, beta_n)
+
+
+def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(x) for x in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise argparse.ArgumentTypeError(f"expected {count} numbers with commas, got {text!r}")
+        return values
+
+    return parse

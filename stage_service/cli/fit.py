@@ -1,0 +1,71 @@
+"""`hairstage fit`: the appearance of a capture and its strands, without a service."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from stage_service.cli.support import (
+    Commands,
+    Output,
+    add_command,
+    add_held_out,
+    progress_bar,
+    read_json,
+)
+
+METHODS = ("sun", "inverse_rendering")
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    fit = add_command(
+        commands,
+        "fit",
+        run,
+        "the hair's appearance from a capture and its strands",
+        "Write MODEL/appearance.json: roughness and colour of hair and skin (method sun). "
+        "inverse_rendering goes on from there, with a sun fit first where there is none: hair that "
+        "varies over the scalp and along strands, and the lights as they are found, in "
+        "MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With held-out "
+        "cameras or lights, judge the model on them.",
+    )
+    fit.add_argument("capture", type=Path)
+    fit.add_argument("model", type=Path, help="model folder with strands.npz")
+    fit.add_argument("--method", choices=METHODS, default="sun")
+    fit.add_argument("--options", help="the method's options as JSON")
+    add_held_out(fit)
+    fit.add_argument("--environment", default="studio", help="studio, sky, or an .hdr or .exr file")
+    fit.add_argument("--seed", type=int, default=0)
+
+
+def run(args: argparse.Namespace, output: Output) -> int:
+    """Fit the appearance."""
+    from reconstruction.model import Model
+    from reconstruction.options import parse_options
+    from stage_service.jobs.records import JobOptions
+    from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
+
+    model, inverse = Model(args.model), args.method == "inverse_rendering"
+    asked = {
+        "held_out_cameras": args.hold_out_camera,
+        "held_out_lights": args.hold_out_light,
+        "environment": args.environment,
+        "seed": args.seed,
+        "inverse_rendering" if inverse else "fit": read_json(args.options),
+    }
+    options = parse_options(JobOptions, asked)
+    data: dict[str, Any] = {"model": str(model), "method": args.method}
+    if not inverse or not model.has("appearance.json"):
+        with progress_bar("sun") as progress:
+            fit(StepContext(args.capture, args.model, options, progress))
+    if inverse:
+        with progress_bar("inverse") as progress:
+            data |= inverse_rendering(StepContext(args.capture, args.model, options, progress))
+    data["appearance"] = model.json("appearance.json")
+    if options.held_out_cameras or options.held_out_lights:
+        with progress_bar("assess") as progress:
+            data["images"] = assess(StepContext(args.capture, args.model, options, progress))
+    output.result(data)
+    return 0

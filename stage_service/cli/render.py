@@ -1,0 +1,102 @@
+"""`hairstage render`: a picture of a model."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stage_service.cli.support import Commands, Output, add_command, progress_bar
+
+if TYPE_CHECKING:
+    from reconstruction.arrays import Floats
+    from reconstruction.report.report import Progress
+
+SIZE = 512
+"""Pixels across, where no camera of a rig says."""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    render = add_command(
+        commands,
+        "render",
+        run,
+        "a model under an environment map, or lights of its rig",
+        "Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, "
+        "where there are any), in the pose of its capture.",
+    )
+    render.add_argument("model", type=Path)
+    render.add_argument("--capture", type=Path, help="the capture that gives rig and head")
+    render.add_argument("--camera", help="a camera of the rig, instead of a three-quarter view")
+    render.add_argument(
+        "--light",
+        action="append",
+        default=[],
+        help="a light of the rig (repeat for more); the environment is then dark unless given",
+    )
+    render.add_argument(
+        "--environment", help="studio (where nothing else is given), sky, or an .hdr or .exr file"
+    )
+    render.add_argument("--out", type=Path, help=".png (exposed, sRGB) or .exr (linear)")
+    render.add_argument("--spp", type=int, default=64, help="samples a pixel")
+    render.add_argument("--seed", type=int, default=0)
+
+
+def run(args: argparse.Namespace, output: Output) -> int:
+    """Render a model."""
+    with progress_bar("render") as progress:
+        done = _render(args, progress)
+    output.result(done, f"{done['image']} ({done['camera']}, {done['seconds']:.0f} s)")
+    return 0
+
+
+def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Render what was asked for; returns what was written."""
+    from appearance.model.fitted_model import FittedModel
+    from appearance.model.relight import environment_map, three_quarter_view
+    from appearance.render.mixed import Environment
+    from reconstruction.capture.folder import Capture
+    from reconstruction.files.durable import writing
+    from reconstruction.model import Model
+
+    start = time.perf_counter()
+    if args.out is not None and args.out.suffix not in (".png", ".exr"):
+        raise ValueError(f"--out {args.out}: expected .png or .exr")
+    capture = Capture(args.capture) if args.capture is not None else None
+    if capture is None and (args.camera is not None or args.light):
+        raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
+    progress("building the scene", 0.0)
+    fitted = FittedModel.load(Model(args.model), capture)
+    camera = three_quarter_view(fitted.strands, SIZE)
+    if capture is not None and args.camera is not None:
+        camera = capture.rig.camera(args.camera)
+    environment = args.environment or (None if args.light else "studio")
+    maps = [] if environment is None else [Environment(environment_map(environment))]
+    lights = fitted.lights(args.light) if args.light else []
+    progress("rendering", 0.2)
+    image = fitted.render(camera, lights, maps, spp=args.spp, seed=args.seed)
+    out: Path = args.out or args.model / f"render_{camera.name}.png"
+    with writing(out) as part:
+        _write(part, image)
+    progress("written", 1.0)
+    return {
+        "image": str(out),
+        "camera": camera.name,
+        "lights": args.light,
+        "environment": environment,
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _write(out: Path, image: Floats) -> None:
+    from appearance.metrics.pictures import write_png
+    from appearance.metrics.scores import Exposure, srgb
+    from reconstruction.files.exr import write_exr
+
+    if out.suffix == ".exr":
+        write_exr(out, image)
+    else:
+        lit = image[image.sum(axis=-1) > 0]
+        write_png(out, srgb(image) if not len(lit) else Exposure.of([lit])(image))

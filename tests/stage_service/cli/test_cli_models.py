@@ -1,0 +1,180 @@
+"""`fit`, `render`, `edit` and `export` on a tuft of which one half is nearly black."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
+from appearance.model.fitted_model import FittedModel
+from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import build_scene
+from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.writer import CaptureWriter
+from reconstruction.files.exr import read_exr
+from reconstruction.files.strands import read_strands, write_strands
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.strands import Strands
+from reconstruction.model import Model
+from stage_service.cli import main
+
+HAIR = HairAppearance((0.1, 0.1, 0.1), 0.25, 0.2)
+DEPTH = 5
+UNSEEN = "l12"
+INVERSE = {
+    "hair_pixels": 150,
+    "max_depth": DEPTH,
+    "fit": {"variant": "spatial", "shape": [1, 4, 4], "effort": {"pixels": 80, "spp": 16}},
+}
+
+
+def tuft(count: int, seed: int = 0) -> Strands:
+    rng = np.random.default_rng(seed)
+    angle, r = rng.uniform(0, 2 * np.pi, count), 0.02 * np.sqrt(rng.uniform(size=count))
+    root = np.stack([r * np.cos(angle), r * np.sin(angle), np.full(count, -0.03)], -1)
+    bend = rng.normal(scale=0.002, size=(count, 1, 3))
+    t = np.linspace(0, 1, 6)[:, None]
+    points = root[:, None] + bend * t**2 + 0.06 * t * np.array([0, 0, 1.0])
+    return Strands(points.reshape(-1, 3).astype(np.float32), 6 * np.arange(count + 1), 4e-4)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The capture, and a model with strands and masks alone."""
+    folder = tmp_path_factory.mktemp("tuft")
+    strands = tuft(200)
+    uv = scalp_coordinates(strands, None)
+    sigma_a = np.broadcast_to((0.05, 0.1, 0.2), (1, 4, 4, 3)).copy()
+    sigma_a[0, :2] = (0.8, 1.5, 2.5)
+    truth = HairMaps(sigma_a, np.zeros((1, 4, 4, 2)), HAIR.beta_m, HAIR.beta_n)
+    scene = build_scene(strands, None, hair=HAIR)
+    scene = MappedStrands.of(scene, strands, uv).with_maps(truth)
+    cameras = tuple(
+        Camera.look_at(f"cam_{i}", 20, 20, (x, y, 0.05), (0, 0, 0), 7.0)
+        for i, (x, y) in enumerate(((0.0, -0.6), (0.3, 0.5)))
+    )
+    lights = tuple(
+        Light(f"l{i}", p, np.full(3, 5.0)) for i, p in enumerate(dome_positions(24, 1.0, -60.0))
+    )
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights) if x.name != UNSEEN]
+    writer = CaptureWriter.create(
+        folder / "capture", Rig("tuft", cameras, lights), {"steps": [s.to_dict() for s in steps]}
+    )
+    model = Model(folder / "model").create()
+    model.write_strands(strands)
+    for camera in cameras:
+        images = render_olat(scene, camera, lights, spp=128, max_depth=DEPTH, seed=7)
+        for step in steps:
+            image = images[int(step.light[1:])]
+            writer.write_frame(step, camera.name, image, pulse=1, block_id=1, timestamp=0.0)
+        model.write_mask(camera.name, "hair", coverage(scene, camera)["hair"] > 0.5)
+    writer.finish("completed", {})
+    unseen = images[int(UNSEEN[1:])]
+    return SimpleNamespace(capture=folder / "capture", model=model, folder=folder, unseen=unseen)
+
+
+def error_of_render(made, capsys) -> float:
+    """The relative error of `hairstage render` against a frame that no fit has seen."""
+    out = made.folder / "render.exr"
+    words = ["render", made.model, "--capture", made.capture, "--camera", "cam_1", "--json"]
+    assert main([str(w) for w in (*words, "--light", UNSEEN, "--spp", 64, "--out", out)]) == 0
+    assert json.loads(capsys.readouterr().out)["lights"] == [UNSEEN]
+    capture = Capture(made.capture)
+    mask = made.model.mask("cam_1", "hair", capture)
+    truth = made.unseen[mask]
+    return float(np.linalg.norm(read_exr(out)[0][mask] - truth) / np.linalg.norm(truth))
+
+
+def test_a_render_of_fitted_maps_is_nearer_to_a_frame_that_no_fit_has_seen(made, capsys):
+    """Inverse rendering runs Sun's fit first, which leaves one material for all hair."""
+    words = ["fit", made.capture, made.model, "--method", "inverse_rendering", "--json"]
+    assert main([str(w) for w in (*words, "--options", json.dumps(INVERSE))]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["appearance"] == made.model.json("appearance.json")
+    assert found["error"] < found["start_error"]
+    assert len(made.model.json("lights.json")) == 23
+    mapped = error_of_render(made, capsys)
+    with_maps = made.model.arrays("hair_maps.npz")
+    made.model.remove("hair_maps.npz")
+    one_material = error_of_render(made, capsys)
+    made.model.write_arrays("hair_maps.npz", with_maps)
+    assert mapped < 0.7 * one_material
+
+
+def run(capsys, *words) -> tuple[int, dict]:
+    code = main([*map(str, words), "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
+    """After the test above: of a model with maps."""
+    before = FittedModel.load(made.model)
+    write_strands(tmp_path / "other.npz", tuft(50, seed=3))
+    code, _ = run(
+        *(capsys, "edit", made.model, "--out", tmp_path / "all", "--strands"),
+        *(tmp_path / "other.npz", "--cut", 0.03, "--pigment", "0.5,0.1", "--roughen", 1.5),
+    )
+    assert code == 0
+    after = FittedModel.load(Model(tmp_path / "all"))
+    assert len(after.strands) == len(after.root_uv) == 50
+    assert after.strands.lengths().max() == pytest.approx(0.03, rel=1e-3)
+    assert after.maps.beta_m == pytest.approx(1.5 * before.maps.beta_m)
+    pigments = 0.5 * np.array([0.419, 0.697, 1.37]) + 0.1 * np.array([0.187, 0.4, 1.05])
+    np.testing.assert_allclose(after.maps.sigma_a.reshape(-1, 3)[0], pigments, rtol=1e-5)
+    u, v = before.root_uv[0]
+    code, _ = run(
+        *(capsys, "edit", made.model, "--out", tmp_path / "wisp", "--recolour", "0.9,0.1,0.1"),
+        *("--wisp", f"{u},{v},0.1", "--along", "0.5,1"),
+    )
+    assert code == 0
+    wisp = FittedModel.load(Model(tmp_path / "wisp")).maps
+    dyed = (np.abs(wisp.sigma_a - before.maps.resized(wisp.shape).sigma_a) > 1e-4).any(-1)
+    assert not dyed[: len(dyed) // 2].any()
+    assert 0.0 < dyed[-1].mean() < 0.1
+    code, _ = run(capsys, "render", tmp_path / "wisp", "--spp", 1, "--out", tmp_path / "x.png")
+    assert code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "--recolour"),
+        (("--wisp", "0,0,1"), "--recolour"),
+        (("--cut", "-1"), "above 0"),
+        (("--roughen", "100"), "beta_m"),
+        (("--recolour", "2,0,0"), "at most 1"),
+        (("--pigment=-1,0",), "0 or more"),
+        (("--recolour", "1,1,1", "--wisp", "9,9,0.1"), "no strand"),
+        (("--strands", "nowhere.npz"), "nowhere.npz"),
+    ],
+)
+def test_edits_that_cannot_be_made_are_one_sentence(made, capsys, tmp_path, words, said):
+    code, found = run(capsys, "edit", made.model, "--out", tmp_path / "out", *words)
+    assert code == 3
+    assert said in found["error"]["detail"]
+    assert not (tmp_path / "out").exists()
+
+
+def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
+    for kind, name in (("usd", "h.usdc"), ("hair", "h.hair"), ("abc", "h.abc")):
+        code, found = run(capsys, "export", made.model, "--to", kind, "--out", tmp_path / name)
+        assert (code, found["files"]) == (0, [str(tmp_path / name)])
+    assert (tmp_path / "h.abc").read_bytes().startswith(b"Ogawa")
+    for name in ("h.usdc", "h.hair"):
+        assert len(read_strands(tmp_path / name)) == 200
+    code, found = run(capsys, "export", made.model, "--to", "maps", "--out", tmp_path / "maps")
+    assert code == 0
+    assert (tmp_path / "maps" / "sigma_a_00.exr").is_file()
+    words = ("--capture", made.capture, "--camera", "cam_1", "--out", tmp_path / "mi")
+    assert run(capsys, "export", made.model, "--to", "mitsuba", *words)[0] == 0
+    assert (tmp_path / "mi" / "scene.xml").is_file()
+    code, found = run(capsys, "export", made.model, "--to", "hair", "--out", tmp_path / "x.usd")
+    assert code == 3
+    assert ".hair" in found["error"]["detail"]
