@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import Exposure, mean_scores, relative_error, scores
 from appearance.observations import HeldOut, Observed, observe
 from appearance.render.olat import render_olat
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.capture.folder import Capture
@@ -34,15 +34,6 @@ def held_out_frames(capture: Capture, model: Model, held_out: HeldOut, most: int
         if len(pixels) and some:
             out.append(observe(capture, name, some, pixels))
     return out
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Paths a pixel, vertices a path, and the seed."""
-
-    spp: int
-    max_depth: int
-    seed: int = 0
 
 
 def judge(

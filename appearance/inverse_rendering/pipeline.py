@@ -9,7 +9,7 @@ import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import save_lights
-from appearance.inverse_rendering.held_out import Sampling, held_out_frames, judge
+from appearance.inverse_rendering.held_out import held_out_frames, judge
 from appearance.inverse_rendering.loop import Monitor, Outcome, run
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
 from appearance.inverse_rendering.problem import Problem
@@ -17,6 +17,7 @@ from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
 from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.bounces import bounce_limit
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.arrays import Array

@@ -23,6 +23,7 @@ from appearance.model.options import AssessOptions
 from appearance.model.relight import relight
 from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.smoothed import olat_smoothed
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
@@ -171,7 +172,7 @@ class _Comparison:
         device, lights = capture.rig.camera(camera), self.fitted.lights(names)
         spp, seed = self.options.spp, self.seed
         rendered = {
-            method: olat_smoothed(s, device, lights, spp=spp, max_depth=MAX_DEPTH, seed=seed)
+            method: olat_smoothed(s, device, lights, Sampling(spp, MAX_DEPTH, seed))
             for method, s in scenes.items()
         }
         out = []

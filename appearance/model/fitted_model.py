@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import lights_as_found
 from appearance.render.mixed import Environment, render_mixed
+from appearance.render.tracing import SAMPLING, Sampling
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
@@ -118,12 +119,9 @@ class FittedModel:
         camera: Camera,
         lights: Sequence[Light] = (),
         environments: Sequence[Environment] = (),
+        sampling: Sampling = SAMPLING,
         *,
         weights: ArrayLike = 1.0,
-        spp: int = 64,
-        seed: int = 0,
     ) -> Floats:
         """Radiance `(H, W, 3)` under lights and environments together; see `render_mixed`."""
-        return render_mixed(
-            self.scene(), camera, lights, environments, weights=weights, spp=spp, seed=seed
-        )
+        return render_mixed(self.scene(), camera, lights, environments, sampling, weights=weights)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from appearance.metrics.scores import Exposure
 from appearance.model.fitted_model import FittedModel
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import load_environment, sky, studio
-from appearance.render.smoothed import environment_smoothed
+from appearance.render.smoothed import SHOWN, environment_smoothed
 from reconstruction.arrays import Floats
 from reconstruction.files.exr import write_exr
 from reconstruction.geometry.cameras import Camera
@@ -42,7 +43,7 @@ def relight(
     """
     envmap = environment_map(environment)
     scene, camera = fitted.scene(), three_quarter_view(fitted.strands, size)
-    radiance = environment_smoothed(scene, camera, envmap, spp=spp, seed=seed)
+    radiance = environment_smoothed(scene, camera, envmap, replace(SHOWN, spp=spp, seed=seed))
     share = coverage(scene, camera)
     subject = share["hair"] + share["head"] > 0.5
     with model.writing("relit.exr") as part:

@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import Surface, opaque_index
-from appearance.render.tracing import PathLimits, Paths, follow
+from appearance.render.tracing import PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.cameras import Camera
@@ -86,8 +86,6 @@ def _by_depth(scene: HairScene, camera: Camera, index: Ints, spp: int, seed: int
             )
 
     # one ray more than vertices: the light of the last vertex is the ray that leaves it
-    reach = PathLimits(_LONGEST + 1, _ROULETTE)
-    follow(
-        Surface(scene), camera, index, spp, (seed, _STREAM), reach, lambda si, paths: None, escape
-    )
+    plan = PathPlan(spp, (seed, _STREAM), PathLimits(_LONGEST + 1, _ROULETTE))
+    follow(Surface(scene), camera, index, plan, lambda si, paths: None, escape)
     return np.array(film, np.float64).reshape(_LONGEST + 1, 3, len(index)).transpose(0, 2, 1) / spp

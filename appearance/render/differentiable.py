@@ -277,9 +277,8 @@ class _Walk:
         def body(si: Any, beta: Any, total: Any, depth: Any, rng: Any, active: Any) -> Any:
             total = self._lights(si, beta, total, rng, active)
             active = active & (depth + 1 < max_depth)
-            ray, beta, active = continue_path(
-                self.surface, si, beta, depth, rng, self.owner.rr_depth, active
-            )
+            roulette = depth + 1 >= self.owner.rr_depth
+            ray, beta, active = continue_path(self.surface, si, beta, rng, roulette, active)
             if self.replay:
                 self._bounce(si, ray, total, active)
             si = self.surface.interact(ray, active)

@@ -17,7 +17,7 @@ import numpy as np
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
-from appearance.render.tracing import PathLimits, Paths, follow
+from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Floats
@@ -28,10 +28,8 @@ def render_environment(
     scene: HairScene,
     camera: Camera,
     envmap: AnyFloats,
+    sampling: Sampling = SAMPLING,
     *,
-    spp: int = 64,
-    max_depth: int = 24,
-    seed: int = 0,
     rotation_deg: float = 0.0,
     background: bool = False,
 ) -> Floats:
@@ -41,8 +39,6 @@ def render_environment(
     or the map with `background`. Each vertex of a path asks one direction, drawn in proportion to
     the map's brightness. Raises `ValueError` for maps that are negative or not finite.
     """
-    if spp < 1 or max_depth < 1:
-        raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
     sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
     if background:
@@ -57,10 +53,10 @@ def render_environment(
         def missed(ray: Any, paths: Paths) -> None:
             _add(film, paths.slot, sky.radiance(ray.d), paths.active & (paths.depth == 0))
 
-        reach = PathLimits(max_depth)
+        plan = PathPlan(sampling.spp, (sampling.seed,), PathLimits(sampling.max_depth))
         escape = missed if background else None
-        follow(gather.surface, camera, index, spp, (seed,), reach, gather, escape)
-        image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
+        follow(gather.surface, camera, index, plan, gather, escape)
+        image[index] = np.array(film).reshape(len(index), 3) / np.float32(sampling.spp)
     return image.reshape(camera.height, camera.width, 3)
 
 
@@ -82,6 +78,7 @@ class Sky:
 
     @classmethod
     def of(cls, envmap: Floats, rotation_deg: float) -> Sky:
+        """The sky of `envmap (h, w, 3)`, turned counter-clockwise seen from above."""
         height, width = envmap.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         weight = envmap.astype(float).sum(-1) * (edges[:-1] - edges[1:])[:, None]

@@ -16,15 +16,15 @@ from appearance.render.environment import Sky
 from appearance.render.environment_maps import check_environment
 from appearance.render.lights import LightBank
 from appearance.render.olat import render_olat
-from appearance.render.paths import Surface, opaque, pixel_indices
-from appearance.render.tracing import PathLimits, Paths, follow
+from appearance.render.paths import Surface, opaque
+from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
-_PILOT = 256  # pixels whose light from each light is looked at first
+_PILOT = 256  # pixels whose light from each light is estimated first
 _SPREAD = 0.1  # share of the choices that all lights have alike
 _PILOT_STREAM = 1 << 30
 
@@ -43,46 +43,38 @@ def render_mixed(
     camera: Camera,
     lights: Sequence[Light] = (),
     environments: Sequence[Environment] = (),
+    sampling: Sampling = SAMPLING,
     *,
     weights: ArrayLike = 1.0,
-    spp: int = 64,
-    max_depth: int = 24,
-    seed: int = 0,
-    pixels: ArrayLike | None = None,
 ) -> Floats:
-    """Radiance, W/(sr m²), of the subject under everything at once: `(H, W, 3)`, or `(P, 3)`.
+    """Radiance `(H, W, 3)`, W/(sr m²), of the subject under everything at once.
 
     `weights` broadcasts to `(L, 3)`: a factor for each light and channel, of any sign (a light may
     be taken away). Every vertex asks one light, drawn in proportion to its mean contribution in a
-    pilot pass, and one direction of each environment. Without `pixels (P,)` (flat indices) those
-    that see the subject are rendered and the others are 0. Raises `ValueError` naming the fault.
+    pilot pass, and one direction of each environment. Pixels that do not see the subject are 0.
+    Raises `ValueError` naming the fault.
     """
-    if spp < 1 or max_depth < 1:
-        raise ValueError(f"spp and max_depth must be positive, got {spp}, {max_depth}")
     weight = np.broadcast_to(np.asarray(weights, float), (len(lights), 3))
     if not np.isfinite(weight).all():
         raise ValueError("weights must be finite")
     maps = [check_environment(e.envmap, f"environment {i}") for i, e in enumerate(environments)]
-    index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    radiance = np.zeros((len(index), 3), np.float32)
+    image = np.zeros((camera.height * camera.width, 3), np.float32)
+    index = covered_pixels(scene, camera)
     if len(index) and (lights or environments):
-        choice = _choice(scene, camera, lights, weight, index, max_depth, seed)
-        radiance = _render(
-            scene,
-            camera,
+        choice = _choice(scene, camera, lights, weight, index, sampling)
+        gather = _Gather(
+            Surface(scene),
+            dr.zeros(mi.Float, 3 * len(index)),
             LightBank.of(lights, weight / choice[:, None]) if lights else None,
-            choice,
+            mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if lights else None,
             [
                 (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
                 for m, e in zip(maps, environments, strict=True)
             ],
-            index,
-            (spp, max_depth, seed),
         )
-    if pixels is not None:
-        return radiance
-    image = np.zeros((camera.height * camera.width, 3), np.float32)
-    image[index] = radiance
+        plan = PathPlan(sampling.spp, (sampling.seed,), PathLimits(sampling.max_depth))
+        follow(gather.surface, camera, index, plan, gather)
+        image[index] = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
     return image.reshape(camera.height, camera.width, 3)
 
 
@@ -92,8 +84,7 @@ def _choice(
     lights: Sequence[Light],
     weight: Array,
     index: Ints,
-    max_depth: int,
-    seed: int,
+    sampling: Sampling,
 ) -> Array:
     """Probabilities `(L,)` of asking each light; none is 0, so nothing is left out for good."""
     if len(lights) < 2:
@@ -104,8 +95,8 @@ def _choice(
         camera,
         lights,
         spp=4,
-        max_depth=max_depth,
-        seed=seed + _PILOT_STREAM,
+        max_depth=sampling.max_depth,
+        seed=sampling.seed + _PILOT_STREAM,
         pixels=few,
         thrift=0,
     ).mean(axis=1)
@@ -113,26 +104,6 @@ def _choice(
     uniform = np.full(len(lights), 1 / len(lights))
     total = share.sum()
     return uniform if total == 0 else (1 - _SPREAD) * share / total + _SPREAD * uniform
-
-
-def _render(
-    scene: HairScene,
-    camera: Camera,
-    bank: LightBank | None,
-    choice: Array,
-    skies: Sequence[tuple[Sky, Array]],
-    index: Ints,
-    how: tuple[int, int, int],
-) -> Floats:
-    spp, max_depth, seed = how
-    film = dr.zeros(mi.Float, 3 * len(index))
-    surface = Surface(scene)
-    draw = mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if bank is not None else None
-
-    gather = _Gather(surface, film, bank, draw, skies)
-    follow(surface, camera, index, spp, (seed,), PathLimits(max_depth), gather)
-    image = np.array(film).reshape(len(index), 3)
-    return np.asarray(image / np.float32(spp), dtype=np.float32)
 
 
 @dataclass(frozen=True)

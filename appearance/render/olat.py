@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
-from appearance.render.dome import Dome
 from appearance.render.lights import LightBank
-from appearance.render.paths import Surface, light_from, opaque_index, pixel_indices
-from appearance.render.tracing import LANE_BYTES, PathLimits, Paths, follow
+from appearance.render.paths import PointSource, Surface, light_from, opaque_index, pixel_indices
+from appearance.render.tracing import LANE_BYTES, PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
@@ -43,9 +42,6 @@ class OlatOptions:
     more variance on hair, where 2 to 8 do as well within a tenth. `roulette`
     of paths is that of `PathLimits`. The estimate is unbiased for every choice of these numbers.
 
-    `degree` projects light from the second vertex on onto spherical harmonics over the lights'
-    directions, see `Dome`: a fraction of the noise, biased. None is the unbiased renderer.
-
     `memory` bounds, in bytes, what the tiles of pixels take at a time; the images that
     `render_olat` returns come on top.
     """
@@ -56,7 +52,6 @@ class OlatOptions:
     deep_lights: int | None = None
     thrift: float = 3.0
     roulette: float = 0.5
-    degree: int | None = None
     memory: int = 1 << 30
 
     def __post_init__(self) -> None:
@@ -70,10 +65,6 @@ class OlatOptions:
         if not min(self.thrift, self.roulette) >= 0:
             raise ValueError(
                 f"thrift and roulette must be 0 or more, got {self.thrift}, {self.roulette}"
-            )
-        if self.degree is not None and (not 0 <= self.degree <= 9 or self.spp < 2):
-            raise ValueError(
-                f"degree must be in [0, 9] and spp at least 2, got {self.degree}, {self.spp}"
             )
 
 
@@ -134,7 +125,7 @@ def _tiles(
         return
     plan = _plan(scene, camera, lights, index, options, seed)
     # the film, its copy and the mean
-    each = 3 * 12 * len(lights) + (0 if plan.dome is None else plan.dome.pixel_bytes) + LANE_BYTES
+    each = 3 * 12 * len(lights) + LANE_BYTES
     tiles = -(-len(index) // max(1, options.memory // each))
     for k in range(tiles):
         part = slice(k, None, tiles)
@@ -151,9 +142,8 @@ class _Plan:
 
     lights: Sequence[Light]
     counts: tuple[int, int]
-    reach: PathLimits
+    limits: PathLimits
     dim: Floats
-    dome: Dome | None
 
 
 def _plan(
@@ -170,12 +160,10 @@ def _plan(
     if depth is None:
         depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    plan = _Plan(lights, (first, deep), PathLimits(depth, options.roulette), none, None)
+    plan = _Plan(lights, (first, deep), PathLimits(depth, options.roulette), none)
     if options.thrift > 0:
         spread = _spread(scene, camera, index, options.spp, plan, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)
-    if options.degree is not None:
-        plan = replace(plan, dome=Dome.over(scene, lights, options.degree))
     return plan
 
 
@@ -219,17 +207,9 @@ def _render_tile(
     film = dr.zeros(mi.Float, 3 * len(lights) * len(index))
     surface = Surface(scene)
     gather = _Gather(surface, film, opaque_index(len(index)), _Bank.of(lights, plan.dim), plan)
-    reach, escape, splat = plan.reach, None, None
-    if plan.dome is not None:
-        splat = plan.dome.splat(len(index))
-        # one ray more than vertices: the light of the last vertex is the ray that leaves it
-        reach, escape = replace(reach, max_depth=reach.max_depth + 1), splat
-    follow(surface, camera, index, spp, seed, reach, gather, escape)
+    follow(surface, camera, index, PathPlan(spp, seed, plan.limits), gather)
     image = np.array(film).reshape(len(lights), 3, len(index)).transpose(0, 2, 1)
-    image = image / np.float32(spp)
-    if splat is not None:
-        image += splat.light(spp)
-    return np.asarray(image, dtype=np.float32)
+    return np.asarray(image / np.float32(spp), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -256,7 +236,7 @@ class _Gather:
 
     def __call__(self, si: Any, paths: Paths) -> None:
         total, first = self.bank.lights.count, paths.depth == 0
-        active = paths.active if self.plan.dome is None else paths.active & first
+        active = paths.active
         count = dr.select(first, *(opaque_index(n) for n in self.plan.counts))
         stride = mi.Float(total) / mi.Float(count)
         sampled = min(self.plan.counts) < total
@@ -280,9 +260,7 @@ class _Gather:
             self.surface,
             si,
             paths.throughput * weight,
-            target,
-            intensity,
-            dr.gather(mi.Float, self.bank.dim, light, active),
+            PointSource(target, intensity, dr.gather(mi.Float, self.bank.dim, light, active)),
             rng.next_float32(),
             active,
         )

@@ -102,48 +102,53 @@ class Surface:
         return dr.select(seen, dr.abs(wo.z), 0)
 
 
-def light_from(
-    surface: Surface,
-    si: Any,
-    throughput: Any,
-    target: Any,
-    intensity: Any,
-    dim: Any,
-    chance: Any,
-    active: Any,
-) -> tuple[Any, Any]:
-    """Radiance that a point light at `target` sends along the path, and where it arrives.
+@dataclass(frozen=True)
+class PointSource:
+    """A point to cast a shadow ray at, its intensity, and the contribution below which one is rare.
 
-    A contribution below `dim` casts its shadow ray only with probability contribution/`dim` (by
-    `chance` in [0, 1)) and then counts as `dim`: the mean stays, and shadow rays, which cost ten
-    times what the BSDF does, go where the light is.
+    A contribution below `dim` casts its shadow ray only with probability contribution/`dim` and
+    then counts as `dim`: the mean stays, and shadow rays, which cost ten times what the BSDF does,
+    go where the light is.
     """
-    towards = target - si.p
+
+    position: Any
+    intensity: Any
+    dim: Any
+
+
+def light_from(
+    surface: Surface, si: Any, throughput: Any, source: PointSource, chance: Any, active: Any
+) -> tuple[Any, Any]:
+    """Radiance `Color3f` that `source` sends along the path, and where it arrives.
+
+    `chance` in [0, 1) decides about the shadow rays of dim contributions.
+    """
+    towards = source.position - si.p
     squared = dr.squared_norm(towards)
     wo = si.to_local(towards * dr.rsqrt(squared))
-    value = throughput * surface.eval(si, wo, active) * (intensity / squared)
+    value = throughput * surface.eval(si, wo, active) * (source.intensity / squared)
     brightest = dr.max(value)
-    kept = dr.maximum(brightest, dim)
+    kept = dr.maximum(brightest, source.dim)
     chance = dr.maximum(chance, 1e-9)  # at 0 a contribution of 1e-40 would count as infinitely many
     lit = active & (chance * kept < brightest)
-    lit &= ~surface.scene.mi_scene.ray_test(si.spawn_ray_to(target), lit)
+    lit &= ~surface.scene.mi_scene.ray_test(si.spawn_ray_to(source.position), lit)
     return value * (kept / brightest), lit
 
 
 def continue_path(
-    surface: Surface, si: Any, throughput: Any, depth: Any, rng: Any, rr_depth: int, active: Any
+    surface: Surface, si: Any, throughput: Any, rng: Any, roulette: Any, active: Any
 ) -> tuple[Any, Any, Any]:
     """Next ray, throughput and whether it is alive: BSDF sampling and Russian roulette.
 
-    Roulette starts at vertex `rr_depth`; survival is the largest channel of the throughput, at
-    most 0.95, and survivors are weighted by its inverse, so that the estimate stays unbiased.
+    Where `roulette`, survival is the largest channel of the throughput, at most 0.95, and survivors
+    are weighted by its inverse, so that the estimate stays unbiased.
     """
     u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
     wo, weight = surface.sample(si, u1, u2, active)
     throughput = throughput * weight
     strength = dr.max(throughput)
     alive = active & (strength > 0)
-    survival = dr.select(depth + 1 >= rr_depth, dr.minimum(strength, 0.95), 1)
+    survival = dr.select(roulette, dr.minimum(strength, 0.95), 1)
     alive &= rng.next_float32() < survival
     throughput = throughput * dr.select(alive, dr.rcp(survival), 0)
     return si.spawn_ray(si.to_world(wo)), throughput, alive
@@ -166,9 +171,14 @@ def _size(camera: Camera) -> int:
 
 def stream(size: int, *seeds: int) -> Any:
     """Random streams of `size` lanes that depend on all of `seeds`."""
-    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
     generator: Any = mi.PCG32  # the stubs call it a plain object
-    return generator(size, dr.opaque(mi.UInt64, int(state[0])))
+    return generator(size, seed_state(*seeds))
+
+
+def seed_state(*seeds: int) -> Any:
+    """A `UInt64` made of all of `seeds`, which kernels read from memory."""
+    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
+    return dr.opaque(mi.UInt64, int(state[0]))
 
 
 def passes(spp: int, per_pass: int) -> Iterator[tuple[int, int]]:
@@ -238,8 +248,7 @@ def each_sample(
     """
     slot = dr.arange(mi.UInt32, slots)
     size, end = opaque_index(slots), opaque_index(spp)
-    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
-    start = dr.opaque(mi.UInt64, int(state[0]))
+    start = seed_state(*seeds)
     generator: Any = mi.PCG32  # the stubs call it a plain object
 
     def more(sample: Any) -> Any:

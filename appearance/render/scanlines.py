@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import (
+    PointSource,
     Surface,
     light_from,
     opaque,
@@ -21,7 +22,7 @@ from appearance.render.paths import (
     opaque_matrix,
     pixel_indices,
 )
-from appearance.render.tracing import LANE_BYTES, PathLimits, Paths, follow
+from appearance.render.tracing import LANE_BYTES, PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
@@ -75,12 +76,12 @@ def render_scanlines(
     moved subject is rendered with the camera and the projectors `moved` instead: the scene stays as
     it is. Where all rows are too much to hold, use `scanline_tiles`.
     """
-    ranges = _ranges(projectors, rows)
+    sweep = _sweep(projectors, rows)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
     size = camera.height * camera.width if pixels is None else len(index)
-    out = {name: np.zeros((len(r), size, 3), np.float32) for name, r in ranges.items()}
+    out = {p.name: np.zeros((len(r), size, 3), np.float32) for p, r in sweep}
     chosen = ScanlineOptions(**options)
-    for part, films in _tiles(scene, camera, projectors, ranges, index, chosen, seed):
+    for part, films in _tiles(scene, camera, sweep, index, chosen, seed):
         for name, film in films.items():
             out[name][:, index[part] if pixels is None else part] = film
     if pixels is not None:
@@ -97,18 +98,25 @@ def scanline_tiles(
     rows: Mapping[str, range] | None = None,
     **options: Any,
 ) -> Iterator[tuple[Ints, dict[str, Floats]]]:
-    """`render_scanlines` of the pixels that see the subject, a tile at a time, as `olat_tiles`."""
-    ranges, chosen = _ranges(projectors, rows), ScanlineOptions(**options)
+    """`render_scanlines` of the pixels that see the subject, a tile at a time, as `olat_tiles`.
+
+    Yields flat pixel indices `(P,)` and radiance `(rows, P, 3)` by projector.
+    """
+    sweep, chosen = _sweep(projectors, rows), ScanlineOptions(**options)
     index = covered_pixels(scene, camera)
-    for part, films in _tiles(scene, camera, projectors, ranges, index, chosen, seed):
+    for part, films in _tiles(scene, camera, sweep, index, chosen, seed):
         yield index[part], films
 
 
-def _ranges(projectors: Sequence[Projector], rows: Mapping[str, range] | None) -> dict[str, range]:
+Sweep = Sequence[tuple[Projector, range]]
+"""Projectors and which of their rows."""
+
+
+def _sweep(projectors: Sequence[Projector], rows: Mapping[str, range] | None) -> Sweep:
     if unknown := set(rows or {}) - {p.name for p in projectors}:
         names = [p.name for p in projectors]
         raise ValueError(f"rows names unknown projectors {sorted(unknown)}; there are {names}")
-    return {p.name: _rows(p, (rows or {}).get(p.name)) for p in projectors}
+    return [(p, _rows(p, (rows or {}).get(p.name))) for p in projectors]
 
 
 def _rows(projector: Projector, rows: range | None) -> range:
@@ -123,19 +131,17 @@ def _rows(projector: Projector, rows: range | None) -> range:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is swept, and how paths and shadow rays are spent; `dim` as in `light_from`."""
+    """What is swept, and how paths and shadow rays are spent; `dim` as in `PointSource`."""
 
-    projectors: Sequence[Projector]
-    rows: dict[str, range]
-    reach: PathLimits
+    sweep: Sweep
+    limits: PathLimits
     dim: tuple[float, ...]
 
 
 def _tiles(
     scene: HairScene,
     camera: Camera,
-    projectors: Sequence[Projector],
-    rows: dict[str, range],
+    sweep: Sweep,
     index: Ints,
     options: ScanlineOptions,
     seed: int,
@@ -146,14 +152,14 @@ def _tiles(
     depth = options.max_depth
     if depth is None:
         depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
-    plan = _Plan(projectors, rows, PathLimits(depth, options.roulette), (0.0,) * len(projectors))
+    plan = _Plan(sweep, PathLimits(depth, options.roulette), (0.0,) * len(sweep))
     if options.thrift > 0:
         few = index[:: -(-len(index) // _PILOT)]
         films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))
         brought = [f.sum(0).max(-1) for f in films.values()]
         dim = (options.thrift * float(np.sqrt((b**2).mean())) for b in brought)
         plan = replace(plan, dim=tuple(dim))
-    each = 3 * 12 * sum(len(r) for r in rows.values()) + LANE_BYTES
+    each = 3 * 12 * sum(len(r) for _, r in sweep) + LANE_BYTES
     tiles = -(-len(index) // max(1, options.memory // each))
     for k in range(tiles):
         part = slice(k, None, tiles)
@@ -172,22 +178,15 @@ def _render(
     n = len(index)
     surface, slots = Surface(scene), opaque_index(n)
     gathers = [
-        _Gather(
-            surface,
-            dr.zeros(mi.Float, 3 * len(plan.rows[p.name]) * n),
-            slots,
-            p,
-            plan.rows[p.name],
-            dim,
-        )
-        for p, dim in zip(plan.projectors, plan.dim, strict=True)
+        _Gather(surface, dr.zeros(mi.Float, 3 * len(rows) * n), slots, p, rows, dim)
+        for (p, rows), dim in zip(plan.sweep, plan.dim, strict=True)
     ]
 
     def gather(si: Any, paths: Paths) -> None:
         for one in gathers:
             one(si, paths)
 
-    follow(surface, camera, index, spp, seed, plan.reach, gather)
+    follow(surface, camera, index, PathPlan(spp, seed, plan.limits), gather)
     out = {}
     for one in gathers:
         film = np.array(one.film).reshape(len(one.rows), 3, n).transpose(0, 2, 1)
@@ -222,9 +221,8 @@ class _Gather:
         intensity = mi.Color3f(*opaque(p.intensity * SCALE**2))
         (dim,) = opaque(self.dim)
         chance = paths.rng.next_float32()
-        value, seen = light_from(
-            self.surface, si, paths.throughput, centre, intensity, dim, chance, seen
-        )
+        source = PointSource(centre, intensity, dim)
+        value, seen = light_from(self.surface, si, paths.throughput, source, chance, seen)
         self._splat(value, v, reach, paths.slot, seen)
 
     def _splat(self, value: Any, v: Any, reach: float, slot: Any, seen: Any) -> None:

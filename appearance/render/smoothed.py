@@ -1,4 +1,4 @@
-"""Pictures for looking at: light from the first hit as it is, the rest smoothed.
+"""Pictures to be shown: light from the first hit as it is, the rest smoothed.
 
 Light that a fibre sends on from another fibre has been spread by every hit before it: it varies
 slowly over the image and carries nearly all of the noise. It is averaged over a Gaussian, hair and
@@ -10,6 +10,7 @@ unbiased reference; what differs is noise there and bias of the smoothing here.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -17,53 +18,47 @@ from scipy.ndimage import gaussian_filter
 from appearance.render.coverage import coverage
 from appearance.render.environment import render_environment
 from appearance.render.olat import render_olat
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
+SIGMA = 1.5
+"""Pixels that indirect light is averaged over."""
+SHOWN = Sampling(36, 16)
+
 
 def olat_smoothed(
-    scene: HairScene,
-    camera: Camera,
-    lights: Sequence[Light],
-    *,
-    spp: int = 36,
-    max_depth: int = 16,
-    sigma: float = 1.5,
-    seed: int = 0,
+    scene: HairScene, camera: Camera, lights: Sequence[Light], sampling: Sampling = SHOWN
 ) -> Floats:
-    """`render_olat` with its indirect light smoothed over `sigma` pixels: `(L, H, W, 3)`."""
+    """`render_olat` with its indirect light smoothed over `SIGMA` pixels: `(L, H, W, 3)`."""
+    spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
     # the first hits and their light are the same in both: they draw the same random numbers first
     first, whole = (
         render_olat(scene, camera, lights, spp=spp, max_depth=depth, thrift=0, seed=seed)
-        for depth in (1, max_depth)
+        for depth in (1, sampling.max_depth)
     )
-    return first + smoothed(whole - first, share, sigma)
+    return first + smoothed(whole - first, share, SIGMA)
 
 
 def environment_smoothed(
-    scene: HairScene,
-    camera: Camera,
-    envmap: AnyFloats,
-    *,
-    spp: int = 36,
-    max_depth: int = 16,
-    sigma: float = 1.5,
-    seed: int = 0,
+    scene: HairScene, camera: Camera, envmap: AnyFloats, sampling: Sampling = SHOWN
 ) -> Floats:
-    """`render_environment` with its indirect light smoothed over `sigma` pixels: `(H, W, 3)`.
+    """`render_environment` with its indirect light smoothed over `SIGMA` pixels: `(H, W, 3)`.
 
-    Direct light takes 8 `spp` paths a pixel: they are short, and the strands show in it.
+    `envmap (h, w, 3)`. Direct light takes 8 `spp` paths a pixel: they are short, and the strands
+    show in it.
     """
+    spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
     first, whole = (
-        render_environment(scene, camera, envmap, spp=spp, max_depth=depth, seed=seed)
-        for depth in (1, max_depth)
+        render_environment(scene, camera, envmap, replace(sampling, max_depth=depth))
+        for depth in (1, sampling.max_depth)
     )
-    direct = render_environment(scene, camera, envmap, spp=8 * spp, max_depth=1, seed=seed + 1)
-    return direct + smoothed((whole - first)[None], share, sigma)[0]
+    direct = render_environment(scene, camera, envmap, Sampling(8 * spp, 1, seed + 1))
+    return direct + smoothed((whole - first)[None], share, SIGMA)[0]
 
 
 def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:

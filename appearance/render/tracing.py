@@ -41,17 +41,43 @@ class PathLimits:
 
 
 @dataclass(frozen=True)
+class Sampling:
+    """Paths a pixel, vertices a path at most, and the seed of a picture."""
+
+    spp: int = 64
+    max_depth: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.spp < 1 or self.max_depth < 1:
+            raise ValueError(
+                f"spp and max_depth must be positive, got {self.spp}, {self.max_depth}"
+            )
+
+
+SAMPLING = Sampling()
+
+
+@dataclass(frozen=True)
+class PathPlan:
+    """`spp` paths a pixel within `limits`, their random numbers from `seeds`."""
+
+    spp: int
+    seeds: tuple[int, ...]
+    limits: PathLimits
+
+
+@dataclass(frozen=True)
 class Paths:
     """One step of the paths in flight, all Dr.Jit variables.
 
     `throughput` (`Color3f`) is the product of weights so far, `depth` counts the vertices so far,
-    `sample` the pixel's samples so far, `slot` is the lane's place in the list of pixels, `rng`
+    `slot` is the lane's place in the list of pixels, `rng`
     its random stream. Lanes that are not `active` are to be left alone.
     """
 
     throughput: Any
     depth: Any
-    sample: Any
     slot: Any
     rng: Any
     active: Any
@@ -61,13 +87,11 @@ def follow(
     surface: Surface,
     camera: Camera,
     pixels: Ints,
-    spp: int,
-    seeds: tuple[int, ...],
-    reach: PathLimits,
+    plan: PathPlan,
     vertex: Callable[[Any, Paths], None],
     escape: Callable[[Any, Paths], None] | None = None,
 ) -> None:
-    """Follow `spp` paths through each of the flat `pixels (P,)`.
+    """Follow `plan.spp` paths through each of the flat `pixels (P,)`.
 
     `vertex(si, paths)` is called where paths meet the subject and `escape(ray, paths)` where their
     rays miss it; both are traced once, with symbolic variables, and add to their films as a side
@@ -75,11 +99,14 @@ def follow(
     every run and no two lanes write to one slot. Lanes do not wait for each other's longest path:
     that saves a fifth to a third of the time.
     """
+    spp, limits = plan.spp, plan.limits
     slot = dr.arange(mi.UInt32, len(pixels))
     pixel = mi.UInt32(for_kernels(pixels, np.uint32))
-    size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(reach.max_depth)
-    (roulette,) = opaque(reach.roulette)
-    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
+    size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(limits.max_depth)
+    (roulette,) = opaque(limits.roulette)
+    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in plan.seeds]).generate_state(
+        1, np.uint64
+    )
     origin = dr.opaque(mi.UInt64, int(state[0]))
     generator: Any = mi.PCG32  # the stubs call it a plain object
 
@@ -95,8 +122,8 @@ def follow(
         si = surface.interact(ray, active)
         hit = active & si.is_valid()
         if escape is not None:
-            escape(ray, Paths(throughput, depth, sample, slot, rng, active & ~hit))
-        vertex(si, Paths(throughput, depth, sample, slot, rng, hit))
+            escape(ray, Paths(throughput, depth, slot, rng, active & ~hit))
+        vertex(si, Paths(throughput, depth, slot, rng, hit))
 
         u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         wo, weight = surface.sample(si, u1, u2, hit)

@@ -57,6 +57,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from appearance.model.fitted_model import FittedModel
     from appearance.model.relight import environment_map, three_quarter_view
     from appearance.render.mixed import Environment
+    from appearance.render.tracing import Sampling
     from reconstruction.capture.folder import Capture
     from reconstruction.files.durable import writing
     from reconstruction.model import Model
@@ -76,7 +77,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     maps = [] if environment is None else [Environment(environment_map(environment))]
     lights = fitted.lights(args.light) if args.light else []
     progress("rendering", 0.2)
-    image = fitted.render(camera, lights, maps, spp=args.spp, seed=args.seed)
+    image = fitted.render(camera, lights, maps, Sampling(args.spp, seed=args.seed))
     out: Path = args.out or args.model / f"render_{camera.name}.png"
     with writing(out) as part:
         _write(part, image)

@@ -13,6 +13,7 @@ from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat
 from appearance.render.smoothed import olat_smoothed, smoothed
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -141,7 +142,7 @@ def test_smoothing_keeps_the_mean_and_takes_the_noise(made):
     mask = coverage(scene, camera)["hair"] > 0.5
     reference = capture.olat("cam_0", ["l4"])[0]
     plain = render_olat(scene, camera, lights, spp=9, thrift=0, seed=3)[0]
-    smooth = olat_smoothed(scene, camera, lights, spp=9, seed=3)[0]
+    smooth = olat_smoothed(scene, camera, lights, Sampling(9, 16, 3))[0]
     # light is handed on by share of the pixels, so that a little crosses the mask's edge
     assert smooth[mask].mean() == pytest.approx(plain[mask].mean(), rel=0.1)
     error = [np.sqrt(np.mean((x[mask] - reference[mask]) ** 2)) for x in (plain, smooth)]

@@ -17,6 +17,7 @@ from appearance.model.export import at_points, export_maps, export_mitsuba, expo
 from appearance.model.fitted_model import FittedModel
 from appearance.render.environment import render_environment
 from appearance.render.olat import render_olat
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.files.exr import read_exr
@@ -81,7 +82,7 @@ def test_dyed_and_smoother_hair_is_so_in_every_light(fitted, small):
     smoother = mi.traverse(fitted.with_maps(replace(fitted.maps, beta_m=0.1)).scene().hair_bsdf)
     assert smoother["longitudinal_roughness"][0] == pytest.approx(0.1)
     sky = np.ones((4, 8, 3), np.float32)
-    assert render_environment(fitted.scene(), CAMERA, sky, spp=4, max_depth=4).max() > 0.1
+    assert render_environment(fitted.scene(), CAMERA, sky, Sampling(4, 4)).max() > 0.1
 
 
 def test_maps_stay_on_strands_that_move_and_other_strands_are_refused(fitted, small):
@@ -109,7 +110,7 @@ def test_stock_mitsuba_opens_the_scene_and_sees_about_our_picture(fitted, tmp_pa
     path = mi.load_dict({"type": "path", "max_depth": 16, "hide_emitters": True})
     stock = np.array(mi.render(scene, integrator=path, seed=0))[..., :3]
     sky = np.ones((4, 8, 3), np.float32)
-    ours = render_environment(fitted.scene(), CAMERA, sky, spp=64, max_depth=15)
+    ours = render_environment(fitted.scene(), CAMERA, sky, Sampling(64, 15))
     np.testing.assert_allclose(stock.mean((0, 1)), ours.mean((0, 1)), rtol=0.35)
     columns = [x.mean((0, 2)) for x in (stock, ours)]
     assert np.corrcoef(columns)[0, 1] > 0.9

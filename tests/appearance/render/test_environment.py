@@ -6,6 +6,7 @@ import pytest
 
 from appearance.render.environment import render_environment
 from appearance.render.environment_maps import load_environment, sky, studio
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
 from reconstruction.files.exr import write_exr
@@ -26,7 +27,7 @@ def eye(direction, size=12, fov_deg=4.0):
 
 
 def test_a_convex_body_in_a_uniform_world_shows_its_albedo(ball):
-    image = render_environment(ball, eye((0.3, -0.8, 0.2)), np.ones((8, 16, 3)), spp=256)
+    image = render_environment(ball, eye((0.3, -0.8, 0.2)), np.ones((8, 16, 3)), Sampling(256))
     np.testing.assert_allclose(image.mean((0, 1)), ALBEDO, rtol=0.02)
 
 
@@ -35,7 +36,7 @@ def test_clear_hair_in_a_uniform_world_vanishes(small):
     clear = HairAppearance((0.0, 0.0, 0.0), 0.3, 0.3)
     scene = build_scene(small.tuft(60), None, hair=clear)
     world = np.ones((8, 16, 3))
-    image = render_environment(scene, small.camera(), world, spp=256, max_depth=60, background=True)
+    image = render_environment(scene, small.camera(), world, Sampling(256, 60), background=True)
     assert image.mean() == pytest.approx(1, abs=0.015)
 
 
@@ -64,19 +65,19 @@ def test_orientation(ball, row, column, axis):
     else:
         world[row - 1 : row + 1, [column - 1, column]] = 1
     axis = np.array(axis, float)
-    facing = render_environment(ball, eye(axis + TILT), world, spp=64).mean()
-    turned = render_environment(ball, eye(-axis + TILT), world, spp=64).mean()
+    facing = render_environment(ball, eye(axis + TILT), world, Sampling(64)).mean()
+    turned = render_environment(ball, eye(-axis + TILT), world, Sampling(64)).mean()
     assert facing > 0.02
     assert turned < 0.02 * facing
     inside = Camera.look_at("inside", 4, 4, 5 * axis, 6 * axis + TILT, 5)
-    assert render_environment(ball, inside, world, spp=1, background=True).min() == 1
+    assert render_environment(ball, inside, world, Sampling(1), background=True).min() == 1
 
 
 def test_rotation_turns_the_map_counter_clockwise(ball):
     world = np.zeros((8, 16, 3))
     world[3:5, 7:9] = 1  # towards +x
     lit = {
-        axis: render_environment(ball, eye(direction), world, spp=32, rotation_deg=90).mean()
+        axis: render_environment(ball, eye(direction), world, Sampling(32), rotation_deg=90).mean()
         for axis, direction in (("+y", (0.01, 1, 0)), ("+x", (1, 0.01, 0)), ("-y", (0, -1, 0)))
     }
     assert lit["+y"] > 4 * max(lit["+x"], lit["-y"])
@@ -85,14 +86,15 @@ def test_rotation_turns_the_map_counter_clockwise(ball):
 def test_same_seed_same_bytes(small):
     scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
     a, b, other = (
-        render_environment(scene, small.camera(), studio(16), spp=8, seed=s) for s in (3, 3, 4)
+        render_environment(scene, small.camera(), studio(16), Sampling(8, seed=s))
+        for s in (3, 3, 4)
     )
     assert a.tobytes() == b.tobytes()
     assert (a != other).any()
 
 
 def test_dark_worlds_are_dark(ball):
-    assert not render_environment(ball, eye((0, -1, 0)), np.zeros((4, 8, 3)), spp=4).any()
+    assert not render_environment(ball, eye((0, -1, 0)), np.zeros((4, 8, 3)), Sampling(4)).any()
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.1])

@@ -12,6 +12,7 @@ from appearance.render.environment_maps import studio
 from appearance.render.lights import LightBank
 from appearance.render.mixed import Environment, render_mixed
 from appearance.render.olat import render_olat
+from appearance.render.tracing import Sampling
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import SCALE, build_scene
@@ -152,8 +153,8 @@ def test_a_sphere_casts_a_soft_shadow(small):
     light = Light("l", np.array([0, 0, light_height]), np.full(3, 8.0), radius=radius)
     point = Light("p", light.position, light.intensity)
     open_scene = build_scene(small.no_hair, small.plane(0.05), hair=HAIR, skin=(0.5, 0.5, 0.5))
-    soft = render_mixed(scene, camera, [light], spp=1024, max_depth=1)[..., 0]
-    lit = render_mixed(open_scene, camera, [point], spp=64, max_depth=1)[..., 0]
+    soft = render_mixed(scene, camera, [light], sampling=Sampling(1024, 1))[..., 0]
+    lit = render_mixed(open_scene, camera, [point], sampling=Sampling(64, 1))[..., 0]
     column, row = np.meshgrid(np.arange(32), np.arange(4))
     rays = camera.rays(np.stack([column, row], -1))
     x = (camera.center - rays * (camera.center[2] / rays[..., 2])[..., None])[..., 0]
@@ -183,32 +184,31 @@ def test_a_mixture_is_the_sum_of_its_parts(tufted):
     parts = (alone * weights).sum(0)
     for e in maps:
         image = render_environment(
-            scene, camera, e.envmap, spp=256, max_depth=5, seed=2, rotation_deg=e.rotation_deg
+            scene, camera, e.envmap, Sampling(256, 5, 2), rotation_deg=e.rotation_deg
         )
         parts = parts + image.mean((0, 1)) * np.asarray(e.weight)
-    mixed = render_mixed(scene, camera, lights, maps, weights=weights, spp=512, max_depth=5, seed=3)
+    mixed = render_mixed(scene, camera, lights, maps, Sampling(512, 5, 3), weights=weights)
     np.testing.assert_allclose(mixed.mean((0, 1)), parts, rtol=0.03)
 
 
 def test_a_light_taken_away_from_itself_is_dark(tufted):
     scene, camera, lights = tufted
     twice = [lights[0], lights[0]]
-    options = {"spp": 512, "max_depth": 3, "seed": 4}
-    none = render_mixed(scene, camera, twice, weights=[[1.0], [-1.0]], **options)
-    one = render_mixed(scene, camera, twice[:1], **options)
+    sampling = Sampling(512, 3, 4)
+    none = render_mixed(scene, camera, twice, (), sampling, weights=[[1.0], [-1.0]])
+    one = render_mixed(scene, camera, twice[:1], (), sampling)
     assert abs(none.mean()) < 0.03 * one.mean()
 
 
-def test_mixtures_of_pixels_and_seeds(tufted):
+def test_mixtures_of_seeds_and_of_nothing(tufted):
     scene, camera, lights = tufted
-    pixels = np.array([100, 7, 101])
-    a, b, c = (render_mixed(scene, camera, lights, spp=8, seed=s, pixels=pixels) for s in (1, 1, 2))
-    assert a.shape == (3, 3)
+    a, b, c = (render_mixed(scene, camera, lights, sampling=Sampling(8, seed=s)) for s in (1, 1, 2))
     assert a.tobytes() == b.tobytes() != c.tobytes()
-    assert not render_mixed(scene, camera, spp=1).any()
-    for wrong in ({"weights": np.nan}, {"spp": 0}):
-        with pytest.raises(ValueError, match="must be"):
-            render_mixed(scene, camera, lights, **wrong)
+    assert not render_mixed(scene, camera, sampling=Sampling(1)).any()
+    with pytest.raises(ValueError, match="must be finite"):
+        render_mixed(scene, camera, lights, weights=np.nan)
+    with pytest.raises(ValueError, match="must be positive"):
+        Sampling(0)
 
 
 def test_lights_of_every_shape_shine_in_olat_images(tufted):
@@ -222,5 +222,5 @@ def test_lights_of_every_shape_shine_in_olat_images(tufted):
     lights = [replace(light, **shape) for light, shape in zip(lights, shapes, strict=True)]
     olat = render_olat(scene, camera, lights, spp=256, max_depth=4, seed=1)
     for image, light in zip(olat, lights, strict=True):
-        one = render_mixed(scene, camera, [light], spp=256, max_depth=4, seed=2)
+        one = render_mixed(scene, camera, [light], sampling=Sampling(256, 4, 2))
         np.testing.assert_allclose(image.mean((0, 1)), one.mean((0, 1)), rtol=0.04)

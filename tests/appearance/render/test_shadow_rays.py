@@ -11,7 +11,7 @@ ensure_backend()
 
 import mitsuba as mi  # noqa: E402
 
-from appearance.render.paths import light_from  # noqa: E402
+from appearance.render.paths import PointSource, light_from  # noqa: E402
 
 
 def arriving(brought: tuple[float, float, float], chance: float, dim: float = 1.0):
@@ -25,11 +25,9 @@ def arriving(brought: tuple[float, float, float], chance: float, dim: float = 1.
             mi_scene=SimpleNamespace(ray_test=lambda ray, active: mi.Bool(False))
         ),
     )
-    target, bright = mi.Point3f(0, 0, 1), mi.Color3f(1)
-    value, lit = light_from(
-        surface, si, mi.Color3f(*brought), target, bright, mi.Float(dim), mi.Float(chance),
-        mi.Bool(True),
-    )  # fmt: skip
+    source = PointSource(mi.Point3f(0, 0, 1), mi.Color3f(1), mi.Float(dim))
+    throughput = mi.Color3f(*brought)
+    value, lit = light_from(surface, si, throughput, source, mi.Float(chance), mi.Bool(True))
     return np.array(value).ravel(), bool(np.array(lit).all())
 
 

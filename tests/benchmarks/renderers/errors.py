@@ -30,9 +30,8 @@ from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
 
-DEGREE = 6
 _JUDGED = 12  # lights whose error is measured
-_STYLES = {"mitsuba path": "k.-", "ours": "C0o-", "ours projected": "C1s-"}
+_STYLES = {"mitsuba path": "k.-", "ours": "C0o-"}
 QUICK = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2, 16)
 
 
@@ -110,7 +109,7 @@ class _Errors:
     def _path(self, lights: list[Light], spp: int, seed: int) -> Floats:
         return self.path.render(self.view.camera, lights, self.view.index, spp=spp, seed=seed)
 
-    def _ours(self, lights: list[Light], spp: int, seed: int, degree: int | None = None) -> Floats:
+    def _ours(self, lights: list[Light], spp: int, seed: int) -> Floats:
         view = self.view
         return render_olat(
             view.scene,
@@ -120,14 +119,12 @@ class _Errors:
             seed=seed,
             pixels=view.index,
             max_depth=self.limit.depth,
-            degree=degree,
         )
 
     def _curves(self, count: int) -> dict[str, Any]:
         lights, seen, effort = dome(count, self.view.seed), min(count, _JUDGED), self.effort
         methods: dict[str, Callable[[int, int], Floats]] = {
             "ours": lambda spp, seed: self._ours(lights, spp, seed),
-            "ours projected": lambda spp, seed: self._ours(lights, spp, seed, DEGREE),
             "mitsuba path": lambda spp, seed: self._path(self.judged[:seen], spp, seed),
         }
         for method in [*methods.values()] * 2:  # a second call may compile a second variant
