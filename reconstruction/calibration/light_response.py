@@ -16,7 +16,7 @@ def dark_response(capture: Capture, step: Step, camera: str) -> tuple[Floats, Bo
     return image - dark_rgb(capture, camera, step.exposure) / np.float32(level), saturated
 
 
-def lamp_response(capture: Capture, light: str, camera: str) -> tuple[Floats, Bools]:
+def light_response(capture: Capture, light: str, camera: str) -> tuple[Floats, Bools]:
     """`Capture.light` less the dark frame, at full level `(H, W, 3)`, and where it is saturated."""
     image, saturated = capture.light(light, camera)
     step = next(s for s in capture.of_kind("olat") if s.light == light)

@@ -20,7 +20,7 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     By camera: `reprojection_px`, mean and largest over a head-sized ball of points; `centre_mm`;
     `turn_deg`. By projector: the rows' error over the same points, `plane_mm` what that is where
     they are, `axis_mm` and `along_axis_mm` of its centre across and along its x axis, `turn_deg`.
-    By lamp: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
+    By light: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
     """
     ball = _ball()
     frame = _align(found, truth, ball)
@@ -36,18 +36,18 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     for p in found.projectors:
         mine, its = frame.inverse().seen_by(p), truth.projector(p.name)
         projectors[p.name] = _rows(mine, its, ball)
-    lamps = {}
+    lights = {}
     for light in found.lights:
-        place, lamp = frame(light.position), truth.light(light.name)
-        distance = float(np.linalg.norm(lamp.position))
-        cosine = place @ lamp.position / (np.linalg.norm(place) * distance)
-        strength = light.intensity.mean() / max(float(lamp.intensity.mean()), 1e-300)
-        lamps[light.name] = {
-            "position": float(np.linalg.norm(place - lamp.position) / distance),
+        place, real = frame(light.position), truth.light(light.name)
+        distance = float(np.linalg.norm(real.position))
+        cosine = place @ real.position / (np.linalg.norm(place) * distance)
+        strength = light.intensity.mean() / max(float(real.intensity.mean()), 1e-300)
+        lights[light.name] = {
+            "position": float(np.linalg.norm(place - real.position) / distance),
             "direction_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
             "intensity": float(abs(strength - 1)),
         }
-    return {"cameras": cameras, "projectors": projectors, "lamps": lamps}
+    return {"cameras": cameras, "projectors": projectors, "lights": lights}
 
 
 def _align(found: Rig, truth: Rig, ball: Array) -> Rigid:

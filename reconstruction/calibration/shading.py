@@ -1,6 +1,6 @@
-"""Lamps from the shading of diffuse spheres: Lambert's law near to a lamp.
+"""Lights from the shading of diffuse spheres: Lambert's law near to it.
 
-Radiance = albedo / π · I · n·v / |v|³, v from a point of the sphere to the lamp: the shading says
+Radiance = albedo / π · I · n·v / |v|³, v from a point of the sphere to the light: the shading says
 where the light comes from, its fall-off over the sphere how far, and its strength how strong.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.least_squares import minimise
-from reconstruction.calibration.solve_lights import LOOSE, Lamp
+from reconstruction.calibration.solve_lights import LOOSE, CalibratedLight
 from reconstruction.geometry.lights import Light
 
 MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better
@@ -24,7 +24,7 @@ STEEPEST = 0.15  # cosine of incidence: flatter light shows the sphere's grain
 
 @dataclass(frozen=True, eq=False)
 class Shading:
-    """Pixels that see diffuse spheres of one radius and albedo under one lamp alone.
+    """Pixels that see diffuse spheres of one radius and albedo under one light alone.
 
     `eyes` and `rays (N, 3)`, the number of the `sphere (N,)` they meet, `radiance (N, 3)` at full
     level, and its `deviation (N,)` from noise. `centres (S, 3)` with `covariance (3 S, 3 S)`.
@@ -83,16 +83,16 @@ class Shading:
         return np.asarray((cosine > STEEPEST) & (self.grey > 6 * self.deviation))
 
 
-def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
-    """Position and intensity of a lamp from diffuse spheres in known places.
+def shaded_light(nominal: Light, shading: Shading) -> CalibratedLight:
+    """Position and intensity of a light from diffuse spheres in known places.
 
-    `nominal` gives the lamp's profile and aim, which stay, and a first distance. Raises
+    `nominal` gives the light's profile and aim, which stay, and a first distance. Raises
     `CalibrationError` where the spheres are not lit or the distance stays open.
     """
     lit = shading.grey > 6 * np.maximum(shading.deviation, 1e-12)
     if lit.sum() < 100:
         raise CalibrationError(
-            f"lamp {nominal.name}: {int(lit.sum())} pixels of the diffuse sphere answer it, 100 "
+            f"light {nominal.name}: {int(lit.sum())} pixels of the diffuse sphere answer it, 100 "
             "are needed: it is behind the sphere for every camera, dark, or too dim for the "
             "exposure: move the sphere or expose longer"
         )
@@ -103,8 +103,8 @@ def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
     form = shading.form(start)
     if use.sum() < 100 or not (form[use] > 0).all():
         raise CalibrationError(
-            f"lamp {nominal.name}: its light falls on the diffuse sphere from where no camera sees "
-            "it well: move the sphere, or aim a camera at its lit side"
+            f"light {nominal.name}: it falls on the diffuse sphere from where no camera sees it "
+            "well: move the sphere, or aim a camera at its lit side"
         )
     (x, n), value, error = (a[use] for a in shading.surface), shading.grey[use], shading.error[use]
     v = start.position - x
@@ -128,21 +128,21 @@ def shaded_lamp(nominal: Light, shading: Shading) -> Lamp:
     worst = float(np.linalg.eigvalsh(shading.covariance)[-1]) / len(shading.centres)
     covariance = solution.covariance[:3, :3] + worst * (distance / shading.radius) ** 2 * np.eye(3)
     light = replace(start, position=found)
-    lamp = Lamp(light, covariance, float(solution.deviation[3]))
-    if not lamp.deviation < LOOSE * distance:
+    out = CalibratedLight(light, covariance, float(solution.deviation[3]))
+    if not out.deviation < LOOSE * distance:
         raise CalibrationError(
-            f"lamp {nominal.name}: shading leaves its position open by {lamp.deviation:.3g} m at "
+            f"light {nominal.name}: shading leaves its position open by {out.deviation:.3g} m at "
             f"{distance:.3g} m (limit {LOOSE:.0%}): use a larger sphere, or several places"
         )
-    return with_intensity(lamp, shading)
+    return with_intensity(out, shading)
 
 
-def with_intensity(lamp: Lamp, shading: Shading) -> Lamp:
-    """`lamp` with the intensity per channel that its place and the `shading` say."""
-    use = shading.used(lamp.light)
-    form, weight = shading.form(lamp.light)[use], shading.error[use] ** -2
+def with_intensity(known: CalibratedLight, shading: Shading) -> CalibratedLight:
+    """`known` with the intensity per channel that its place and the `shading` say."""
+    use = shading.used(known.light)
+    form, weight = shading.form(known.light)[use], shading.error[use] ** -2
     intensity = (form * weight) @ shading.radiance[use] / ((form * weight) @ form)
-    return replace(lamp, light=replace(lamp.light, intensity=np.maximum(intensity, 0)))
+    return replace(known, light=replace(known.light, intensity=np.maximum(intensity, 0)))
 
 
 def refine_centres(
@@ -151,8 +151,8 @@ def refine_centres(
     """`shadings` with the centres that shading and outlines agree on.
 
     An outline's light is not equal all around, which pulls it to one side by a tenth of a pixel;
-    from cameras on several sides that contradicts the shading. Each round solves for all lamps and
-    takes a Gauss-Newton step for the centres, with the lamps' answer to it eliminated.
+    from cameras on several sides that contradicts the shading. Each round solves for all lights and
+    takes a Gauss-Newton step for the centres, with the lights' answer to it eliminated.
     """
     first = next(iter(shadings.values()))
     prior, centres = np.linalg.inv(first.covariance), first.centres
@@ -162,7 +162,7 @@ def refine_centres(
         for name, whole in shadings.items():
             shading = replace(whole, centres=centres).thinned(max(1, len(whole.rays) // 4000))
             try:
-                light = shaded_lamp(lights[name], shading).light
+                light = shaded_light(lights[name], shading).light
             except CalibrationError:
                 continue  # as the caller will find out
             r, J = _derivatives(shading, light)
@@ -177,7 +177,7 @@ def refine_centres(
 
 
 def _derivatives(shading: Shading, light: Light) -> tuple[Array, Array]:
-    """Residuals `(N,)` and derivatives by the lamp's place, log intensity, and all centres."""
+    """Residuals `(N,)` and derivatives by the light's place, log intensity, and all centres."""
     use = shading.used(light)
     grey, error = shading.grey[use], shading.error[use]
     strength = float(light.intensity.mean())

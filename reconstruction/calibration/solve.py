@@ -9,9 +9,9 @@ import numpy as np
 
 from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.calibration.calibration_error import CalibrationError
-from reconstruction.calibration.shading import refine_centres, shaded_lamp, with_intensity
+from reconstruction.calibration.shading import refine_centres, shaded_light, with_intensity
 from reconstruction.calibration.solve_cameras import CameraSolution, calibrate_cameras
-from reconstruction.calibration.solve_lights import Lamp, mirrored_lamps
+from reconstruction.calibration.solve_lights import CalibratedLight, mirrored_lights
 from reconstruction.calibration.solve_projectors import (
     UNDETERMINED,
     Rows,
@@ -30,10 +30,21 @@ from reconstruction.report.report import Progress, Report, Stage, silent
 
 
 @dataclass(frozen=True)
+class TargetCaptures:
+    """What was shot: `boards`, one a pose, with `all_on` frames, and sweeps where they calibrate
+    projectors; `mirrors` and `diffuse` spheres under single lights, one a place.
+    """
+
+    boards: Sequence[Capture]
+    mirrors: Sequence[Capture] = ()
+    diffuse: Sequence[Capture] = ()
+
+
+@dataclass(frozen=True)
 class Targets:
     """What stood on the stage: the board, its paper's albedo, the spheres' radii and albedo.
 
-    Metres. The diffuse sphere's albedo scales all lamps' intensities, the paper's all projectors';
+    Metres. The diffuse sphere's albedo scales all lights' intensities, the paper's all projectors';
     None leaves the projectors' intensities nominal.
     """
 
@@ -46,26 +57,22 @@ class Targets:
 
 def calibrate(
     nominal: Rig,
-    boards: Sequence[Capture],
+    captures: TargetCaptures,
     targets: Targets = Targets(),
     *,
-    mirrors: Sequence[Capture] = (),
-    diffuse: Sequence[Capture] = (),
     keep_lens: bool = False,
     progress: Progress = silent,
 ) -> tuple[Rig, Report]:
     """Calibrate the rig whose devices are called as in `nominal`, and are about there.
 
-    `boards` are captures of the board, one a pose, with `all_on` frames; where they hold sweeps,
-    projectors are calibrated too. `mirrors` and `diffuse` are captures of a sphere with single
-    lamps, one a place. Pictures are taken less their dark frames. What no capture determines stays
-    nominal and stands in the report's stages under `undetermined`.
+    Pictures are taken less their dark frames. What no capture determines stays nominal and stands
+    in the report's stages under `undetermined`.
 
     The world is `nominal`'s: the rigid motion that fits its cameras best. Raises
     `CalibrationError` where cameras stay open.
     """
     report = Report()
-    poses = {f"{k:02d} {c.path.name}": c for k, c in enumerate(boards)}
+    poses = {f"{k:02d} {c.path.name}": c for k, c in enumerate(captures.boards)}
     with report.stage("cameras") as stage:
         found = _cameras(nominal, poses, targets.board, keep_lens, stage, progress)
     projectors: tuple[Projector, ...] = nominal.projectors
@@ -74,8 +81,8 @@ def calibrate(
             projectors = _projectors(nominal, poses, found, targets, stage, progress)
     lights: tuple[Light, ...] = nominal.lights
     if lights:
-        with report.stage("lamps") as stage:
-            lights = _lamps(nominal, found.cameras, targets, mirrors, diffuse, stage, progress)
+        with report.stage("lights") as stage:
+            lights = _lights(nominal, found.cameras, targets, captures, stage, progress)
     return Rig(nominal.name, found.cameras, lights, projectors), report
 
 
@@ -166,64 +173,63 @@ def _projectors(
     return tuple(out)
 
 
-def _lamps(
+def _lights(
     nominal: Rig,
     cameras: Sequence[Camera],
     targets: Targets,
-    mirrors: Sequence[Capture],
-    diffuse: Sequence[Capture],
+    captures: TargetCaptures,
     stage: Stage,
     progress: Progress,
 ) -> tuple[Light, ...]:
     undetermined: dict[str, str] = {}
     names = [x.name for x in nominal.lights]
     shadings = {}
-    if diffuse:
+    if captures.diffuse:
         progress("diffuse sphere", 0.7)
         shadings = gather_shading(
-            diffuse, cameras, targets.diffuse_radius, targets.diffuse_albedo, names
+            captures.diffuse, cameras, targets.diffuse_radius, targets.diffuse_albedo, names
         )
         shadings = refine_centres({x.name: x for x in nominal.lights}, shadings)
         stage.figures["diffuse_centres"] = next(iter(shadings.values())).centres.tolist()
-    lamps: dict[str, Lamp] = {}
+    found: dict[str, CalibratedLight] = {}
     for name, shading in shadings.items():
         try:
-            lamps[name] = shaded_lamp(nominal.light(name), shading)
+            found[name] = shaded_light(nominal.light(name), shading)
         except CalibrationError as error:
             undetermined[name] = str(error)
-    if mirrors:
+    if captures.mirrors:
         progress("mirror sphere", 0.85)
-        glints = glints_of(mirrors, cameras, names)
+        glints = glints_of(captures.mirrors, cameras, names)
         if not glints:
             raise CalibrationError(
-                "mirror sphere: no camera sees a highlight of any single lamp: are there OLAT "
+                "mirror sphere: no camera sees a highlight of any single light: are there OLAT "
                 "frames, and is the sphere in view?"
             )
-        by_mirror, centres, rms = mirrored_lamps(
-            {x.name: x for x in nominal.lights}, glints, targets.mirror_radius, lamps
+        by_mirror, centres, rms = mirrored_lights(
+            {x.name: x for x in nominal.lights}, glints, targets.mirror_radius, found
         )
-        for name, lamp in by_mirror.items():
-            lamps[name] = with_intensity(lamp, shadings[name]) if name in lamps else lamp
+        for name, one in by_mirror.items():
+            found[name] = with_intensity(one, shadings[name]) if name in found else one
         stage.figures.update(
             highlights=len(glints),
             highlights_rms_px=rms,
             saturated_highlights=sum(g.highlight.saturated for g in glints),
             mirror_centres=centres.tolist(),
         )
-        for name in {g.light for g in glints} - set(lamps):
+        for name in {g.light for g in glints} - set(found):
             undetermined[name] = (
                 "its highlights tell its direction but not its distance: shoot the mirror sphere "
                 "in more places, or a diffuse one"
             )
     for name in names:
-        if name not in lamps:
+        if name not in found:
             undetermined.setdefault(name, "no sphere was shot under it alone")
-        elif lamps[name].intensity_deviation is None:
+        elif found[name].intensity_deviation is None:
             undetermined[name] = "intensity: only mirrors showed it; kept as nominal"
     stage.figures.update(
-        calibrated=len(lamps),
-        position_deviation_mm={k: 1e3 * v.deviation for k, v in lamps.items()},
-        intensity_deviation={k: v.intensity_deviation for k, v in lamps.items()},
+        calibrated=len(found),
+        position_deviation_mm={k: 1e3 * v.deviation for k, v in found.items()},
+        intensity_deviation={k: v.intensity_deviation for k, v in found.items()},
         undetermined=undetermined,
     )
-    return tuple(lamps[x.name].light if x.name in lamps else x for x in nominal.lights)
+    return tuple(found[x.name].light if x.name in found else x for x in nominal.lights)

@@ -1,4 +1,4 @@
-"""Lamps from highlights on mirror spheres, with what was known of them before.
+"""Lights from highlights on mirror spheres, with what was known of them before.
 
 A highlight is a direction from the sphere, sharp but with the base line of the spheres alone for a
 distance. The shading of diffuse spheres (`shading`) knows distances; its answers, with their
@@ -26,7 +26,7 @@ SAME_PLACE = np.radians(0.5)  # between rays that are to cross
 
 @dataclass(frozen=True, eq=False)
 class Glint:
-    """`highlight` of the lamp `light` that `camera` sees on mirror sphere number `sphere`."""
+    """`highlight` of `light` that `camera` sees on mirror sphere number `sphere`."""
 
     light: str
     camera: Camera
@@ -35,10 +35,10 @@ class Glint:
 
 
 @dataclass(frozen=True, eq=False)
-class Lamp:
+class CalibratedLight:
     """A calibrated `light` with the `covariance (3, 3)` of its position, m².
 
-    `intensity_deviation` is relative; None where only mirrors showed the lamp and the intensity
+    `intensity_deviation` is relative; None where only mirrors showed the light and the intensity
     is nominal.
     """
 
@@ -52,16 +52,16 @@ class Lamp:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
 
-def mirrored_lamps(
+def mirrored_lights(
     nominal: Mapping[str, Light],
     glints: Sequence[Glint],
     radius: float,
-    known: Mapping[str, Lamp],
-) -> tuple[dict[str, Lamp], Array, float]:
-    """Lamps from highlights on mirror spheres of `radius`; `known` is what shading said of them.
+    known: Mapping[str, CalibratedLight],
+) -> tuple[dict[str, CalibratedLight], Array, float]:
+    """Lights from highlights on mirror spheres of `radius`; `known` is what shading said of them.
 
-    Solves for all lamps and the spheres' centres at once, by reprojection of the highlights.
-    Returns lamps whose position is found to `LOOSE`, the centres `(S, 3)`, and the highlights' rms
+    Solves for all lights and the spheres' centres at once, by reprojection of the highlights.
+    Returns lights whose position is found to `LOOSE`, the centres `(S, 3)`, and the highlights' rms
     in pixels.
 
     Raises `CalibrationError` where a sphere cannot be placed: fewer than two viewpoints.
@@ -69,7 +69,7 @@ def mirrored_lamps(
     names = sorted({g.light for g in glints})
     spheres = 1 + max(g.sphere for g in glints)
     centres = np.array([_place(glints, s, radius) for s in range(spheres)])
-    lamp = np.array([names.index(g.light) for g in glints])
+    which = np.array([names.index(g.light) for g in glints])
     sphere = np.array([g.sphere for g in glints])
     pixel = np.array([g.highlight.pixel for g in glints])
     error = np.array([g.highlight.deviation for g in glints])
@@ -80,14 +80,14 @@ def mirrored_lamps(
     count = 3 * len(names)
 
     def residual(x: Array) -> Array:
-        lamps, centre = x[:count].reshape(-1, 3)[lamp], x[count:].reshape(-1, 3)[sphere]
-        at = mirrored(eyes, lamps, centre, radius)
+        place, centre = x[:count].reshape(-1, 3)[which], x[count:].reshape(-1, 3)[sphere]
+        at = mirrored(eyes, place, centre, radius)
         out = np.empty((len(glints), 2))
         for name, k in of.items():
             out[k] = (cameras[name].project(at[k])[0] - pixel[k]) / error[k, None]
         return out.ravel()
 
-    # what shading knew: rows that weigh a lamp's change by the root of its information
+    # what shading knew: rows that weigh a light's change by the root of its information
     priors = [
         (k, known[n].light.position, np.linalg.cholesky(np.linalg.inv(known[n].covariance)).T)
         for k, n in enumerate(names)
@@ -98,8 +98,8 @@ def mirrored_lamps(
         r, h = residual(x), 1e-6
         row = np.arange(2 * len(glints))
         entries = []
-        # no highlight shares its lamp or sphere with another's parameters: step them all at once
-        for owner, offset, size in ((lamp, 0, count), (sphere, count, len(x) - count)):
+        # no highlight shares its light or sphere with another's parameters: step them all at once
+        for owner, offset, size in ((which, 0, count), (sphere, count, len(x) - count)):
             for axis in range(3):
                 step = np.zeros_like(x)
                 step[offset + axis : offset + size : 3] = h
@@ -114,39 +114,39 @@ def mirrored_lamps(
         return np.concatenate([r, *rest]), sparse.csr_array((value, (rows, columns)), shape=shape)
 
     solution = minimise(function, np.concatenate([start.ravel(), centres.ravel()]))
-    return _lamps(nominal, known, names, solution, glints)
+    return _calibrated(nominal, known, names, solution, glints)
 
 
-def _lamps(
+def _calibrated(
     nominal: Mapping[str, Light],
-    known: Mapping[str, Lamp],
+    known: Mapping[str, CalibratedLight],
     names: Sequence[str],
     solution: Solution,
     glints: Sequence[Glint],
-) -> tuple[dict[str, Lamp], Array, float]:
+) -> tuple[dict[str, CalibratedLight], Array, float]:
     out = {}
     centres = solution.x[3 * len(names) :].reshape(-1, 3)
     for k, name in enumerate(names):
         at = np.arange(3 * k, 3 * k + 3)
         before = known.get(name)
         light = before.light if before else nominal[name]
-        lamp = Lamp(
+        calibrated = CalibratedLight(
             replace(light, position=solution.x[at]),
             solution.covariance[np.ix_(at, at)],
             before.intensity_deviation if before else None,
         )
-        distance = np.linalg.norm(lamp.light.position - centres.mean(axis=0))
-        if lamp.deviation < LOOSE * distance:
-            out[name] = lamp
+        distance = np.linalg.norm(calibrated.light.position - centres.mean(axis=0))
+        if calibrated.deviation < LOOSE * distance:
+            out[name] = calibrated
     pixels = solution.residual[: 2 * len(glints)].reshape(-1, 2)
     pixels = pixels * np.array([g.highlight.deviation for g in glints])[:, None]
     return out, centres, float(np.sqrt((pixels**2).sum(axis=1).mean()))
 
 
 def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:
-    """About where a mirror sphere is: a far lamp's image stands half a radius before its centre.
+    """About where a mirror sphere is: a far light's image stands half a radius before its centre.
 
-    So the crossings of the rays to each lamp's highlight lie on a sphere of half the radius.
+    So the crossings of the rays to each light's highlight lie on a sphere of half the radius.
     """
     images = []
     widest = 0.0
@@ -162,7 +162,7 @@ def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:
     if not images:
         who = sorted({g.camera.name for g in mine})
         raise CalibrationError(
-            f"mirror sphere {sphere + 1}: no lamp's highlight is seen from two places ({who}, "
+            f"mirror sphere {sphere + 1}: no light's highlight is seen from two places ({who}, "
             f"{np.degrees(widest):.2g}° apart at most): a second camera must see it"
         )
     v = np.array(images)
@@ -177,7 +177,7 @@ def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:
 
 def _begin(
     nominal: Mapping[str, Light],
-    known: Mapping[str, Lamp],
+    known: Mapping[str, CalibratedLight],
     names: Sequence[str],
     glints: Sequence[Glint],
     centres: Array,

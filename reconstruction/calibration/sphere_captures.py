@@ -1,4 +1,4 @@
-"""What captures of spheres say of each lamp: shading samples and highlights."""
+"""What captures of spheres say of each light: shading samples and highlights."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.calibration_error import CalibrationError
-from reconstruction.calibration.light_response import lamp_response
+from reconstruction.calibration.light_response import light_response
 from reconstruction.calibration.shading import Shading
 from reconstruction.calibration.solve_lights import Glint
 from reconstruction.calibration.spheres import find_highlight, find_outline, sphere_centre
@@ -30,7 +30,7 @@ def gather_shading(
     albedo: float,
     lights: Sequence[str],
 ) -> dict[str, Shading]:
-    """Samples of a diffuse sphere in the places of `captures`, by lamp; `radius` in metres.
+    """Samples of a diffuse sphere in the places of `captures`, by light; `radius` in metres.
 
     The sphere's place is found from its outline in the lit frames. Raises `CalibrationError` where
     a capture shows none.
@@ -55,7 +55,7 @@ def gather_shading(
             for name in lights if len(pixels) else ():
                 if not capture.has_light(name, c.name):
                     continue
-                image, saturated = lamp_response(capture, name, c.name)
+                image, saturated = light_response(capture, name, c.name)
                 x, y = pixels.T
                 ok = ~saturated[y, x]
                 values = image[y, x][ok].astype(np.float64)
@@ -71,7 +71,7 @@ def gather_shading(
     if not out:
         raise CalibrationError(
             f"diffuse sphere: none of {[str(c.path) for c in captures]} holds frames of single "
-            "lamps (OLAT)"
+            "lights (OLAT)"
         )
     return out
 
@@ -79,14 +79,14 @@ def gather_shading(
 def glints_of(
     captures: Sequence[Capture], cameras: Sequence[Camera], lights: Sequence[str]
 ) -> list[Glint]:
-    """Highlights on a mirror sphere in the places of `captures`, of every camera and lamp."""
+    """Highlights on a mirror sphere in the places of `captures`, of every camera and light."""
     out = []
     for number, capture in enumerate(captures):
         for c in cameras:
             for name in lights:
                 if not capture.has_light(name, c.name):
                     continue
-                image, saturated = lamp_response(capture, name, c.name)
+                image, saturated = light_response(capture, name, c.name)
                 highlight = find_highlight(image.mean(axis=-1), saturated)
                 if highlight is not None:
                     out.append(Glint(name, c, number, highlight))

@@ -20,7 +20,7 @@ SPOT = 0.3  # pixels: a highlight within one pixel, anywhere in it
 
 @dataclass(frozen=True, eq=False)
 class Highlight:
-    """A lamp's mirror image: its centre `pixel (2,)`, and `deviation` of it in pixels."""
+    """A light's mirror image: its centre `pixel (2,)`, and `deviation` of it in pixels."""
 
     pixel: Array
     deviation: float
@@ -123,16 +123,16 @@ def find_highlight(image: AnyFloats, saturated: Bools) -> Highlight | None:
     return Highlight(centre, float(max(deviation, 0.05)), clipped)
 
 
-def mirrored(eyes: Array, lamps: Array, centres: Array, radius: float) -> Array:
-    """Points `(N, 3)` of mirror spheres at `centres` where `eyes` see `lamps` (all `(N, 3)`).
+def mirrored(eyes: Array, lights: Array, centres: Array, radius: float) -> Array:
+    """Points `(N, 3)` of mirror spheres at `centres` where `eyes` see `lights` (all `(N, 3)`).
 
-    The normal halves the angle between the ways to eye and lamp: iterated, each round is nearer by
-    about radius / distance. A lamp behind the sphere gives a point beyond the rim.
+    The normal halves the angle between the ways to eye and light: iterated, each round is nearer by
+    about radius / distance. A light behind the sphere gives a point beyond the rim.
     """
-    n = _unit(_unit(eyes - centres) + _unit(lamps - centres))
+    n = _unit(_unit(eyes - centres) + _unit(lights - centres))
     for _ in range(40):
         at = centres + radius * n
-        n = _unit(_unit(eyes - at) + _unit(lamps - at))
+        n = _unit(_unit(eyes - at) + _unit(lights - at))
     return np.asarray(centres + radius * n)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,8 +72,3 @@ def nearest_views(views: Sequence[View], subject: ArrayLike, count: int) -> list
     return [
         [int(k) for k in row if k != c and cosine[c, k] > 0][:count] for c, row in enumerate(order)
     ]
-
-
-def by_name(views: Sequence[View]) -> Mapping[str, View]:
-    """The views by their camera's name."""
-    return {v.camera.name: v for v in views}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -38,17 +37,6 @@ class Segments:
             self.confidence[which],
             self.view[which],
             self.supports[which],
-        )
-
-    def save(self, path: str | Path) -> None:
-        """Write an `.npz` with the fields' names."""
-        np.savez_compressed(
-            path,
-            points=self.points.astype(np.float32),
-            directions=self.directions.astype(np.float32),
-            confidence=self.confidence.astype(np.float32),
-            view=self.view.astype(np.int16),
-            supports=self.supports.astype(np.int16),
         )
 
 

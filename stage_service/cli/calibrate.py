@@ -26,7 +26,7 @@ def add(commands: Commands) -> None:
         run_rig,
         "a rig file from captures of a board and of spheres",
         "Calibrate cameras (and, where the captures hold sweeps, projectors) from captures of a "
-        "ChArUco board, one a pose, and lamps from captures of a mirror or diffuse sphere, one a "
+        "ChArUco board, one a pose, and lights from captures of a mirror or diffuse sphere, one a "
         "place. Writes a rig file with the nominal one's device tables, and beside it "
         "NAME.report.json: what is known how well, and what no capture determined.",
     )
@@ -37,7 +37,7 @@ def add(commands: Commands) -> None:
     rig.add_argument("--diffuse", type=Path, nargs="+", default=[], metavar="CAPTURE")
     rig.add_argument("--mirror-radius-mm", type=float, default=50.0)
     rig.add_argument("--diffuse-radius-mm", type=float, default=50.0)
-    rig.add_argument("--diffuse-albedo", type=float, default=0.8, help="scales all lamps")
+    rig.add_argument("--diffuse-albedo", type=float, default=0.8, help="scales all lights")
     rig.add_argument(
         "--paper-albedo", type=float, help="of the board; without it projectors stay as strong"
     )
@@ -69,7 +69,7 @@ def _board(args: argparse.Namespace) -> Any:
 def run_rig(args: argparse.Namespace, output: Output) -> int:
     """Calibrate a stage."""
     from reconstruction.calibration.rig_comparison import compare_rigs
-    from reconstruction.calibration.solve import Targets, calibrate
+    from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
     from reconstruction.capture.folder import Capture
     from reconstruction.geometry.rig import Rig
     from stage_service.config import load_rig_file
@@ -98,10 +98,12 @@ def run_rig(args: argparse.Namespace, output: Output) -> int:
     with progress_bar("calibrate") as progress:
         rig, report = calibrate(
             nominal,
-            boards,
+            TargetCaptures(
+                boards,
+                [Capture(p) for p in args.mirror],
+                [Capture(p) for p in args.diffuse],
+            ),
             targets,
-            mirrors=[Capture(p) for p in args.mirror],
-            diffuse=[Capture(p) for p in args.diffuse],
             keep_lens=args.keep_lens,
             progress=progress,
         )

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from benchmarks.light_planes.growth_study import compare_growth
 from benchmarks.light_planes.motion_errors import motion_errors, true_motion
+from benchmarks.light_planes.solver_study import compare_solvers
 from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangulation
 from benchmarks.pictures import picture_model, picture_motion
 from benchmarks.results import save
@@ -17,7 +18,6 @@ from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture
 from reconstruction.growth.field import field_system, solve_field
 from reconstruction.growth.hair_envelope import build_envelope
-from reconstruction.growth.laplace import compare_solvers
 from reconstruction.head.scalp import find_scalp, sample_roots
 from reconstruction.light_planes import (
     Motion,

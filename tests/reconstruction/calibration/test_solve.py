@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from reconstruction.calibration.calibration_error import CalibrationError
-from reconstruction.calibration.solve import calibrate
+from reconstruction.calibration.solve import TargetCaptures, calibrate
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.rig import Rig
 from stage_service.cli import main
@@ -37,21 +37,23 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
         assert camera["reprojection_px"][0] < 0.3, name
         assert camera["centre_mm"] < 2.0, name
     assert errors["projectors"]["beam"]["plane_mm"] < 1.0
-    for name, lamp in errors["lamps"].items():
-        assert lamp["position"] < 0.01, name
-        assert lamp["intensity"] < 0.02, name
+    for name, light in errors["lights"].items():
+        assert light["position"] < 0.01, name
+        assert light["intensity"] < 0.02, name
     report = json.loads(out.with_suffix(".report.json").read_text())
-    assert [s["name"] for s in report["stages"]] == ["cameras", "projectors", "lamps"]
+    assert [s["name"] for s in report["stages"]] == ["cameras", "projectors", "lights"]
     assert "rows say nothing" in said["stages"]["projectors"]["undetermined"]["beam"]
-    assert said["stages"]["lamps"]["undetermined"] == {}
+    assert said["stages"]["lights"]["undetermined"] == {}
 
 
 def test_what_no_capture_shows_stays_nominal_and_is_listed(
     nominal_rig: Rig, board_captures: list[Capture]
 ) -> None:
-    rig, report = calibrate(nominal_rig, board_captures[3:] + board_captures[3:4], keep_lens=True)
+    rig, report = calibrate(
+        nominal_rig, TargetCaptures(board_captures[3:] + board_captures[3:4]), keep_lens=True
+    )
     assert rig.lights == nominal_rig.lights
-    assert set(report["lamps"].figures["undetermined"]) == {x.name for x in nominal_rig.lights}
+    assert set(report["lights"].figures["undetermined"]) == {x.name for x in nominal_rig.lights}
     assert rig.projectors == nominal_rig.projectors
     assert "0 points" in report["projectors"].figures["undetermined"]["beam"]
 
@@ -60,7 +62,7 @@ def test_a_capture_without_the_board_is_an_error(
     nominal_rig: Rig, diffuse_captures: list[Capture]
 ) -> None:
     with pytest.raises(CalibrationError, match="in 0 of the captures"):
-        calibrate(nominal_rig, diffuse_captures)
+        calibrate(nominal_rig, TargetCaptures(diffuse_captures))
 
 
 def test_the_board_can_be_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

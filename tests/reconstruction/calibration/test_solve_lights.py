@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from reconstruction.calibration.calibration_error import CalibrationError
-from reconstruction.calibration.shading import Shading, refine_centres, shaded_lamp
-from reconstruction.calibration.solve_lights import Glint, mirrored_lamps
+from reconstruction.calibration.shading import Shading, refine_centres, shaded_light
+from reconstruction.calibration.solve_lights import Glint, mirrored_lights
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
 from reconstruction.calibration.spheres import find_highlight, mirrored
 from reconstruction.capture.folder import Capture
@@ -42,11 +42,11 @@ def test_shading_gives_position_to_one_and_intensity_to_two_percent(
     true_rig: Rig, nominal_rig: Rig, shadings: dict[str, Shading]
 ) -> None:
     for true in true_rig.lights:
-        lamp = shaded_lamp(nominal_rig.light(true.name), shadings[true.name])
-        off = float(np.linalg.norm(lamp.light.position - true.position))
+        light = shaded_light(nominal_rig.light(true.name), shadings[true.name])
+        off = float(np.linalg.norm(light.light.position - true.position))
         assert off < 0.01 * 1.2, true.name
-        assert off < 4 * lamp.deviation, true.name
-        assert lamp.light.intensity == pytest.approx(true.intensity, rel=0.02)
+        assert off < 4 * light.deviation, true.name
+        assert light.light.intensity == pytest.approx(true.intensity, rel=0.02)
 
 
 def test_shading_corrects_where_outlines_put_the_sphere(
@@ -62,18 +62,18 @@ def test_a_mirror_sharpens_what_shading_says(
     true_rig: Rig, nominal_rig: Rig, shadings: dict[str, Shading], glints: list[Glint]
 ) -> None:
     nominal = {x.name: x for x in nominal_rig.lights}
-    known = {n: shaded_lamp(nominal[n], s) for n, s in shadings.items()}
-    lamps, centres, rms = mirrored_lamps(nominal, glints, 0.05, known)
+    known = {n: shaded_light(nominal[n], s) for n, s in shadings.items()}
+    lights, centres, rms = mirrored_lights(nominal, glints, 0.05, known)
     assert len(glints) == 2 * 3 * 4
     assert rms < 0.5
     assert np.linalg.norm(centres[0] - (0.0, 0.01, 0.02)) < 1e-3
     for true in true_rig.lights:
-        lamp = lamps[true.name]
-        assert np.linalg.norm(lamp.light.position - true.position) < 0.01 * 1.2
-        assert lamp.deviation <= 1.1 * known[true.name].deviation
+        light = lights[true.name]
+        assert np.linalg.norm(light.light.position - true.position) < 0.01 * 1.2
+        assert light.deviation <= 1.1 * known[true.name].deviation
 
 
-def test_a_mirror_alone_says_where_lamps_are_when_its_places_are_wide_apart(
+def test_a_mirror_alone_says_where_lights_are_when_its_places_are_wide_apart(
     true_rig: Rig, nominal_rig: Rig
 ) -> None:
     rng = np.random.default_rng(0)
@@ -91,18 +91,18 @@ def test_a_mirror_alone_says_where_lamps_are_when_its_places_are_wide_apart(
                 spot = replace(spot, pixel=pixel, deviation=0.05)
                 seen.append(Glint(light.name, camera, k, spot))
     nominal = {x.name: x for x in nominal_rig.lights}
-    lamps, _, _ = mirrored_lamps(nominal, seen, 0.05, {})
+    lights, _, _ = mirrored_lights(nominal, seen, 0.05, {})
     for true in true_rig.lights:
-        assert np.linalg.norm(lamps[true.name].light.position - true.position) < 0.01 * 1.2
-        assert lamps[true.name].intensity_deviation is None
+        assert np.linalg.norm(lights[true.name].light.position - true.position) < 0.01 * 1.2
+        assert lights[true.name].intensity_deviation is None
 
 
 def test_one_place_seen_by_one_pixel_leaves_the_distance_open(
     nominal_rig: Rig, glints: list[Glint]
 ) -> None:
     one = [g for g in glints if g.sphere == 0]
-    lamps, _, _ = mirrored_lamps({x.name: x for x in nominal_rig.lights}, one, 0.05, {})
-    assert lamps == {}
+    lights, _, _ = mirrored_lights({x.name: x for x in nominal_rig.lights}, one, 0.05, {})
+    assert lights == {}
 
 
 def test_cameras_in_one_place_cannot_say_where_a_mirror_is(
@@ -110,8 +110,10 @@ def test_cameras_in_one_place_cannot_say_where_a_mirror_is(
 ) -> None:
     own = [g for g in glints if g.camera.name == "cam_0"]
     twice = own + [replace(g, camera=replace(g.camera, name="copy")) for g in own]
-    with pytest.raises(CalibrationError, match="mirror sphere 1: no lamp's highlight is seen from"):
-        mirrored_lamps({x.name: x for x in nominal_rig.lights}, twice, 0.05, {})
+    with pytest.raises(
+        CalibrationError, match="mirror sphere 1: no light's highlight is seen from"
+    ):
+        mirrored_lights({x.name: x for x in nominal_rig.lights}, twice, 0.05, {})
 
 
 def test_a_saturated_highlight_is_told_and_weighs_less() -> None:
@@ -126,13 +128,13 @@ def test_a_saturated_highlight_is_told_and_weighs_less() -> None:
     assert spot.deviation > 5 * sharp.deviation
 
 
-def test_a_lamp_behind_the_sphere_is_an_error_that_says_so(
+def test_a_light_behind_the_sphere_is_an_error_that_says_so(
     true_rig: Rig, nominal_rig: Rig, shadings: dict[str, Shading]
 ) -> None:
     dark = shadings["lamp_0"]
     dark = replace(dark, radiance=np.zeros_like(dark.radiance))
-    with pytest.raises(CalibrationError, match=r"lamp lamp_0: 0 pixels .* behind the sphere"):
-        shaded_lamp(nominal_rig.light("lamp_0"), dark)
+    with pytest.raises(CalibrationError, match=r"light lamp_0: 0 pixels .* behind the sphere"):
+        shaded_light(nominal_rig.light("lamp_0"), dark)
 
 
 def test_light_that_dark_frames_hold_does_no_harm(
@@ -147,23 +149,23 @@ def test_light_that_dark_frames_hold_does_no_harm(
     capture = shoot_prop(prop, steps, ambient=0.3)  # type: ignore[operator]
     found = gather_shading([capture], true_rig.cameras, 0.06, 0.8, ["lamp_1"])
     shading = refine_centres({"lamp_1": nominal_rig.light("lamp_1")}, found)["lamp_1"]
-    lamp = shaded_lamp(nominal_rig.light("lamp_1"), shading)
+    light = shaded_light(nominal_rig.light("lamp_1"), shading)
     true = true_rig.light("lamp_1")
-    assert np.linalg.norm(lamp.light.position - true.position) < 0.02 * 1.2
-    assert lamp.light.intensity == pytest.approx(true.intensity, rel=0.03)
+    assert np.linalg.norm(light.light.position - true.position) < 0.02 * 1.2
+    assert light.light.intensity == pytest.approx(true.intensity, rel=0.03)
 
 
 def test_mirrors_reflect_at_equal_angles_in_estimate_and_simulation() -> None:
     rng = np.random.default_rng(3)
     eye, centre = np.array((0.9, 0.1, 0.0)), np.array((0.02, 0.0, 0.01))
-    lamps = rng.standard_normal((50, 3))
-    lamps *= 1.2 / np.linalg.norm(lamps, axis=1, keepdims=True)
-    shown = reflection(eye, lamps, centre, 0.05)
+    lights = rng.standard_normal((50, 3))
+    lights *= 1.2 / np.linalg.norm(lights, axis=1, keepdims=True)
+    shown = reflection(eye, lights, centre, 0.05)
     visible = np.isfinite(shown).all(axis=1)
     assert visible.sum() > 30
     n = (shown - centre)[visible] / 0.05
     to_eye, to_lamp = (
-        v / np.linalg.norm(v, axis=1, keepdims=True) for v in (eye - shown, lamps - shown)
+        v / np.linalg.norm(v, axis=1, keepdims=True) for v in (eye - shown, lights - shown)
     )
     cosines = [(n * v[visible]).sum(axis=1) for v in (to_eye, to_lamp)]
     assert cosines[0] == pytest.approx(cosines[1], abs=1e-9)
@@ -171,4 +173,4 @@ def test_mirrors_reflect_at_equal_angles_in_estimate_and_simulation() -> None:
     steep[visible] = cosines[0] > 0.15
     count = int(steep.sum())
     eyes, centres = (np.broadcast_to(v, (count, 3)) for v in (eye, centre))
-    assert mirrored(eyes, lamps[steep], centres, 0.05) == pytest.approx(shown[steep], abs=1e-7)
+    assert mirrored(eyes, lights[steep], centres, 0.05) == pytest.approx(shown[steep], abs=1e-7)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.light_planes.solver_study import compare_solvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -15,7 +16,6 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import gather, principal, solve_field, to_tensors
 from reconstruction.growth.laplace import (
     Multigrid,
-    compare_solvers,
     conjugate_gradients,
     explicit_diffusion,
     grid_laplacian,
