@@ -24,7 +24,7 @@ def picture_model(
 ) -> None:
     """Four panels as one PNG at `path`, of the capture's second camera.
 
-    Its photograph under all lamps, the triangulated points by depth, the strands drawn over the
+    Its photograph under all lights, the triangulated points by depth, the strands drawn over the
     photograph by direction, and the directions in the plane x = 0: |x|, |y|, |z| of a tangent are
     its red, green and blue. At most `most` strands are drawn.
     """
@@ -45,7 +45,7 @@ def picture_model(
         *strands.points[slab][:, 1:].T * 1e3, c=np.clip(tangents[slab], 0, 1), s=1, linewidths=0
     )
     panels[3].set(aspect="equal", xlabel="y, mm", ylabel="z, mm")
-    titles = ("under all lamps", "points by depth", "strands by direction", "slice x = 0")
+    titles = ("under all lights", "points by depth", "strands by direction", "slice x = 0")
     for axes, title in zip(panels, titles, strict=True):
         axes.set_title(title, loc="left", fontsize=10)
     for axes in panels[:3]:

@@ -67,16 +67,16 @@ def run_bench(
     captured: Captured | None = None
     for name in SUBJECTS:
         captured = known_subject(name, subject, rig, seed, captured)
-        rows = Table(captured, options, progress=within(progress, f"({name})"), seed=seed).run()
-        result["subjects"][name] = rows
+        variants = Table(captured, options, progress=within(progress, f"({name})"), seed=seed).run()
+        result["subjects"][name] = variants
         _write(out, result)
         if name == "a":
             result["recovery"] = recovery(
-                captured, rows, options, within(progress, f"({name})"), seed
+                captured, variants, options, within(progress, f"({name})"), seed
             )
             result["starts"] = from_afar(captured, options, within(progress, f"({name})"), seed)
         if name == "b":
-            found = [_final(rows)]
+            found = [_final(variants)]
             for k in range(1, seeds):
                 table = Table(
                     captured, options, progress=within(progress, f"({name})"), seed=seed + k
@@ -97,14 +97,14 @@ def _write(out: Path, result: dict[str, Any]) -> None:
 
 def recovery(
     captured: Captured,
-    rows: dict[str, dict[str, Any]],
+    variants: dict[str, dict[str, Any]],
     options: InverseRenderingOptions,
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """What is recovered from frames with noise, and with lights 2 mm and 3 % off their calibration.
 
-    `rows` are those of the table of the frames as they are. The variant "original" (lights
+    `variants` are those of the table of the frames as they are. The variant "original" (lights
     as calibrated) and, with lights off, "lights" (lights fitted too).
     """
     rng = np.random.default_rng([seed, 9])
@@ -130,7 +130,7 @@ def recovery(
         )
         for o in captured.views
     ]
-    out = {"as captured": _recovered(rows)}
+    out = {"as captured": _recovered(variants)}
     name = "noise of 2 % of white and 500 electrons at white"
     table = Table(
         replace(captured, views=tuple(noisy)),
@@ -178,11 +178,11 @@ def from_afar(
     return out
 
 
-def _recovered(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _recovered(variants: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     wanted = ("beta_m_error", "beta_n_error", "sigma_a_error")
     return {
-        name: {"psnr_clean": row[GROUPS[1]]["psnr_clean"], **{k: row[k] for k in wanted}}
-        for name, row in rows.items()
+        name: {"psnr_clean": variant[GROUPS[1]]["psnr_clean"], **{k: variant[k] for k in wanted}}
+        for name, variant in variants.items()
         if name in ("HairInverse", "original", "lights")
     }
 
@@ -241,7 +241,7 @@ def error_against_time(
         curve = []
         for seconds, maps in points:
             table.score_maps("now", maps, captured.mapped, seconds)
-            psnr_clean = table.rows["now"][GROUPS[1]]["psnr_clean"]
+            psnr_clean = table.variants["now"][GROUPS[1]]["psnr_clean"]
             curve.append({"cpu_seconds": seconds, "psnr_clean": psnr_clean})
         curves[name] = curve
     return curves
@@ -260,8 +260,8 @@ def _into(points: list[tuple[float, HairMaps]]) -> Callable[[float, HairMaps], N
     return lambda seconds, maps: points.append((seconds, maps))
 
 
-def _final(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
-    return {name: row[GROUPS[1]]["psnr_clean"] for name, row in rows.items()}
+def _final(variants: dict[str, dict[str, Any]]) -> dict[str, float]:
+    return {name: variant[GROUPS[1]]["psnr_clean"] for name, variant in variants.items()}
 
 
 def report(result: dict[str, Any]) -> str:
@@ -279,28 +279,30 @@ def report(result: dict[str, Any]) -> str:
     ]
     errors = ("beta_m_error", "beta_n_error", "sigma_a_error")
     lines = []
-    for name, rows in result["subjects"].items():
+    for name, variants in result["subjects"].items():
         cells = []
-        for row, figures in rows.items():
+        for variant, figures in variants.items():
             held, train = figures[GROUPS[1]], figures[GROUPS[0]]
             scores = [f"{held['psnr_clean']:.2f}", f"{held['psnr']:.2f}", f"{held['ssim']:.3f}"]
             off = [f"{100 * figures[k]:+.1f} %" if k in figures else "" for k in errors]
             seconds = f"{figures.get('seconds', 0):.0f}"
-            cells.append([row, *scores, f"{train['psnr_clean']:.2f}", *off, seconds])
+            cells.append([variant, *scores, f"{train['psnr_clean']:.2f}", *off, seconds])
         lines += [f"## Subject ({name})", "", markdown(head, cells)]
     for name, found in result.get("seeds", {}).items():
         sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
         lines.append(f"- (b), {name}: {found['mean']:.2f}{sd} dB over {found['seeds']} seeds")
-    for case, rows in result.get("recovery", {}).items():
-        for row, found in rows.items():
+    for case, variants in result.get("recovery", {}).items():
+        for variant, found in variants.items():
             off = found.get("lights_off")
             lights = "" if off is None else f", lights {100 * off:.1f} % off"
-            lines.append(f"- {case}, {row}: {found['psnr_clean']:.2f} dB, {_off(found)}{lights}")
-    for row in result.get("starts", []):
-        start = row["start"]
+            lines.append(
+                f"- {case}, {variant}: {found['psnr_clean']:.2f} dB, {_off(found)}{lights}"
+            )
+    for variant in result.get("starts", []):
+        start = variant["start"]
         lines.append(
             f"- from β_M {start['beta_m']:g}, β_N {start['beta_n']:g}, η {start['eta']:g}: "
-            f"{_off(row)}, η {row['eta']:.3f}, {row['cpu_seconds']:.0f} CPU s"
+            f"{_off(variant)}, η {variant['eta']:.3f}, {variant['cpu_seconds']:.0f} CPU s"
         )
     for name, curve in result.get("time", {}).items():
         points = ", ".join(f"{p['cpu_seconds']:.0f} s: {p['psnr_clean']:.2f}" for p in curve)

@@ -31,7 +31,7 @@ TRUTH = "truth, fresh numbers"
 
 
 class Table:
-    """All rows of one subject; each fit starts from the last."""
+    """All variants of one subject, and baselines; each fit starts from the last."""
 
     def __init__(
         self,
@@ -45,10 +45,10 @@ class Table:
         self.captured, self.options = captured, options
         self.progress, self.seed = progress, seed
         self.training = captured.training(lights)
-        self.rows: dict[str, dict[str, Any]] = {}
+        self.variants: dict[str, dict[str, Any]] = {}
 
-    def run(self, rows: Sequence[Variant] = tuple(VARIANTS)) -> dict[str, dict[str, Any]]:
-        """Baselines, then `rows`, then the truth itself."""
+    def run(self, variants: Sequence[Variant] = tuple(VARIANTS)) -> dict[str, dict[str, Any]]:
+        """Baselines, then `variants`, then the truth itself."""
         captured = self.captured
         colour = np.mean([o.radiance.mean((0, 1)) for o in self.training], axis=0)
         views, pairs = captured.views, self._truth()
@@ -71,23 +71,23 @@ class Table:
         )
         maps = HairMaps.of(hair)
         self.score_maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
-        self.rows["HairInverse"]["warnings"] = stage.warnings
+        self.variants["HairInverse"]["warnings"] = stage.warnings
         lights = None
         problem = Problem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
-        for row in rows:
+        for variant in variants:
             begun = time.perf_counter()
-            self.progress(row, 0.0)
+            self.progress(variant, 0.0)
             found = run(
                 problem,
                 maps,
                 lights,
-                options=replace(self.options, variant=row),
+                options=replace(self.options, variant=variant),
                 seed=self.seed,
-                monitor=Monitor(within(self.progress, f"({row})")),
+                monitor=Monitor(within(self.progress, f"({variant})")),
             )
             maps, lights = found.maps, found.lights
-            self.score_maps(row, maps, captured.mapped, time.perf_counter() - begun)
-            self.rows[row] |= {
+            self.score_maps(variant, maps, captured.mapped, time.perf_counter() - begun)
+            self.variants[variant] |= {
                 "ended": found.ended,
                 "steps": found.steps,
                 "gain_spread": float(found.lights.gain.std()),
@@ -95,14 +95,16 @@ class Table:
             }
         self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
         self.found = maps, lights or LightDeviations.calibrated(len(self.training[0].lights))
-        return self.rows
+        return self.variants
 
     def _truth(self) -> list[tuple[int, int]]:
         """Numbers of the views and of the held-out lights that are compared."""
         return [(k, i) for k in range(len(self.captured.views)) for i in self.captured.held_lights]
 
-    def score_maps(self, row: str, maps: HairMaps, mapped: MappedStrands, seconds: float) -> None:
-        """Render `maps` on `mapped` with fresh random numbers and score them as `row`."""
+    def score_maps(
+        self, variant: str, maps: HairMaps, mapped: MappedStrands, seconds: float
+    ) -> None:
+        """Render `maps` on `mapped` with fresh random numbers and score them as `variant`."""
         scene = mapped.with_maps(maps).with_skin(self.captured.skin)
         held = list(self.captured.held_lights)
         pictures: list[tuple[Array, Array]] = []
@@ -120,9 +122,9 @@ class Table:
                 for h in (0, 1)
             )
             pictures += list(zip(one, other, strict=True))
-        self._score(row, pictures)
+        self._score(variant, pictures)
         hair, true = maps.mean(), self.captured.truth.mean()
-        self.rows[row] |= {
+        self.variants[variant] |= {
             "seconds": seconds,
             "sigma_a": list(hair.sigma_a),
             "beta_m": hair.beta_m,
@@ -133,7 +135,7 @@ class Table:
             "sigma_a_error": float(np.abs(np.array(hair.sigma_a) / true.sigma_a - 1).max()),
         }
 
-    def _score(self, row: str, pictures: Sequence[tuple[Array, Array]]) -> None:
+    def _score(self, variant: str, pictures: Sequence[tuple[Array, Array]]) -> None:
         """Scores over held-out lights, in the training and in the held-out views.
 
         `pictures` are pairs of independent renderings `(P, 3)`. "psnr" and "ssim" compare their
@@ -161,7 +163,7 @@ class Table:
             mean = mean_scores(values)
             mean["psnr_clean"] = float(-10 * np.log10(max(mean.pop("clean"), 1e-5)))
             figures[group] = mean
-        self.rows[row] = figures
+        self.variants[variant] = figures
 
     def _nearest(self, o: Observed, frames: Floats, light: int) -> Array:
         """The view's own frames under the three nearest training lights, by inverse angle."""

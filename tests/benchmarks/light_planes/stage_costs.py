@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from reconstruction.capture.folder import Capture
-from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots
@@ -67,12 +66,10 @@ def of_triangulation(capture: Capture) -> list[Growth]:
     lines = np.cumsum([p.height for p in rig.projectors])
 
     def shrunk(cameras: int, projectors: int) -> None:
-        capture.rig = Rig(rig.name, rig.cameras[:cameras], rig.lights, rig.projectors[:projectors])
-        try:
-            options = TriangulateOptions(hull=False)
-            triangulate(capture, peaks=sweep_peaks(capture), options=options)
-        finally:
-            capture.rig = rig
+        part = capture.view(cameras=[c.name for c in rig.cameras[:cameras]])
+        part.rig = replace(part.rig, projectors=rig.projectors[:projectors])
+        options = TriangulateOptions(hull=False)
+        triangulate(part, peaks=sweep_peaks(part), options=options)
 
     counts = [n for n in (1, 2, 4, 8, 16) if n <= len(rig.cameras)]
     return [
@@ -121,22 +118,3 @@ def regridded(grid: VoxelGrid, spacing: float) -> VoxelGrid:
     shape = np.ceil(grid.spacing * np.array(grid.inside.shape) / spacing).astype(int)
     empty = replace(grid, origin=low + spacing / 2, spacing=spacing, inside=np.ones(shape, bool))
     return replace(empty, inside=grid.contains(empty.centers()).reshape(empty.inside.shape))
-
-
-def extrapolated(
-    growths: Sequence[Growth], stages: dict[str, float], factors: dict[str, float]
-) -> dict[str, float]:
-    """Seconds of each of `stages` (seconds now) once sizes have grown by `factors`.
-
-    A stage grows by factor ** exponent for each quantity that was measured for it, and by the
-    factor itself for `pixels`, which every stage but field and growth reads.
-    """
-    out = {}
-    for name, seconds in stages.items():
-        for growth in growths:
-            if growth.stage == name:
-                seconds *= factors.get(growth.over, 1.0) ** growth.exponent
-        if name not in ("field", "growth"):
-            seconds *= factors.get("pixels", 1.0)
-        out[name] = seconds
-    return out

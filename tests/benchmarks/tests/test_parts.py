@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.light_planes.motion_errors import PAPER_PIXELS, motion_errors, true_motion
-from benchmarks.light_planes.stage_costs import Growth, extrapolated, measure_growth, regridded
+from benchmarks.light_planes.stage_costs import Growth, measure_growth, regridded
 
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.voxels import VoxelGrid
@@ -54,11 +54,9 @@ def test_the_true_motion_is_that_of_each_tracking_pulse(
     np.testing.assert_allclose(motion.translations[:, 0], expected)
 
 
-def test_exponents_are_slopes_and_carry_over() -> None:
+def test_exponents_are_slopes() -> None:
     growth = Growth("field", "voxels", (100, 1000), (1.0, 100.0), (None, None))
     assert growth.exponent == pytest.approx(2.0)
-    later = extrapolated([growth], {"field": 3.0, "masks": 1.0}, {"voxels": 10.0, "pixels": 5.0})
-    assert later == pytest.approx({"field": 300.0, "masks": 5.0})
     sizes: list[int] = []
     measured = measure_growth("x", "y", (1, 2), sizes.append)
     assert sizes == [1, 2]
