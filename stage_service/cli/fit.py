@@ -59,13 +59,13 @@ def run(args: argparse.Namespace, output: Output) -> int:
     data: dict[str, Any] = {"model": str(model), "method": args.method}
     if not inverse or not model.has("appearance.json"):
         with progress_bar("sun") as progress:
-            fit(StepContext(args.capture, args.model, options, progress))
+            fit(StepContext(args.capture, model, options, progress))
     if inverse:
         with progress_bar("inverse") as progress:
-            data |= inverse_rendering(StepContext(args.capture, args.model, options, progress))
+            data |= inverse_rendering(StepContext(args.capture, model, options, progress))
     data["appearance"] = model.json("appearance.json")
     if options.held_out_cameras or options.held_out_lights:
         with progress_bar("assess") as progress:
-            data["images"] = assess(StepContext(args.capture, args.model, options, progress))
+            data["images"] = assess(StepContext(args.capture, model, options, progress))
     output.result(data)
     return 0

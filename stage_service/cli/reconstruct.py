@@ -35,26 +35,26 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace, output: Output) -> int:
     """Reconstruct strands."""
     from reconstruction.capture.folder import Capture
-    from reconstruction.files.strands import read_strands
-    from reconstruction.report.report import Report
+    from reconstruction.model import Model
+    from reconstruction.options import parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, reconstruct
 
-    options = JobOptions(
-        method=args.method,
-        held_out_cameras=tuple(args.hold_out_camera),
-        held_out_lights=tuple(args.hold_out_light),
-        reconstruct=read_json(args.options),
-    )
+    asked = {
+        "method": args.method,
+        "held_out_cameras": args.hold_out_camera,
+        "held_out_lights": args.hold_out_light,
+        "reconstruct": read_json(args.options),
+    }
+    options, model = parse_options(JobOptions, asked), Model(args.out)
     Capture(args.capture)
-    args.out.mkdir(parents=True, exist_ok=True)
     with progress_bar("reconstruct") as progress:
-        reconstruct(StepContext(args.capture, args.out, options, progress))
-    strands = read_strands(args.out / "strands.npz")
-    seconds = sum(stage.seconds for stage in Report.load(args.out / "report.json").stages)
-    data = {"model": str(args.out), "strands": len(strands), "points": len(strands.points)}
+        reconstruct(StepContext(args.capture, model, options, progress))
+    strands = model.strands()
+    seconds = sum(stage.seconds for stage in model.report().stages)
+    data = {"model": str(model), "strands": len(strands), "points": len(strands.points)}
     output.result(
         {**data, "seconds": seconds},
-        f"{len(strands)} strands in {args.out / 'strands.npz'} ({seconds:.0f} s)",
+        f"{len(strands)} strands in {model.file('strands.npz')} ({seconds:.0f} s)",
     )
     return 0

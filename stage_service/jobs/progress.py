@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 
+from reconstruction.model import Model
 from stage_service.jobs.records import JobProgress
 
-FILE = "progress.json"
+EVERY_S = 0.2
+"""A step's progress is written, and whether it must stop is asked, at most this often."""
 
 
 class JobInterrupted(BaseException):
@@ -27,29 +27,27 @@ class WorkerStopping(JobInterrupted):
 class StepProgress:
     """The `Progress` callback of one step: tells readers, and raises when the step must stop.
 
-    `interrupted` is asked at most every `every` seconds and returns the exception to raise, if any.
-    The file is replaced, never half written, and at most as often.
+    `interrupted` returns the exception to raise, if any.
     """
 
     def __init__(
         self,
-        folder: Path,
+        model: Model,
         job: str,
         step: str,
         steps: tuple[str, ...],
         interrupted: Callable[[], JobInterrupted | None],
         *,
-        every: float = 0.2,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._path = folder / FILE
+        self._model = model
         self._job, self._step, self._steps = job, step, steps
-        self._interrupted, self._every, self._clock = interrupted, every, clock
+        self._interrupted, self._clock = interrupted, clock
         self._last = float("-inf")
 
     def __call__(self, what: str, share: float) -> None:
         now = self._clock()
-        if now - self._last < self._every and share < 1:
+        if now - self._last < EVERY_S and share < 1:
             return
         self._last = now
         stop = self._interrupted()
@@ -64,15 +62,13 @@ class StepProgress:
             share=(done + step_share) / len(self._steps),
             step_share=step_share,
         )
-        part = self._path.with_suffix(".part")
-        part.write_text(json.dumps({"job": self._job, **progress.model_dump(mode="json")}))
-        part.replace(self._path)
+        told = {"job": self._job, **progress.model_dump(mode="json")}
+        self._model.write_json("progress.json", told)
 
 
-def read_progress(model: Path, job: str) -> JobProgress | None:
-    """What `job` last said in this model folder, or None when it said nothing there."""
-    try:
-        data = json.loads((model / FILE).read_text())
-    except FileNotFoundError:
+def read_progress(model: Model, job: str) -> JobProgress | None:
+    """What `job` last said of this model, or None where it said nothing."""
+    if not model.has("progress.json"):
         return None
+    data = model.json("progress.json")
     return JobProgress(**data) if data.pop("job") == job else None

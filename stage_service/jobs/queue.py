@@ -11,6 +11,7 @@ from typing import Any
 
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, WorkflowStatus
 
+from reconstruction.model import Model
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.progress import read_progress
 from stage_service.jobs.records import Job, JobError, JobOptions, JobOutcome, JobState
@@ -124,7 +125,7 @@ def _job(status: WorkflowStatus) -> Job:
         capture=spec["capture"],
         model=spec["model"],
         options=spec["options"],
-        progress=read_progress(Path(spec["model"]), status.workflow_id),
+        progress=read_progress(Model(spec["model"]), status.workflow_id),
         error=error,
         created=_time(status.created_at) or "",
         started=_time(status.dequeued_at),

@@ -10,6 +10,7 @@ from appearance.inverse_rendering.options import InverseRenderingRequest
 from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
 from reconstruction.methods import Method
+from reconstruction.reconstruct_options import ReconstructOptions
 from stage_service.jobs.pipelines import PIPELINES
 
 JobState = Literal["queued", "running", "done"]
@@ -35,10 +36,17 @@ class JobOptions(BaseModel):
     environment: str = "studio"
     truth: str | None = None
     seed: int = Field(default=0, ge=0)
-    reconstruct: dict[str, Any] = Field(default_factory=dict)
+    reconstruct: ReconstructOptions = Field(default_factory=ReconstructOptions)
     fit: FitOptions = Field(default_factory=FitOptions)
     inverse_rendering: InverseRenderingRequest = Field(default_factory=InverseRenderingRequest)
     assess: AssessOptions = Field(default_factory=AssessOptions)
+
+    @field_validator("reconstruct")
+    @classmethod
+    def _said_once(cls, asked: ReconstructOptions) -> ReconstructOptions:
+        if asked.held_out or asked.seed:
+            raise ValueError("held_out and seed are the job's: held_out_cameras and seed")
+        return asked
 
     def to_dict(self) -> dict[str, Any]:
         """What differs from the defaults, as JSON."""

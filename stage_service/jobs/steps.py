@@ -8,9 +8,9 @@ a crash) writes the same files again.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from reconstruction.capture.folder import Capture
 from reconstruction.model import Model
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from appearance.observations import HeldOut
 
 Figures = dict[str, Any]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class StepContext:
     """What a step works on; `previous` holds what the job's earlier steps returned, by name."""
 
     capture: Path
-    model: Path
+    model: Model
     options: JobOptions
     progress: Progress
     previous: Mapping[str, Figures] = field(default_factory=dict)
@@ -46,22 +45,14 @@ def compress(context: StepContext) -> Figures:
 
 def reconstruct(context: StepContext) -> Figures:
     """Strands from the capture: `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`."""
-    from reconstruction.model import Model
-    from reconstruction.options import parse_options
     from reconstruction.pipeline import reconstruct as run
-    from reconstruction.reconstruct_options import ReconstructOptions
 
     asked = context.options
-    options = parse_options(
-        ReconstructOptions,
-        {"held_out": asked.held_out_cameras, "seed": asked.seed, **asked.reconstruct},
-        "options.reconstruct",
-    )
+    options = replace(asked.reconstruct, held_out=asked.held_out_cameras, seed=asked.seed)
     capture = Capture(context.capture)
     left = [name for name in capture.olat_lights() if name not in asked.held_out_lights]
     capture = capture.view(lights=left)
-    model = Model(context.model)
-    run(capture, model, method=asked.method, options=options, progress=context.progress)
+    run(capture, context.model, method=asked.method, options=options, progress=context.progress)
     return {"strands": "strands.npz"}
 
 
@@ -71,7 +62,7 @@ def fit(context: StepContext) -> Figures:
 
     run(
         Capture(context.capture),
-        Model(context.model),
+        context.model,
         held_out=_held_out(context.options),
         options=context.options.fit,
         progress=context.progress,
@@ -90,7 +81,7 @@ def inverse_rendering(context: StepContext) -> Figures:
     asked = context.options
     found = run(
         Capture(context.capture),
-        Model(context.model),
+        context.model,
         held_out=_held_out(asked),
         request=asked.inverse_rendering,
         progress=context.progress,
@@ -105,7 +96,7 @@ def assess(context: StepContext) -> Figures:
 
     return run(
         Capture(context.capture),
-        Model(context.model),
+        context.model,
         held_out=_held_out(context.options),
         environment=context.options.environment,
         options=context.options.assess,
@@ -124,7 +115,7 @@ def evaluate(context: StepContext) -> Figures:
     truth = Path(context.options.truth)
     figures = evaluate_geometry(
         Capture(context.capture),
-        Model(context.model),
+        context.model,
         truth / "strands.npz" if truth.is_dir() else truth,
         held_out_cameras=context.options.held_out_cameras,
         seed=context.options.seed,
@@ -132,7 +123,7 @@ def evaluate(context: StepContext) -> Figures:
     )
     appearance = truth / "appearance.json"
     if "fit" in context.previous and appearance.is_file():
-        figures["appearance"] = evaluate_appearance(Model(context.model), appearance)
+        figures["appearance"] = evaluate_appearance(context.model, appearance)
     return figures
 
 
@@ -140,7 +131,7 @@ def results(context: StepContext) -> Figures:
     """Gather every figure of the job in `results.json`, and draw the report's plots."""
     from reconstruction.report.plots import plot_geometry, plot_report
 
-    model = Model(context.model)
+    model = context.model
     plots, report = model.file("plots"), model.report()
     plot_report(report, plots)
     done = {step: result["figures"] for step, result in context.previous.items()}
@@ -165,13 +156,6 @@ def _held_out(options: JobOptions) -> HeldOut:
     from appearance.observations import HeldOut
 
     return HeldOut(options.held_out_cameras, options.held_out_lights)
-
-
-def _options(kind: Callable[..., T], field: str, values: dict[str, Any]) -> T:
-    try:
-        return kind(**values)
-    except TypeError as error:
-        raise ValueError(f"options.{field}: {error}") from error
 
 
 STEPS: dict[str, Callable[[StepContext], Figures]] = {

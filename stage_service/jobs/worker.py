@@ -18,6 +18,7 @@ from typing import Any
 from dbos import DBOS, DBOSPortableJSONSerializer
 from dbos import error as dbos_error
 
+from reconstruction.model import Model
 from reconstruction.options import parse_options
 from stage_service.jobs.pipelines import PIPELINES, STEPS_VERSION
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, WorkerStopping
@@ -58,8 +59,7 @@ class Worker:
     def _run_step(self, spec: dict[str, Any], step: str, previous: dict[str, Any]) -> Any:
         job = DBOS.workflow_id
         assert job is not None
-        model = Path(spec["model"])
-        model.mkdir(parents=True, exist_ok=True)
+        model = Model(spec["model"]).create()
         progress = StepProgress(
             model, job, step, PIPELINES[spec["pipeline"]], lambda: self._interrupted(job)
         )

@@ -304,6 +304,12 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
     [
         ({"heldout": []}, "heldout"),
         ({"seed": -1}, "seed"),
+        ({"reconstruct": {"seed": 3}}, "reconstruct"),
+        ({"reconstruct": {"measure": {"thinn": 1}}}, "reconstruct.measure.thinn"),
+        (
+            {"reconstruct": {"measure": {"bank": {"wavelength": 1.0}}}},
+            "reconstruct.measure.bank.wavelength",
+        ),
         ({"fit": {"hair_pixel": 3}}, "fit.hair_pixel"),
         ({"inverse_rendering": {"fit": {"stepps": 3}}}, "inverse_rendering.fit.stepps"),
         (

@@ -101,6 +101,29 @@ def test_rig_check_counts_and_conditions(capsys, name):
     assert data["warnings"] == [] or name == "stage331.toml"
 
 
+@pytest.mark.parametrize(
+    ("command", "options", "place"),
+    [
+        (
+            ["reconstruct", "c", "--out", "m"],
+            {"measure": {"bank": {"kind": 1}}},
+            "options.reconstruct.measure.bank.kind",
+        ),
+        (["fit", "c", "m"], {"hair_pixels": 0}, "options.fit.hair_pixels"),
+        (
+            ["fit", "c", "m", "--method", "inverse_rendering"],
+            {"fit": {"stepps": 3}},
+            "options.inverse_rendering.fit.stepps",
+        ),
+    ],
+)
+def test_a_bad_option_is_one_sentence_with_its_place(capsys, command, options, place):
+    code, data = run(capsys, *command, "--options", json.dumps(options))
+    assert code == 3
+    assert data["error"]["detail"].startswith(f"{place}: ")
+    assert "\n" not in data["error"]["detail"]
+
+
 def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
     code, data = run(capsys, "rig", "check", tmp_path / "none.toml")
     assert code == 3

@@ -9,7 +9,7 @@ from stage_service.jobs.worker import run_worker
 
 
 def _log(context: steps.StepContext, line: str) -> None:
-    with (context.model / "log.txt").open("a") as file:
+    with (context.model.path / "log.txt").open("a") as file:
         file.write(line + "\n")
 
 
@@ -21,7 +21,7 @@ def first(context: steps.StepContext) -> steps.Figures:
 def slow(context: steps.StepContext) -> steps.Figures:
     """Goes on until the file `go` is there; tells its progress as real steps do."""
     _log(context, "slow begins")
-    while not (context.model / "go").exists():
+    while not (context.model.path / "go").exists():
         time.sleep(0.02)
         try:
             context.progress("waiting", 0.5)

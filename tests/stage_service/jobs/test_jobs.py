@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from waiting import until
 
+from reconstruction.model import Model
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, read_progress
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, JobOptions, PipelineRequest
@@ -137,20 +138,20 @@ def test_progress_is_throttled_but_never_late_at_the_end(tmp_path: Path) -> None
         return JobCancelled("stop") if now[0] > 100 else None
 
     progress = StepProgress(
-        tmp_path, "job-1", "b", ("a", "b"), interrupted, every=0.2, clock=lambda: now[0]
+        Model(tmp_path), "job-1", "b", ("a", "b"), interrupted, clock=lambda: now[0]
     )
     progress("early", 0.1)
     now[0] = 0.1
     progress("too soon", 0.2)
-    told = read_progress(tmp_path, "job-1")
+    told = read_progress(Model(tmp_path), "job-1")
     assert told is not None
     assert (told.what, told.step_share, asked[0]) == ("early", 0.1, 1)
     assert told.share == pytest.approx(0.55)
     progress("end", 1.0)
-    told = read_progress(tmp_path, "job-1")
+    told = read_progress(Model(tmp_path), "job-1")
     assert told is not None
     assert (told.what, told.share) == ("end", 1.0)
-    assert read_progress(tmp_path, "another job") is None
+    assert read_progress(Model(tmp_path), "another job") is None
     now[0] = 101.0
     with pytest.raises(JobCancelled):
         progress("more", 0.3)
