@@ -37,8 +37,10 @@ def parse_options(kind: type[T], values: Mapping[str, Any], place: str = "option
 
 
 def sentence(error: ValidationError, place: str = "") -> str:
-    """Each field that is wrong with its place, below `place`, and why."""
+    """Each field that is wrong with its place, below `place`, why, and what was given."""
     above = (place,) if place else ()
     return "; ".join(
-        f"{'.'.join(map(str, (*above, *e['loc'])))}: {e['msg']}" for e in error.errors()
+        f"{'.'.join(map(str, (*above, *e['loc'])))}: {e['msg']}"
+        + (f", got {e['input']!r}" if isinstance(e["input"], bool | int | float | str) else "")
+        for e in error.errors()
     )

@@ -56,7 +56,7 @@ def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) 
         from stage_service.plan.capture_plan import CapturePlan
         from stage_service.plan.resolved import resolve
 
-        plan = parse_options(CapturePlan, read_json(args.plan), str(args.plan))
+        plan = parse_options(CapturePlan, read_json(args.plan), f"{args.plan}: plan")
         cost = resolve(plan, load_rig_file(args.rig)).cost.model_dump(mode="json")
     else:
         cost = service.post("/plans:validate", read_json(args.plan))

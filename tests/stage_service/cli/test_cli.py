@@ -369,5 +369,5 @@ def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
     code, data = run(capsys, *words, "--plan", plan)
     assert (code, data["error"]["detail"]) == (
         3,
-        f"{plan}: speed: Extra inputs are not permitted, got 1",
+        f"{plan}: plan.speed: Extra inputs are not permitted, got 1",
     )
