@@ -27,7 +27,7 @@ class CameraLink:
         self._server.world = world
         self._server.sensor = sensor
         self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(0.1,), name="cameras", daemon=True
+            target=self._server.serve_forever, args=(0.02,), name="cameras", daemon=True
         )
 
     def start(self) -> int:

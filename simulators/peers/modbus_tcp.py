@@ -70,7 +70,7 @@ class ModbusTcpPeer:
 
     def _listen(self, address: tuple[str, int]) -> _Server:
         server = _Server(address, self)
-        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         return server
 
     def _hang_up(self) -> None:

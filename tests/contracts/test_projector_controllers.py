@@ -176,7 +176,7 @@ def test_lit_projectors_go_dark_when_nobody_asks(stage, by):
 
 def test_short_flashes_do_not_keep_an_armed_sequence_alive(stage):
     stage.projectors.set_watchdog(0.1)
-    stage.projectors.load_sequence(rows(*[1] * 100_000))
+    stage.projectors.load_sequence(rows(*[1] * 100))
 
     def flash():
         stage.controller.gate(True)
