@@ -1,9 +1,9 @@
-"""OLAT frames of a capture, reduced to the pixels that a fit looks at."""
+"""OLAT frames of a capture, reduced to the pixels that a fit observes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,31 +15,28 @@ from reconstruction.geometry.lights import Light
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Cameras and lights that a fit must not see."""
+    """Cameras and lights that a fit must not observe."""
 
     cameras: tuple[str, ...] = ()
     lights: tuple[str, ...] = ()
 
-    def check(self, capture: Capture) -> None:
-        """Raise `CaptureError` where a name is not in the capture, or nothing is left to fit."""
-        cameras = [c.name for c in capture.rig.cameras]
-        lights = capture.olat_lights()
+    def training(self, capture: Capture) -> Capture:
+        """`capture` without them: what a fit may observe.
+
+        Raises `CaptureError` where a name is not in the capture, or nothing is left to fit.
+        """
+        cameras, lights = [c.name for c in capture.rig.cameras], capture.olat_lights()
+        left = []
         for kind, names, known in (
             ("camera", self.cameras, cameras),
             ("light", self.lights, lights),
         ):
             if unknown := sorted(set(names) - set(known)):
                 raise CaptureError(f"held-out {kind}s {unknown} are not in {capture.path}")
-            if not set(known) - set(names):
+            left.append([name for name in known if name not in names])
+            if not left[-1]:
                 raise CaptureError(f"{capture.path}: every {kind} is held out or none was shot")
-
-    def training_cameras(self, capture: Capture) -> list[str]:
-        """Names of the cameras that may be fitted, in rig order."""
-        return [c.name for c in capture.rig.cameras if c.name not in self.cameras]
-
-    def training_lights(self, capture: Capture) -> list[str]:
-        """Names of the lights that may be fitted, in rig order."""
-        return [name for name in capture.olat_lights() if name not in self.lights]
+        return capture.view(cameras=left[0], lights=left[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +55,20 @@ class Observed:
 
     def where(self, pixels: Bools) -> Observed:
         """The same lights at some of the pixels, marked by `pixels (P,)`."""
-        return Observed(
-            self.camera,
-            self.lights,
-            self.pixels[pixels],
-            self.radiance[:, pixels],
-            self.valid[:, pixels],
+        return replace(
+            self,
+            pixels=self.pixels[pixels],
+            radiance=self.radiance[:, pixels],
+            valid=self.valid[:, pixels],
+        )
+
+    def under(self, lights: Ints) -> Observed:
+        """The same pixels under some of the lights, by their indices `(l,)`."""
+        return replace(
+            self,
+            lights=tuple(self.lights[i] for i in lights),
+            radiance=self.radiance[lights],
+            valid=self.valid[lights],
         )
 
 
@@ -87,6 +92,6 @@ def observe(capture: Capture, camera: str, lights: Sequence[str], pixels: Ints) 
 
 
 def chosen(mask: Bools, most: int, rng: np.random.Generator) -> Ints:
-    """Flat indices of `most` pixels of `mask` at random, or of all where there are fewer."""
+    """Flat indices `(P,)` of `most` pixels of `mask (H, W)` at random, or of all of fewer."""
     index = np.flatnonzero(mask)
     return index if len(index) <= most else np.sort(rng.choice(index, most, replace=False))

@@ -51,12 +51,12 @@ def inverse_rendering(
     out. Raises `CaptureError` or `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
-    held_out.check(capture)
+    training = held_out.training(capture)
     fitted, strands, head = FittedAppearance.load(model), model.strands(), model.head(capture)
     report = model.report()
     with report.stage("inverse_rendering") as stage:
         progress("reading hair pixels", 0.0)
-        views = _views(capture, model, held_out, request.hair_pixels, seed)
+        views = _views(training, model, request.hair_pixels, seed)
         scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
         mapped = MappedStrands.of(scene, strands, root_uv(model, strands, head))
         depth = request.max_depth
@@ -143,16 +143,14 @@ class _Fit:
         return outcome
 
 
-def _views(
-    capture: Capture, model: Model, held_out: HeldOut, hair_pixels: int, seed: int
-) -> list[Observed]:
+def _views(training: Capture, model: Model, hair_pixels: int, seed: int) -> list[Observed]:
     rng = np.random.default_rng(seed)
-    lights = held_out.training_lights(capture)
+    lights = training.olat_lights()
     views = []
-    for name in held_out.training_cameras(capture):
-        pixels = chosen(model.mask(name, "hair", capture), hair_pixels, rng)
+    for name in [c.name for c in training.rig.cameras]:
+        pixels = chosen(model.mask(name, "hair", training), hair_pixels, rng)
         if len(pixels):
-            views.append(observe(capture, name, lights, pixels))
+            views.append(observe(training, name, lights, pixels))
     if not views:
         raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
     return views

@@ -74,13 +74,13 @@ def assess(
     `relight`) and the stage "images" of the report.
     """
     options = options or AssessOptions()
-    held_out.check(capture)
+    training = held_out.training(capture)
     fitted = FittedModel.load(model, capture)
     result: dict[str, Any] = {}
     report = model.report()
     with report.stage("images") as stage:
         if held_out.cameras or held_out.lights:
-            comparison = _Comparison(capture, model, fitted, held_out, options, seed)
+            comparison = _Comparison(capture, training, model, fitted, held_out, options, seed)
             result = comparison.run(stage, progress)
         else:
             stage.warn("no camera and no light is held out: nothing is compared")
@@ -97,6 +97,7 @@ class _Comparison:
     """What is compared with what."""
 
     capture: Capture
+    training: Capture
     model: Model
     fitted: FittedModel
     held_out: HeldOut
@@ -107,7 +108,7 @@ class _Comparison:
         """The scores by group and method; writes `comparison.png`."""
         scene, exposure = self.fitted.scene(), self.fitted.appearance.exposure
         progress("fitting the baselines", 0.0)
-        training = self._training()
+        training = self._observed()
         colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
         albedo = fit_diffuse(scene, training, seed=self.seed)
         scenes = {"ours": scene, "diffuse": scene.with_hair(DiffuseHair(albedo))}
@@ -127,16 +128,16 @@ class _Comparison:
             comparison_picture(part, _rows(groups, exposure), COLUMNS)
         return result
 
-    def _training(self) -> list[Observed]:
+    def _observed(self) -> list[Observed]:
         """Hair pixels of the training cameras under some of the training lights."""
         rng = np.random.default_rng(self.seed)
-        names = _spread(self.held_out.training_lights(self.capture), self.options.baseline_lights)
+        names = _spread(self.training.olat_lights(), self.options.baseline_lights)
         out = []
-        for camera in self.held_out.training_cameras(self.capture):
-            mask = self.model.mask(camera, "hair", self.capture)
+        for camera in [c.name for c in self.training.rig.cameras]:
+            mask = self.model.mask(camera, "hair", self.training)
             pixels = chosen(mask, self.options.baseline_pixels, rng)
             if len(pixels):
-                seen = observe(self.capture, camera, names, pixels)
+                seen = observe(self.training, camera, names, pixels)
                 out.append(replace(seen, lights=tuple(self.fitted.lights(names))))
         if not out:
             raise ModelError(f"{self.model}: the hair masks of the training cameras are all empty")
@@ -146,10 +147,10 @@ class _Comparison:
         """Which cameras to compare under which lights, by group."""
         held_out, options = self.held_out, self.options
         new = _spread(list(held_out.lights), options.lights)
-        training = held_out.training_lights(self.capture)
+        training = self.training.olat_lights()
         views: dict[str, list[tuple[str, list[str]]]] = {}
         if new:
-            cameras = _spread(held_out.training_cameras(self.capture), options.cameras)
+            cameras = _spread([c.name for c in self.training.rig.cameras], options.cameras)
             views["held_out_lights"] = [(camera, new) for camera in cameras]
         if held_out.cameras:
             both = _spread(training, max(options.lights - len(new) // 2, 1)) + _spread(
@@ -178,7 +179,9 @@ class _Comparison:
         out = []
         for i, name in enumerate(names):
             captured = capture.light(name, camera)[0]
-            near = three_nearest(capture, camera, capture.rig.light(name), self.held_out)
+            near = three_nearest(
+                capture, camera, capture.rig.light(name), self.training.olat_lights()
+            )
             frames = {
                 "captured": captured,
                 **{method: images[i] for method, images in rendered.items()},
@@ -189,16 +192,16 @@ class _Comparison:
         return out
 
 
-def three_nearest(capture: Capture, camera: str, light: Light, held_out: HeldOut) -> AnyFloats:
-    """`camera`'s captured frames under the three training lights nearest to `light`, mixed.
+def three_nearest(
+    capture: Capture, camera: str, light: Light, training: Sequence[str]
+) -> AnyFloats:
+    """`camera`'s frames `(H, W, 3)` under the three `training` lights nearest to `light`, mixed.
 
     Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
     distance to what `light` would give. `light` itself is never among the three.
     """
     others = [
-        capture.rig.light(n)
-        for n in held_out.training_lights(capture)
-        if n != light.name and capture.has_light(n, camera)
+        capture.rig.light(n) for n in training if n != light.name and capture.has_light(n, camera)
     ]
     positions = np.array([o.position for o in others])
     distance = np.linalg.norm(positions, axis=1)

@@ -24,13 +24,15 @@ from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import (
     Colours,
     Lobe,
+    Pixels,
+    Sampling,
     fit_colour,
     fit_lobe,
     fit_lobe_as_printed,
     match_roughness,
 )
 from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
-from reconstruction.arrays import Array, Ints
+from reconstruction.arrays import Array
 from reconstruction.capture.folder import Capture
 from reconstruction.model import Model
 from reconstruction.report.report import Progress, Report, Series, Stage, silent
@@ -56,27 +58,27 @@ def fit(
     and the report is returned. Raises `CaptureError` or `ValueError` naming what is missing.
     """
     held_out, options = held_out or HeldOut(), options or FitOptions()
-    held_out.check(capture)
+    training = held_out.training(capture)
     strands = model.strands()
     if len(strands) == 0:
         raise ValueError(f"{model.file('strands.npz')} has no strands: there is no hair to fit")
     report = model.report()
     with report.stage("samples") as stage:
         progress("reading hair pixels", 0.0)
-        hair, skin = _observed(capture, model, held_out, options, stage, progress, seed)
-        exposure = Exposure.of([o.radiance[o.valid] for o in hair])
-        hair, skin = _reached(capture, hair, skin, exposure, stage)
+        pixels = _observed(training, model, options, stage, progress, seed)
+        exposure = Exposure.of([o.radiance[o.valid] for o in pixels.hair])
+        pixels = _reached(training, pixels, exposure, stage)
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
     head = model.head(capture)
     scene = build_scene(strands, head, hair=start)
-    fitting = SunFit(scene, hair, skin, options, seed, progress)
+    fitting = SunFit(scene, pixels, options, seed, progress)
     with report.stage("roughness") as stage:
         plain, printed, corrected, first = fitting.roughness(stage)
     with report.stage("colour") as stage:
         colours = fitting.colour(corrected, np.array(first.colour), np.array(first.skin), stage)
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
-        elif not skin:
+        elif not pixels.skin:
             stage.warn("no camera sees skin: its colour is a guess")
     fitted = FittedAppearance(
         colours.hair,
@@ -96,27 +98,25 @@ def fit(
 
 
 def _observed(
-    capture: Capture,
+    training: Capture,
     model: Model,
-    held_out: HeldOut,
     options: FitOptions,
     stage: Stage,
     progress: Progress,
     seed: int,
-) -> tuple[list[Observed], list[Observed]]:
-    """Hair and skin pixels of the training cameras under the training lights."""
+) -> Pixels:
     rng = np.random.default_rng(seed)
-    cameras, lights = held_out.training_cameras(capture), held_out.training_lights(capture)
+    cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
     hair, skin, seen = [], [], 0
-    has_head = model.head(capture) is not None
+    has_head = model.head(training) is not None
     for i, name in enumerate(cameras):
         progress("reading hair pixels", 0.3 * i / len(cameras))
-        mask = model.mask(name, "hair", capture)
-        bare = model.mask(name, "skin", capture) & ~mask
+        mask = model.mask(name, "hair", training)
+        bare = model.mask(name, "skin", training) & ~mask
         seen += int(mask.sum())
         wanted = chosen(mask, options.hair_pixels, rng)
         beside = chosen(bare if has_head else bare & False, options.skin_pixels, rng)
-        both = observe(capture, name, lights, np.concatenate([wanted, beside]))
+        both = observe(training, name, lights, np.concatenate([wanted, beside]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
         if len(wanted):
             hair.append(both.where(is_hair))
@@ -134,22 +134,16 @@ def _observed(
             "means and lobes are known to a per cent from the others",
             f"{1 - kept / seen:.0%} of the renderings",
         )
-    return hair, skin
+    return Pixels(hair, skin)
 
 
-def _reached(
-    capture: Capture,
-    hair: list[Observed],
-    skin: list[Observed],
-    exposure: Exposure,
-    stage: Stage,
-) -> tuple[list[Observed], list[Observed]]:
+def _reached(training: Capture, pixels: Pixels, exposure: Exposure, stage: Stage) -> Pixels:
     """Leave out the lights that reach no hair pixel of any camera."""
-    noise = 0.0
+    hair, noise = pixels.hair, 0.0
     for o in hair[:1]:
-        for step in capture.of_kind("dark"):
-            if capture.has(step, o.camera.name):
-                frame = capture.frame(step, o.camera.name).reshape(-1, 3)[o.pixels]
+        for step in training.of_kind("dark"):
+            if training.has(step, o.camera.name):
+                frame = training.frame(step, o.camera.name).reshape(-1, 3)[o.pixels]
                 noise = max(noise, float(frame.std()))
     threshold = max(5 * noise, 1e-3 / exposure.scale)
     peak = np.max([np.where(o.valid[..., None], o.radiance, 0).max((1, 2)) for o in hair], axis=0)
@@ -162,14 +156,9 @@ def _reached(
             f"{len(names) / len(peak):.0%} of the shadow rays",
         )
     if len(lit) == 0:
-        raise ValueError(f"{capture.path}: no light reaches a hair pixel")
+        raise ValueError(f"{training.path}: no light reaches a hair pixel")
     stage.figures["lights_that_reach_hair"] = len(lit)
-    return [_under(o, lit) for o in hair], [_under(o, lit) for o in skin]
-
-
-def _under(o: Observed, lights: Ints) -> Observed:
-    names = tuple(o.lights[i] for i in lights)
-    return replace(o, lights=names, radiance=o.radiance[lights], valid=o.valid[lights])
+    return Pixels([o.under(lit) for o in hair], [o.under(lit) for o in pixels.skin])
 
 
 class SunFit:
@@ -178,26 +167,26 @@ class SunFit:
     def __init__(
         self,
         scene: HairScene,
-        hair: Sequence[Observed],
-        skin: Sequence[Observed],
+        pixels: Pixels,
         options: FitOptions,
         seed: int,
         progress: Progress,
     ) -> None:
-        self.scene, self.hair, self.skin = scene, hair, skin
+        self.scene, self.pixels = scene, pixels
         self.options, self.seed, self.progress = options, seed, progress
 
     def roughness(self, stage: Stage) -> tuple[Lobe, float, float, Colours]:
         """The plain lobe, Eq. 10's variance, the corrected β_M and a first colour."""
         start = time.perf_counter()
         self.progress("measuring the highlight", 0.3)
-        step = max(1, len(self.hair) // self.options.roughness_cameras)
-        views = self._views(self.hair[::step][: self.options.roughness_cameras])
-        if len(views) < len(self.hair):
+        hair = self.pixels.hair
+        step = max(1, len(hair) // self.options.roughness_cameras)
+        views = self._views(hair[::step][: self.options.roughness_cameras])
+        if len(views) < len(hair):
             stage.leave_out(
-                f"{len(self.hair) - len(views)} of {len(self.hair)} cameras",
+                f"{len(hair) - len(views)} of {len(hair)} cameras",
                 "the highlight is the same from all of them",
-                f"{1 - len(views) / len(self.hair):.0%} of the renderings",
+                f"{1 - len(views) / len(hair):.0%} of the renderings",
             )
         views = [(o, f) for o, f in views if len(o.lights)]
         if not views:
@@ -243,26 +232,26 @@ class SunFit:
         stage: Stage,
         iterations: int | None = None,
     ) -> Colours:
-        """Hair and skin colour at a roughness; errors against run time go into `stage`."""
+        """Hair and skin colour at a roughness, from albedos `start (3,)` and `skin (3,)`.
+
+        Errors against run time go into `stage`.
+        """
         began = time.perf_counter()
         series = Series("hair colour", "relative error of the mean colour under uniform light")
         stage.series.append(series)
 
-        def told(error: float) -> None:
+        def on_iteration(error: float) -> None:
             series.points.append((time.perf_counter() - began, error))
             self.progress("matching the colour", min(0.7 + 0.05 * len(series.points), 0.95))
 
         base = HairAppearance((0.1, 0.1, 0.1), beta_m, BETA_N)
         result = fit_colour(
             self.scene.with_hair(base).with_skin(skin),
-            self.hair,
-            self.skin,
+            self.pixels,
             start=start,
             iterations=iterations or self.options.iterations,
-            spp=self.options.colour_spp,
-            max_depth=MAX_DEPTH,
-            seed=self.seed,
-            told=told,
+            sampling=Sampling(self.options.colour_spp, MAX_DEPTH, self.seed),
+            on_iteration=on_iteration,
         )
         stage.figures |= {
             "colour": list(result.colour),
@@ -283,7 +272,7 @@ class SunFit:
         for o in hair:
             fibres = visible_fibres(self.scene, o.camera, o.pixels, seed=self.seed)
             near = mirror_lights(o, fibres, tilt_deg=self._tilt)
-            out.append((_under(o, near), fibres))
+            out.append((o.under(near), fibres))
         return out
 
     def _read(

@@ -16,6 +16,7 @@ from reconstruction.arrays import Array, Bools, Ints
 WINDOW = np.pi / 6
 """Sun Eq. 9: how far from the mirror direction samples are taken, both ways."""
 BINS = 32
+LEAST_SHARE, MOST_SPREAD = 0.9, 0.06
 _PAIRS = 96  # directions kept a bin, each with all its pixel's fibres, to average the model over
 
 
@@ -69,18 +70,14 @@ def mirror_samples(
     *,
     tilt_deg: float,
     channel: int,
-    least_share: float = 0.9,
-    most_spread: float = 0.06,
 ) -> MirrorSamples:
     """Samples of one view with |θ_i + θ_o + 2 tilt| and |φ_i − φ_o| below π/6 (Eq. 9).
 
-    `channel` is the colour channel to take: the darkest
-    has the least light from inside the fibres. Pixels with less hair than `least_share`, or whose
-    tangents vary by more than `most_spread` rad², are left out.
+    `channel` is the colour channel to take: the darkest has the least light from inside the fibres.
+    Pixels with less hair than `LEAST_SHARE`, or whose tangents vary by more than `MOST_SPREAD`
+    rad², are left out.
     """
-    near, theta, towards, squared = _near_mirror(
-        observed, fibres, tilt_deg, least_share, most_spread
-    )
+    near, theta, towards, squared = _near_mirror(observed, fibres, tilt_deg)
     light, pixel = np.nonzero(near)
     middle = _middle(fibres)
     shines = np.array([light.intensity_towards(middle)[:, channel] for light in observed.lights])
@@ -98,12 +95,10 @@ def mirror_samples(
     )
 
 
-def mirror_lights(
-    observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, least: float = 0.03
-) -> Ints:
-    """Indices of the lights that are near the mirror direction of a share `least` of the pixels."""
-    near = _near_mirror(observed, fibres, tilt_deg, 0.9, 0.06)[0]
-    return np.flatnonzero(near.sum(axis=1) > least * near.shape[1])
+def mirror_lights(observed: Observed, fibres: VisibleFibres, *, tilt_deg: float) -> Ints:
+    """Indices `(l,)` of the lights near the mirror direction of a share of 3 % of the pixels."""
+    near = _near_mirror(observed, fibres, tilt_deg)[0]
+    return np.flatnonzero(near.sum(axis=1) > 0.03 * near.shape[1])
 
 
 def binned(samples: MirrorSamples, *, seed: int = 0) -> LobeBins:
@@ -141,8 +136,6 @@ def _near_mirror(
     observed: Observed,
     fibres: VisibleFibres,
     tilt_deg: float,
-    least_share: float,
-    most_spread: float,
 ) -> tuple[Bools, Array, Array, Array]:
     """Which samples to take `(L, P)`, their deviations, and the way to the light and its square."""
     middle = _middle(fibres)
@@ -158,7 +151,7 @@ def _near_mirror(
     deviation = _angle(sin_i) + _angle(sin_o) + 2 * np.radians(tilt_deg)
     near = (np.abs(deviation) < WINDOW) & observed.valid
     near &= (across_i * across_o).sum(-1) > np.cos(WINDOW)
-    near &= (fibres.share >= least_share) & (fibres.spread() <= most_spread)
+    near &= (fibres.share >= LEAST_SHARE) & (fibres.spread() <= MOST_SPREAD)
     near &= np.array([(light.intensity > 0).all() for light in observed.lights])[:, None]
     return near, deviation, towards, squared
 

@@ -10,7 +10,7 @@ reads the true value off them. Colour: Algorithm 1 with Eq. 11 and 12 (`fit_colo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar, nnls
@@ -29,6 +29,8 @@ from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
+TOLERANCE = 0.01
+"""Relative error of the mean colour at which Algorithm 1 ends."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def match_roughness(
     Three renderings around `start` give a line in log β_M, a fourth where that says the answer is.
     Readings scatter by a few per cent and one may be far off: the line is Theil and Sen's, through
     medians, and the answer stays within a factor of 2 of `start`. Returns β_M and the pairs (β_M,
-    rendered(β_M)) looked at.
+    rendered(β_M)).
     """
     pairs: list[tuple[float, float]] = []
     lowest, highest = (
@@ -107,12 +109,29 @@ def match_roughness(
     for last in (False, True):
         x, y = np.log(np.array(pairs)).T
         # an estimator that hardly answers to β_M must not throw the answer out of range
-        slope = float(np.clip(theilslopes(y, x)[0], 0.4, 1.5))
-        wanted = (np.log(measured) - float(np.median(y - slope * x))) / slope
+        gradient = float(np.clip(theilslopes(y, x)[0], 0.4, 1.5))
+        wanted = (np.log(measured) - float(np.median(y - gradient * x))) / gradient
         beta = float(np.clip(np.exp(wanted), lowest, highest))
         if not last:
             pairs.append((beta, rendered(beta)))
     return beta, pairs
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """What the cameras observed: hair, and skin where they see some."""
+
+    hair: Sequence[Observed]
+    skin: Sequence[Observed] = ()
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Paths a pixel, vertices a path, and the seed."""
+
+    spp: int = 32
+    max_depth: int = 16
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -132,31 +151,31 @@ class Colours:
 
 def fit_colour(
     scene: HairScene,
-    hair: Sequence[Observed],
-    skin: Sequence[Observed],
+    pixels: Pixels,
     *,
     start: Array | None = None,
     iterations: int = 5,
-    tolerance: float = 0.01,
-    spp: int = 32,
-    max_depth: int = 16,
-    seed: int = 0,
-    told: Callable[[float], None] = lambda error: None,
+    sampling: Sampling | None = None,
+    on_iteration: Callable[[float], None] = lambda error: None,
 ) -> Colours:
     """Sun's Algorithm 1: the multiple-scattering albedo C whose rendering has the captured colour.
 
-    `hair` and `skin` are the cameras' observed hair and skin pixels; the light is the mean of their
-    single lights. `scene` gives geometry, roughness and first skin albedo, `start` the first C. An
-    iteration renders the observed pixels, fits R = aC + b per channel (Eq. 12) and takes Eq. 11's
-    sigma of the next C. The skin's albedo follows by the ratio of captured to rendered. Ends when
-    the hair's mean colour is within `tolerance`, or after `iterations` with one more update. Every
-    rendering draws other random numbers, so that the fit averages their noise.
+    The light is the mean of the single lights. `scene` gives geometry, roughness and first skin
+    albedo, `start (3,)` the first C. An iteration renders the observed pixels, fits R = aC + b per
+    channel (Eq. 12), takes Eq. 11's sigma of the next C, and tells `on_iteration` the error. The
+    skin's albedo follows by the ratio of captured to rendered. Ends when the hair's mean colour is
+    within `TOLERANCE`, or after `iterations` with one more update. Every rendering draws other
+    random numbers, so that the fit averages their noise.
     """
+    sampling = sampling or Sampling()
     if not isinstance(scene.hair, HairAppearance):
         raise TypeError("fit_colour needs a scene with HairAppearance, not diffuse fibres")
     beta_n = scene.hair.beta_n
-    target, skin_target = _mean_colour(hair), _mean_colour(skin) if skin else None
-    colour = np.clip(_as_albedo(hair) if start is None else start, 0.02, 0.98)
+    target, skin_target = (
+        _mean_colour(pixels.hair),
+        _mean_colour(pixels.skin) if pixels.skin else None,
+    )
+    colour = np.clip(_as_albedo(pixels.hair) if start is None else start, 0.02, 0.98)
     albedo = np.array(scene.skin)
     pairs: list[tuple[Array, Array]] = []
     errors: list[float] = []
@@ -164,14 +183,15 @@ def fit_colour(
     for step in range(iterations):
         current = _with_colour(scene.hair, colour, beta_n)
         lit = scene.with_hair(current).with_skin(np.clip(albedo, 0, 1))
-        seen = _mean_colour([_rendered(lit, o, spp, max_depth, seed + step) for o in hair])
+        now = replace(sampling, seed=sampling.seed + step)
+        seen = _mean_colour([_rendered(lit, o, now) for o in pixels.hair])
         errors.append(float(np.linalg.norm(seen - target) / np.linalg.norm(target)))
-        told(errors[-1])
+        on_iteration(errors[-1])
         pairs.append((colour, seen))
         if skin_target is not None and step < 3:
-            skin_seen = _mean_colour([_rendered(lit, o, spp, max_depth, seed + step) for o in skin])
+            skin_seen = _mean_colour([_rendered(lit, o, now) for o in pixels.skin])
             albedo = np.clip(albedo * skin_target / np.maximum(skin_seen, 1e-12), 0.005, 0.98)
-        if errors[-1] < tolerance and step > 0:
+        if errors[-1] < TOLERANCE and step > 0:
             break
         colour = next_colour(pairs, target)
     best = _with_colour(scene.hair, colour, beta_n)
@@ -179,7 +199,7 @@ def fit_colour(
 
 
 def fit_diffuse(
-    scene: HairScene, hair: Sequence[Observed], *, iterations: int = 3, spp: int = 32, seed: int = 0
+    scene: HairScene, hair: Sequence[Observed], *, seed: int = 0
 ) -> tuple[float, float, float]:
     """The albedo of Lambertian fibres on the same strands that gives the captured mean colour.
 
@@ -188,10 +208,10 @@ def fit_diffuse(
     target = _mean_colour(hair)
     albedo = np.clip(_as_albedo(hair), 0.02, 0.98)
     pairs: list[tuple[Array, Array]] = []
-    for step in range(iterations):
+    for step in range(3):
         lit = scene.with_hair(DiffuseHair(_rgb(albedo)))
         pairs.append(
-            (albedo, _mean_colour([_rendered(lit, o, spp, 16, seed + step) for o in hair]))
+            (albedo, _mean_colour([_rendered(lit, o, Sampling(seed=seed + step)) for o in hair]))
         )
         albedo = next_colour(pairs, target)
     return _rgb(albedo)
@@ -215,9 +235,9 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
             weight = 1.0 / (off + 0.02)
             middle, level = np.average(c[:, k], weights=weight), np.average(r[:, k], weights=weight)
             spread = np.sum(weight * (c[:, k] - middle) ** 2)
-            slope = np.sum(weight * (c[:, k] - middle) * (r[:, k] - level)) / spread
-            if slope > 0:  # noise may turn it between two colours that are all but equal
-                value = middle + (target[k] - level) / slope
+            gradient = np.sum(weight * (c[:, k] - middle) * (r[:, k] - level)) / spread
+            if gradient > 0:  # noise may turn it between two colours that are all but equal
+                value = middle + (target[k] - level) / gradient
         out[k] = np.clip(value, 0.5 * c[nearest, k], 2.0 * c[nearest, k])
     return np.clip(out, 0.005, 0.995)
 
@@ -230,15 +250,13 @@ def _rgb(values: Array) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 
-def _rendered(scene: HairScene, o: Observed, spp: int, max_depth: int, seed: int) -> Observed:
+def _rendered(scene: HairScene, o: Observed, sampling: Sampling) -> Observed:
     """The same pixels under the same lights, rendered; lights sampled, as only means are used."""
     radiance = render_olat(
         scene,
         o.camera,
         o.lights,
-        spp=spp,
-        max_depth=max_depth,
-        seed=seed,
+        **asdict(sampling),
         pixels=o.pixels,
         first_lights=8,
         deep_lights=4,

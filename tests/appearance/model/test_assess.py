@@ -127,7 +127,8 @@ def test_a_group_with_nothing_held_out_is_left_out(made):
 def test_three_nearest_lights_are_training_lights(made):
     capture, _, _ = made
     light = capture.rig.light("l4")
-    mixed = three_nearest(capture, "cam_0", light, HELD_OUT)
+    training = HELD_OUT.training(capture).olat_lights()
+    mixed = three_nearest(capture, "cam_0", light, training)
     positions = {x.name: x.position @ light.position for x in capture.rig.lights}
     nearest = sorted(set(positions) - {"l4", "l7"}, key=lambda n: -positions[n])[:3]
     frames = capture.olat("cam_0", nearest)

@@ -116,7 +116,7 @@ def test_missing_frames_and_masks_are_named(made, tmp_path):
     with pytest.raises(CaptureError, match="cam_9"):
         fit(capture, model, held_out=HeldOut(("cam_9",)), options=OPTIONS)
     with pytest.raises(CaptureError, match="every camera"):
-        HeldOut(("cam_0", "cam_1", "cam_2")).check(capture)
+        HeldOut(("cam_0", "cam_1", "cam_2")).training(capture)
 
 
 def test_observations_are_responses_at_full_level(made):

@@ -11,6 +11,7 @@ from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.fit import BETA_N, SunFit
 from appearance.sun_fit.options import FitOptions
+from appearance.sun_fit.roughness_and_colour import Pixels
 from reconstruction.arrays import Array
 from reconstruction.report.report import Progress, Stage, silent
 
@@ -36,7 +37,7 @@ def hair_inverse(
     options, stage = options or FitOptions(), stage or Stage("start")
     few = [_thinned(o, options.hair_pixels, seed) for o in hair]
     base = scene.with_hair(HairAppearance((0.1, 0.1, 0.1), GUESS, BETA_N))
-    fitting = SunFit(base, few, skin, options, seed, progress)
+    fitting = SunFit(base, Pixels(few, skin), options, seed, progress)
     try:
         _, _, beta_m, first = fitting.roughness(stage)
         start: Array | None = np.array(first.colour)
