@@ -1,6 +1,6 @@
 """Ways to say how much a fibre absorbs: pigments, or the colour that dense hair should show.
 
-Both work on Dr.Jit arrays and are differentiable; `appearance.sun_fit.longitudinal` has the
+Both work on Dr.Jit arrays and are differentiable; `appearance.bsdf.longitudinal` has the
 second in NumPy, with its inverse.
 """
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 
-from appearance.sun_fit.longitudinal import LEAST_COLOUR
+from appearance.bsdf.longitudinal import LEAST_COLOUR, bracket
 
 EUMELANIN = (0.419, 0.697, 1.37)
 """Absorption of black-brown pigment per unit of concentration (d'Eon et al. 2011), linear RGB."""
@@ -32,6 +32,4 @@ def of_colour(colour: Any, beta_n: Any) -> Any:
     (log C / P(beta_n))² with Chiang's polynomial P (2016, eq. 9). C is clamped to [1e-6, 1]: above
     1 the square would alias to albedos below.
     """
-    b = beta_n
-    bracket = 5.969 - 0.215 * b + 2.532 * b**2 - 10.73 * b**3 + 5.574 * b**4 + 0.245 * b**5
-    return (dr.log(dr.clip(colour, LEAST_COLOUR, 1.0)) / bracket) ** 2
+    return (dr.log(dr.clip(colour, LEAST_COLOUR, 1.0)) / bracket(beta_n)) ** 2

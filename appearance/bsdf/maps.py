@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.render.paths import opaque
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
+from appearance.scene.opaque import opaque
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
 from reconstruction.geometry.mesh import Mesh

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from appearance.sun_fit.longitudinal import longitudinal, variance_of_roughness
+from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from reconstruction.arrays import Array
 
 LOBES = 4
@@ -60,7 +60,7 @@ def tilted(p: int, theta: ArrayLike, tilt: ArrayLike) -> Array:
 def m_p(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
     """M_p: the longitudinal lobe (d'Eon 2011, eq. 7), of unit integral over cos(theta_o) dtheta_o.
 
-    `appearance.sun_fit.longitudinal` has it, and is tested against arbitrary precision.
+    `appearance.bsdf.longitudinal` has it, and is tested against arbitrary precision.
     """
     return longitudinal(theta_i, theta_o, v)
 

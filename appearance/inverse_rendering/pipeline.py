@@ -32,7 +32,7 @@ JUDGED_IMAGES = 6
 MOST_DEPTH = 16
 
 
-def inverse_rendering(
+def fit_maps(
     capture: Capture,
     model: Model,
     *,

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import lights_as_found
 from appearance.render.mixed import Environment, render_mixed
 from appearance.render.tracing import SAMPLING, Sampling
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
 from reconstruction.arrays import Array, Floats
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera

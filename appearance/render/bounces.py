@@ -10,9 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.render.coverage import covered_pixels
-from appearance.render.paths import Surface, opaque_index
+from appearance.render.paths import Surface
 from appearance.render.tracing import PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import HairScene
+from appearance.scene.opaque import opaque_index
 from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.cameras import Camera
 

@@ -25,16 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.render.lights import LightBank
-from appearance.render.paths import (
-    Surface,
-    Wave,
-    continue_path,
-    each_sample,
-    opaque_index,
-    pixel_indices,
-)
+from appearance.render.paths import Surface, Wave, continue_path, each_sample, pixel_indices
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, HairScene
+from appearance.scene.opaque import opaque_index
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import Camera

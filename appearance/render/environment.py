@@ -16,9 +16,10 @@ import numpy as np
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
-from appearance.render.paths import Surface, camera_rays, opaque, opaque_index
+from appearance.render.paths import Surface, camera_rays
 from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
 from appearance.scene.hair_scene import HairScene
+from appearance.scene.opaque import opaque, opaque_index
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.geometry.cameras import Camera

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.bsdf.corrective import rodrigues
-from appearance.render.paths import opaque, opaque_index, opaque_matrix
 from appearance.scene.hair_scene import SCALE, light_arrays
+from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import POLAR_FRAMES, LightProfile

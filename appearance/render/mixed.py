@@ -16,9 +16,10 @@ from appearance.render.environment import Sky
 from appearance.render.environment_maps import check_environment
 from appearance.render.lights import LightBank
 from appearance.render.olat import render_olat
-from appearance.render.paths import Surface, opaque
+from appearance.render.paths import Surface
 from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
 from appearance.scene.hair_scene import HairScene
+from appearance.scene.opaque import opaque
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.geometry.cameras import Camera

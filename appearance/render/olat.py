@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.lights import LightBank
-from appearance.render.paths import PointSource, Surface, light_from, opaque_index, pixel_indices
+from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
 from appearance.render.tracing import LANE_BYTES, PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import HairScene
+from appearance.scene.opaque import opaque_index
 from reconstruction.arrays import Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light

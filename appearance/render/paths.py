@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.scene.hair_scene import SCALE, HairScene
-from reconstruction.arrays import Array, Ints
+from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
+from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import Camera, undistorted
 
 
@@ -30,25 +31,6 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
         x, y = undistorted(opaque(camera.distortion), x, y)
     direction = opaque_matrix(camera.R.T) @ mi.Vector3f(x, y, mi.Float(1))
     return mi.Ray3f(mi.Point3f(*opaque(camera.center * SCALE)), dr.normalize(direction))
-
-
-def opaque(values: ArrayLike) -> list[Any]:
-    """One Dr.Jit float per number, which kernels read from memory.
-
-    A literal would become part of the kernel, and every camera, pose or light bank would be
-    compiled anew: seconds instead of milliseconds.
-    """
-    return [dr.opaque(mi.Float, float(v)) for v in np.asarray(values, float).ravel()]
-
-
-def opaque_index(value: int) -> Any:
-    """`value` as a Dr.Jit integer that kernels read from memory."""
-    return dr.opaque(mi.UInt32, value)
-
-
-def opaque_matrix(matrix: Array) -> Any:
-    """`matrix (3, 3)` that kernels read from memory."""
-    return mi.Matrix3f(*opaque(matrix))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance.render.paths import Surface, jittered, opaque, opaque_index
+from appearance.render.paths import Surface, jittered
+from appearance.scene.opaque import opaque, opaque_index
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import Camera

@@ -8,17 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from appearance.bsdf.longitudinal import (
+    absorption_of_colour,
+    roughness_of_variance,
+    variance_of_roughness,
+)
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from appearance.sun_fit.longitudinal import (
-    absorption_of_colour,
-    roughness_of_variance,
-    variance_of_roughness,
-)
 from appearance.sun_fit.mirror_samples import MirrorSamples, binned, mirror_lights, mirror_samples
 from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import (

@@ -8,8 +8,8 @@ from typing import Self
 
 import numpy as np
 
+from appearance.bsdf.longitudinal import longitudinal
 from appearance.observations import Observed
-from appearance.sun_fit.longitudinal import longitudinal
 from appearance.sun_fit.visible_fibres import VisibleFibres
 from reconstruction.arrays import Array, Bools, Ints
 

@@ -16,15 +16,15 @@ import numpy as np
 from scipy.optimize import minimize_scalar, nnls
 from scipy.stats import theilslopes
 
-from appearance.observations import Observed
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
-from appearance.scene.hair_scene import HairScene
-from appearance.sun_fit.longitudinal import (
+from appearance.bsdf.longitudinal import (
     absorption_of_colour,
     roughness_of_variance,
     variance_of_roughness,
 )
+from appearance.observations import Observed
+from appearance.render.olat import render_olat
+from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
+from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 

@@ -126,7 +126,7 @@ def _absorption(args: argparse.Namespace, beta_n: float) -> Array:
     import numpy as np
 
     from appearance.bsdf.absorption import of_melanin
-    from appearance.sun_fit.longitudinal import absorption_of_colour
+    from appearance.bsdf.longitudinal import absorption_of_colour
 
     if args.pigment is not None:
         if min(args.pigment) < 0:

@@ -60,9 +60,9 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
+    from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
     from appearance.scene.hair_appearance import HairAppearance
     from appearance.sun_fit.fitted_appearance import FittedAppearance
-    from appearance.sun_fit.longitudinal import colour_of_absorption, variance_of_roughness
 
     def figures(hair: HairAppearance, skin: Sequence[float]) -> dict[str, Any]:
         return {

@@ -76,7 +76,7 @@ def inverse_rendering(context: StepContext) -> Figures:
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
-    from appearance.inverse_rendering.pipeline import inverse_rendering as run
+    from appearance.inverse_rendering.pipeline import fit_maps as run
 
     asked = context.options
     found = run(

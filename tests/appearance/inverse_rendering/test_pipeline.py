@@ -11,7 +11,7 @@ import pytest
 
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.options import InverseRenderingRequest
-from appearance.inverse_rendering.pipeline import inverse_rendering
+from appearance.inverse_rendering.pipeline import fit_maps
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
@@ -78,10 +78,10 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        inverse_rendering(capture, model, held_out=HELD_OUT, request=REQUEST, progress=killed)
+        fit_maps(capture, model, held_out=HELD_OUT, request=REQUEST, progress=killed)
     assert model.checkpoint("correctives").is_file()
     again = []
-    result = inverse_rendering(
+    result = fit_maps(
         capture,
         model,
         held_out=HELD_OUT,
@@ -129,9 +129,7 @@ def test_the_head_that_was_laid_under_points_casts_its_shadow(made, small, tmp_p
         shutil.copytree(model.path, other.path)
         if head is not None:
             other.write_head(head)
-        found = inverse_rendering(
-            capture, other, held_out=HeldOut(lights=tuple(below[:2])), request=request
-        )
+        found = fit_maps(capture, other, held_out=HeldOut(lights=tuple(below[:2])), request=request)
         errors.append(found["held_out"]["start"]["relative_error"])
     assert capture.head is None
     assert abs(errors[0] - 1) > 0.2

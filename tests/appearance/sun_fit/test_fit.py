@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut, chosen, observe
 from appearance.render.coverage import coverage
@@ -13,7 +14,6 @@ from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fit import fit
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from appearance.sun_fit.longitudinal import variance_of_roughness
 from appearance.sun_fit.options import FitOptions
 from reconstruction.capture.folder import Capture, CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter

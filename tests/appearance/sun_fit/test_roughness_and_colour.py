@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import build_scene
-from appearance.sun_fit.longitudinal import longitudinal, variance_of_roughness
 from appearance.sun_fit.mirror_samples import (
     LobeBins,
     MirrorSamples,

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appearance.sun_fit.longitudinal import (
+from appearance.bsdf.longitudinal import (
     ColourRange,
     absorption_of_colour,
     colour_of_absorption,

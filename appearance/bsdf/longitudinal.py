@@ -7,6 +7,7 @@ directions point away from it, and the untilted mirror direction is theta_o = -t
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,7 +46,7 @@ def log_longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Ar
 
 
 def longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
-    """The longitudinal lobe M itself, per radian of solid angle's height; see `log_longitudinal`.
+    """The longitudinal lobe M itself, broadcast over its arguments; see `log_longitudinal`.
 
     Far from the mirror direction it underflows to 0, as it should.
     """
@@ -53,7 +54,7 @@ def longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
 
 
 def variance_of_roughness(beta_m: ArrayLike) -> Array:
-    """Longitudinal variance v of Chiang's perceptual roughness `beta_m` in (0, 1].
+    """Longitudinal variance v of Chiang's perceptual roughness `beta_m` in (0, 1], of any shape.
 
     v = (0.726 b + 0.812 b² + 3.7 b²⁰)² (Chiang et al. 2015). Sun's beta_l is this v.
     """
@@ -64,7 +65,7 @@ def variance_of_roughness(beta_m: ArrayLike) -> Array:
 
 
 def roughness_of_variance(v: ArrayLike) -> Array:
-    """Chiang's `beta_m` whose longitudinal variance is `v`: the inverse of the map above.
+    """Chiang's `beta_m` whose longitudinal variance is `v`, of any shape: the map above inverted.
 
     Monotone, so Newton's method kept inside a bracket; exact to rounding. Variances above 27.4,
     that no roughness has, give 1. Raises `ValueError` for variances outside [1e-7, 110].
@@ -81,7 +82,7 @@ def roughness_of_variance(v: ArrayLike) -> Array:
 
 
 def absorption_of_colour(colour: ArrayLike, beta_n: float) -> Array:
-    """Absorption sigma_a per fibre radius that gives dense hair the albedo `colour` (Sun Eq. 11).
+    """Absorption sigma_a per fibre radius giving dense hair the albedo `colour (…, 3)` (Eq. 11).
 
     sigma = (log C / P(beta_n))², with Chiang's bracket: as printed, Sun's closes too early. Albedos
     above 1 would alias to those below (1.25 gives the sigma of 0.8): they are clamped to 1, those
@@ -92,15 +93,15 @@ def absorption_of_colour(colour: ArrayLike, beta_n: float) -> Array:
         raise ValueError(f"colour must be finite, got {c}")
     if ((c <= 0) | (c > 1)).any():
         warnings.warn(f"albedo {c} is clamped to (0, 1]", ColourRange, stacklevel=2)
-    return np.asarray((np.log(np.clip(c, LEAST_COLOUR, 1.0)) / _bracket(beta_n)) ** 2)
+    return np.asarray((np.log(np.clip(c, LEAST_COLOUR, 1.0)) / bracket(_checked(beta_n))) ** 2)
 
 
 def colour_of_absorption(sigma_a: ArrayLike, beta_n: float) -> Array:
-    """Multiple-scattering albedo of dense hair with absorption `sigma_a` >= 0: Eq. 11 inverted."""
+    """Multiple-scattering albedo of dense hair of absorption `sigma_a (…, 3)`: Eq. 11 inverted."""
     sigma = np.asarray(sigma_a, float)
     if not (sigma >= 0).all():
         raise ValueError(f"sigma_a must not be negative, got {sigma}")
-    return np.exp(-np.sqrt(sigma) * _bracket(beta_n))
+    return np.exp(-np.sqrt(sigma) * bracket(_checked(beta_n)))
 
 
 def _variance(v: ArrayLike) -> Array:
@@ -112,8 +113,12 @@ def _variance(v: ArrayLike) -> Array:
     return v
 
 
-def _bracket(beta_n: float) -> float:
+def bracket(b: Any) -> Any:
+    """Chiang's polynomial P of the azimuthal roughness `b` (2016, eq. 9), in any arithmetic."""
+    return 5.969 - 0.215 * b + 2.532 * b**2 - 10.73 * b**3 + 5.574 * b**4 + 0.245 * b**5
+
+
+def _checked(beta_n: float) -> float:
     if not 0 < beta_n <= 1:
         raise ValueError(f"beta_n must be in (0, 1], got {beta_n}")
-    b = beta_n
-    return 5.969 - 0.215 * b + 2.532 * b**2 - 10.73 * b**3 + 5.574 * b**4 + 0.245 * b**5
+    return beta_n
