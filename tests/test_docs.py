@@ -135,7 +135,7 @@ def test_every_page_is_in_the_readme() -> None:
 def test_a_model_has_the_files_that_the_page_lists() -> None:
     page = (ROOT / "docs" / "files.md").read_text()
     table = page.split("## A model folder")[1].split("\n\n")[1]
-    rows = re.findall(r"^\| `([^`]+)` \| (.*) \|$", table, re.MULTILINE)
+    rows = re.findall(r"^- `([^`]+)`: (.*)$", table, re.MULTILINE)
     assert dict(rows) == FILES
 
 

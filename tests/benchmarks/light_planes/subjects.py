@@ -61,7 +61,7 @@ class Framing:
     longest: float
     rows: int = 128
     coarser: int = 1
-    """How many of the usual pixels and rows are one."""
+    """How many of the usual pixels, rows and lights are one."""
 
 
 FRAMINGS = {
@@ -81,7 +81,7 @@ def rig_text(framing: Framing, tracking_every: int = 64) -> str:
 
     width, height, rows = (n // framing.coarser for n in (WIDTH, HEIGHT, ROWS))
     optics = Optics(framing.target, math.degrees(2 * math.atan(framing.width / 2 / _DISTANCE)))
-    dome = f"lights = {LIGHTS}\nradius = 1.2\nlowest_deg = -50.0\nbeside_cameras_at = 0.05"
+    dome = f"lights = {LIGHTS // framing.coarser}\nradius = 1.2\nlowest_deg = -50.0\nbeside_cameras_at = 0.05"
     cameras = [
         optics.device("cameras", k, place(360 / CAMERAS * k, (8, 30)[k % 2], _DISTANCE))
         + f"width = {width}\nheight = {height}"
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if not framings:
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(FRAMINGS)}")
     if args.quick:
-        framings = {"curly": replace(FRAMINGS["curly"], rows=32, coarser=4)}
+        framings = {"curly": replace(FRAMINGS["curly"], rows=21, coarser=6)}
     for k, (name, framing) in enumerate(framings.items()):
         if name != "curly" and data_folder() is None:
             continue
