@@ -81,7 +81,8 @@ def rig_text(framing: Framing, tracking_every: int = 64) -> str:
 
     width, height, rows = (n // framing.coarser for n in (WIDTH, HEIGHT, ROWS))
     optics = Optics(framing.target, math.degrees(2 * math.atan(framing.width / 2 / _DISTANCE)))
-    dome = f"lights = {LIGHTS // framing.coarser}\nradius = 1.2\nlowest_deg = -50.0\nbeside_cameras_at = 0.05"
+    dome = f"lights = {LIGHTS // framing.coarser}\nradius = 1.2\nlowest_deg = -50.0\n"
+    dome += "beside_cameras_at = 0.05"
     cameras = [
         optics.device("cameras", k, place(360 / CAMERAS * k, (8, 30)[k % 2], _DISTANCE))
         + f"width = {width}\nheight = {height}"
