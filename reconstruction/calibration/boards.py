@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.calibration_error import CalibrationError
 
+PER_SQUARE = 64
+"""Pixels along a square of the print that pictures are compared with."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
@@ -67,26 +70,26 @@ class Board:
         """Width and height `(2,)`, metres."""
         return self.square * np.array([self.columns, self.rows])
 
-    def picture(self, per_square: int = 64) -> NDArray[np.uint8]:
+    def picture(self, per_square: int = PER_SQUARE) -> NDArray[np.uint8]:
         """What to print `(H, W)`: 0 where there is ink, else 255; `per_square` pixels a square."""
         size = (self.columns * per_square, self.rows * per_square)
         return np.asarray(self._opencv.generateImage(size))
 
-    def ink(self, points: ArrayLike, per_square: int = 64) -> Bools:
+    def ink(self, points: ArrayLike) -> Bools:
         """Whether board points `(..., 2)` are inked; beyond the picture they are not."""
-        picture = self.picture(per_square)
-        at = np.floor(np.asarray(points, float) * (per_square / self.square)).astype(int)
+        picture = self.picture()
+        at = np.floor(np.asarray(points, float) * (PER_SQUARE / self.square)).astype(int)
         inside = np.asarray(((at >= 0) & (at < picture.shape[::-1])).all(axis=-1))
         at = np.where(inside[..., None], at, 0)
         return np.asarray(inside) & (picture[at[..., 1], at[..., 0]] < 128)
 
-    def plain(self, points: ArrayLike, margin: float, per_square: int = 64) -> Bools:
+    def plain(self, points: ArrayLike, margin: float) -> Bools:
         """Whether board points `(..., 2)` are `margin` metres or more inside one colour."""
-        ink = (self.picture(per_square) < 128).astype(np.uint8)
-        reach = int(np.ceil(margin * per_square / self.square))
+        ink = (self.picture() < 128).astype(np.uint8)
+        reach = int(np.ceil(margin * PER_SQUARE / self.square))
         kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
         one = cv2.dilate(ink, kernel) == cv2.erode(ink, kernel)
-        at = np.floor(np.asarray(points, float) * (per_square / self.square)).astype(int)
+        at = np.floor(np.asarray(points, float) * (PER_SQUARE / self.square)).astype(int)
         inside = np.asarray(((at >= reach) & (at < np.array(ink.shape[::-1]) - reach)).all(axis=-1))
         at = np.where(inside[..., None], at, 0)
         return np.asarray(inside & one[at[..., 1], at[..., 0]])
@@ -107,7 +110,7 @@ class Board:
         )
         return self._refined(grey / white, rough) if len(rough) >= 6 else rough
 
-    def _refined(self, image: Array, rough: Sighting, rounds: int = 3) -> Sighting:
+    def _refined(self, image: Array, rough: Sighting) -> Sighting:
         """Corners shifted to where the print about them fits the picture best (Lucas, Kanade 1981).
 
         The detector's own window ends short of the markers; here they help. A homography says how
@@ -128,7 +131,7 @@ class Board:
         sub = np.stack(np.meshgrid(sub, sub), axis=-1).reshape(-1, 2)
         at = rough.pixels.copy()
         back, n = np.linalg.inv(H), 2 * reach + 1
-        for _ in range(rounds):
+        for _ in range(3):
             near = np.rint(at).astype(int)
             pixels = near[:, None] + patch
             inside = np.asarray(((pixels >= 0) & (pixels < image.shape[::-1])).all(axis=-1))

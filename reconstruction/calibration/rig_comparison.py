@@ -63,11 +63,11 @@ def _align(found: Rig, truth: Rig, ball: Array) -> Rigid:
     return Rigid.from_vector(minimise(numeric(residual), np.zeros(6)).x) @ start
 
 
-def _ball(radius: float = 0.1, count: int = 500) -> Array:
+def _ball() -> Array:
     rng = np.random.default_rng(0)
-    way = rng.standard_normal((count, 3))
+    way = rng.standard_normal((500, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
-    return np.asarray(radius * rng.uniform(size=(count, 1)) ** (1 / 3) * way)
+    return np.asarray(0.1 * rng.uniform(size=(500, 1)) ** (1 / 3) * way)
 
 
 def _pose(ours: Pinhole, true: Pinhole) -> dict[str, float]:

@@ -146,7 +146,7 @@ def with_intensity(known: CalibratedLight, shading: Shading) -> CalibratedLight:
 
 
 def refine_centres(
-    lights: Mapping[str, Light], shadings: Mapping[str, Shading], rounds: int = 3
+    lights: Mapping[str, Light], shadings: Mapping[str, Shading]
 ) -> dict[str, Shading]:
     """`shadings` with the centres that shading and outlines agree on.
 
@@ -156,7 +156,7 @@ def refine_centres(
     """
     first = next(iter(shadings.values()))
     prior, centres = np.linalg.inv(first.covariance), first.centres
-    for _ in range(rounds):
+    for _ in range(3):
         A = prior.copy()
         b = prior @ (centres - first.centres).ravel()
         for name, whole in shadings.items():

@@ -14,7 +14,7 @@ from reconstruction.calibration.solve_cameras import CameraSolution, calibrate_c
 from reconstruction.calibration.solve_lights import CalibratedLight, mirrored_lights
 from reconstruction.calibration.solve_projectors import (
     UNDETERMINED,
-    Rows,
+    DecodedRows,
     calibrate_projector,
     projector_intensities,
     rows_on_board,
@@ -145,7 +145,7 @@ def _projectors(
             for camera in cameras.cameras
         ]
         try:
-            one = calibrate_projector(p, Rows.join(parts))
+            one = calibrate_projector(p, DecodedRows.join(parts))
         except CalibrationError as error:
             undetermined[p.name] = str(error)
             out.append(p)

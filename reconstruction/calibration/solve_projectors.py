@@ -33,7 +33,7 @@ LOOSE = 2e-3  # metres: where planes are known to no better there, that is no ca
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class DecodedRows:
     """Points `points (N, 3)` of the world, their rows `row (N,)` and deviations `(N,)`, in rows."""
 
     points: Array
@@ -41,7 +41,7 @@ class Rows:
     deviation: Array
 
     @classmethod
-    def join(cls, parts: Sequence[Rows]) -> Rows:
+    def join(cls, parts: Sequence[DecodedRows]) -> DecodedRows:
         """All of them; at most `MOST`, evenly taken."""
         if not parts:
             return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
@@ -77,7 +77,7 @@ UNDETERMINED = (
 
 def rows_on_board(
     capture: Capture, camera: Camera, projector: str, board: Board, board_to_world: Rigid
-) -> Rows:
+) -> DecodedRows:
     """What `camera`, calibrated, decodes of `projector`'s sweep on the board, one point a pixel.
 
     Pixels that see an edge of the print are left out: the line's centre of light is not its centre
@@ -89,17 +89,17 @@ def rows_on_board(
     rays = camera.rays(peaks.pixel[first].astype(float)) @ board_to_world.rotation
     origin = board_to_world.inverse()(camera.center)
     if not len(rays) or origin[2] >= 0:
-        return Rows.join([])
+        return DecodedRows.join([])
     distance = -origin[2] / np.where(rays[:, 2] > 1e-6, rays[:, 2], np.inf)
     flat = origin + distance[:, None] * rays
     footprint = np.abs(origin[2]) / camera.K[0, 0]
     slant = np.median(np.where(rays[:, 2] > 1e-6, 1 / np.maximum(rays[:, 2], 0.1), 10.0))
     good = (distance > 0) & board.plain(flat[:, :2], float(1.2 * footprint * slant))
     flat, first = flat[good], first[good]
-    return Rows(board_to_world(flat), peaks.row[first], peaks.deviation[first])
+    return DecodedRows(board_to_world(flat), peaks.row[first], peaks.deviation[first])
 
 
-def calibrate_projector(nominal: Projector, rows: Rows) -> ProjectorSolution:
+def calibrate_projector(nominal: Projector, rows: DecodedRows) -> ProjectorSolution:
     """The projector whose planes of light meet `rows`, in the world of the points.
 
     `nominal` gives the size, the line's width, intensity and what rows leave open.
@@ -242,7 +242,7 @@ def _projector(nominal: Projector, x: Array) -> Projector:
     return replace(nominal, K=K, R=R, t=-R @ center)
 
 
-def _linearised(nominal: Projector, rows: Rows) -> Linearised:
+def _linearised(nominal: Projector, rows: DecodedRows) -> Linearised:
     def residual(x: Array) -> Array:
         p = _projector(nominal, x)
         local = rows.points @ p.R.T + p.t
@@ -251,7 +251,7 @@ def _linearised(nominal: Projector, rows: Rows) -> Linearised:
     return numeric(residual)
 
 
-def _linear(nominal: Projector, rows: Rows) -> Array:
+def _linear(nominal: Projector, rows: DecodedRows) -> Array:
     """The parameters that `rows` give by the direct linear transform; nominal where it is weak."""
     start = np.array([0.0, 0, 0, 0, 0, 0, nominal.K[1, 2]])
     middle = rows.points.mean(axis=0)

@@ -27,10 +27,10 @@ class Highlight:
     saturated: bool
 
 
-def find_outline(image: AnyFloats, directions: int = 120) -> Array:
+def find_outline(image: AnyFloats) -> Array:
     """Sub-pixel points `(N, 2)` of the rim of the one lit blob in a dark-subtracted grey `image`.
 
-    Along rays from its centroid, where the light falls to half of what it is two pixels inside.
+    Along 120 rays from its centroid, where the light falls to half of what it is two pixels inside.
     Directions in which the rim is dark are left out; none where nothing is lit.
     """
     noise, bright = background_noise(image), float(np.percentile(image, 99))
@@ -46,7 +46,7 @@ def find_outline(image: AnyFloats, directions: int = 120) -> Array:
     middle = np.array([x.mean(), y.mean()])
     reach = 1.5 * np.sqrt(area.max() / np.pi) + 4
     radii = np.arange(0, reach, 0.25)
-    angle = np.linspace(0, 2 * np.pi, directions, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     at = middle + radii[:, None, None] * along
     inside = ((at >= 0) & (at <= np.array(image.shape[::-1]) - 1)).all(axis=-1).all(axis=0)

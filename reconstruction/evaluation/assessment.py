@@ -16,7 +16,7 @@ from reconstruction.evaluation.connectivity import (
     length_figures,
     spread,
 )
-from reconstruction.evaluation.matching import Comparison, draw, scores
+from reconstruction.evaluation.matching import StrandComparison, draw, scores
 from reconstruction.evaluation.oriented_points import Block, Drawn, OrientedPoints
 from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
 from reconstruction.evaluation.visibility import Visibility
@@ -179,7 +179,7 @@ def root_figures(pred: Strands, true: Strands, head: Mesh | None = None) -> dict
 def _region_figures(
     true: Strands,
     truth: OrientedPoints,
-    comparison: Comparison,
+    comparison: StrandComparison,
     of_pred: Nearest,
     head: Mesh | None,
     sphere: HeadSphere | None,

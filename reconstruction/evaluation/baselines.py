@@ -54,11 +54,11 @@ def baseline_hull(
     return space_carve(hull, used, first)
 
 
-def hull_vertical(hull: VoxelGrid, *, spacing: float = SPACING) -> Strands:
-    """The hull filled with vertical lines, `spacing` metres apart, upper ends first."""
+def hull_vertical(hull: VoxelGrid) -> Strands:
+    """The hull filled with vertical lines, `SPACING` metres apart, upper ends first."""
     low = hull.origin - hull.spacing / 2
     size = hull.spacing * np.array(hull.inside.shape)
-    x, y = (low[a] + np.arange(spacing / 2, size[a], spacing) for a in (0, 1))
+    x, y = (low[a] + np.arange(SPACING / 2, size[a], SPACING) for a in (0, 1))
     columns = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     i, j = hull.index(np.column_stack([columns, np.full(len(columns), low[2])])).T[:2]
     inside = np.pad(hull.inside[i, j], ((0, 0), (1, 1))).astype(np.int8)
@@ -71,10 +71,8 @@ def hull_vertical(hull: VoxelGrid, *, spacing: float = SPACING) -> Strands:
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
 
 
-def hull_smooth_field(
-    hull: VoxelGrid, head: Mesh | None = None, *, spacing: float = SPACING
-) -> Strands:
-    """The hull filled with the smooth field of its own surface, in pieces `spacing` metres long.
+def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
+    """The hull filled with the smooth field of its own surface, in pieces `SPACING` metres long.
 
     On the outer surface the direction is that of steepest descent, gravity's part in the surface;
     inwards it is spread as measured orientations are (`solve_field`). Where the hull touches the
@@ -84,11 +82,11 @@ def hull_smooth_field(
     field, _ = solve_field(hull, points, tangents)
     low = hull.origin - hull.spacing / 2
     size = hull.spacing * np.array(hull.inside.shape)
-    axes = [low[a] + np.arange(spacing / 2, size[a], spacing) for a in range(3)]
+    axes = [low[a] + np.arange(SPACING / 2, size[a], SPACING) for a in range(3)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     lattice = lattice[hull.contains(lattice)]
     direction, there = field.sample(lattice, np.broadcast_to(DOWN, lattice.shape))
-    center, half = lattice[there], direction[there] * spacing / 2
+    center, half = lattice[there], direction[there] * SPACING / 2
     ends = np.stack([center - half, center + half], axis=1)
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
 

@@ -91,7 +91,7 @@ def _share(matches: Matches, k: int, directed: bool, among: Bools | None) -> tup
 
 
 @dataclass(frozen=True)
-class Comparison:
+class StrandComparison:
     """Matches of both sets: points drawn from all, and from what cameras see."""
 
     all: tuple[Matches, Matches]
@@ -124,7 +124,7 @@ def draw(
     seed: int = 0,
     samples: int | None = 40_000,
     visibility: Visibility | None = None,
-) -> Comparison:
+) -> StrandComparison:
     """Draw the points to compare; nothing is matched yet. Raises as `compare_strands` does."""
     if truth.count == 0:
         raise ValueError("there are no true strands to compare with")
@@ -136,7 +136,7 @@ def draw(
             raise ValueError("no camera sees any of the true strands: are they in one frame?")
         visible = Matches(predicted.draw(samples, rng, visibility)), Matches(seen)
     everything = Matches(predicted.draw(samples, rng)), Matches(truth.draw(samples, rng))
-    return Comparison(everything, visible)
+    return StrandComparison(everything, visible)
 
 
 def compare_strands(

@@ -45,7 +45,7 @@ class Tracing:
 
 
 @dataclass(frozen=True, eq=False)
-class Paths:
+class TracedPaths:
     """Traced polylines as columns: `points (T, N, 3) float32`, of which path i has `counts[i]`."""
 
     points: Floats
@@ -57,7 +57,7 @@ def trace(
     starts: AnyFloats,
     along: AnyFloats,
     tracing: Tracing = Tracing(),
-) -> Paths:
+) -> TracedPaths:
     """Follow the field from `starts (N, 3)`, setting out on the side of `along (N, 3)`.
 
     At every step the line's sign is the one that turns least. A path ends where it leaves the
@@ -82,7 +82,7 @@ def trace(
         row[active] = p
         rows.append(row)
         counts[active] += 1
-    return Paths(np.stack(rows), counts)
+    return TracedPaths(np.stack(rows), counts)
 
 
 def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> Array:
@@ -102,7 +102,7 @@ def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> A
     return (d + 2 * k2 + 2 * k3 + ahead(step * k3)) / 6
 
 
-def to_polylines(paths: Paths) -> list[Floats]:
+def to_polylines(paths: TracedPaths) -> list[Floats]:
     """The points `(N, 3)` of each path."""
     columns = np.ascontiguousarray(paths.points.transpose(1, 0, 2))
     return [columns[i, :n] for i, n in enumerate(paths.counts)]

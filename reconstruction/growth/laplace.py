@@ -135,15 +135,6 @@ def conjugate_gradient_steps(
         p = z + (rz / np.maximum(before, 1e-300)) * p
 
 
-def explicit_steps(A: sparse.csr_array, b: Array, start: Array) -> Iterator[tuple[Array, Array]]:
-    """The heat equation's explicit steps, Δt = h²/6: iterates and residuals `(F, 6)`."""
-    x = np.array(start, dtype=float)
-    while True:
-        r = b - A @ x
-        yield x, r
-        x += r / 6
-
-
 def conjugate_gradients(
     A: sparse.csr_array,
     b: Array,
@@ -170,23 +161,3 @@ def conjugate_gradients(
         f"conjugate gradients stopped at a residual of {error:.2g} after {limit} iterations, "
         f"wanted {tolerance:.2g}"
     )
-
-
-def explicit_diffusion(
-    A: sparse.csr_array, b: Array, start: Array, seconds: float, begin: float | None = None
-) -> tuple[Array, Series]:
-    """`explicit_steps` from `start (F, 6)` for at most `seconds`: the plain reference.
-
-    Returns x and the relative residual against run time.
-    """
-    begin = time.perf_counter() if begin is None else begin
-    series = Series("explicit steps", "relative residual")
-    scale = np.maximum(np.linalg.norm(b, axis=0), 1e-12)
-    steps = explicit_steps(A, b, start)
-    while True:
-        x, r = next(steps)
-        now = time.perf_counter() - begin
-        series.points.append((now, float((np.linalg.norm(r, axis=0) / scale).max())))
-        if now > seconds or series.points[-1][1] < 1e-12:
-            return x, series
-        next(islice(steps, 8, None))

@@ -24,6 +24,8 @@ PULL = 0.6
 LEAST_SUPPORT = 0.5
 SPACING = 0.4
 
+_BATCH = 2000
+
 
 @dataclass(frozen=True)
 class SurfaceOptions:
@@ -100,11 +102,11 @@ class LineCloud:
 
 
 def surface_strands(
-    lines: Measured, options: SurfaceOptions = SurfaceOptions(), *, seed: int = 0, batch: int = 2000
+    lines: Measured, options: SurfaceOptions = SurfaceOptions(), *, seed: int = 0
 ) -> list[Floats]:
     """Polylines `(N, 3)` through measured lines, both ways from lines that none passes yet.
 
-    Lines are taken `batch` at a time in an order drawn by `seed`.
+    Lines are taken two thousand at a time in an order drawn by `seed`.
     """
     if not len(lines.points):
         return []
@@ -113,7 +115,7 @@ def surface_strands(
     spent = np.zeros(len(order), bool)
     out: list[Floats] = []
     while len(order := order[~spent[order]]):
-        chosen = order[:batch]
+        chosen = order[:_BATCH]
         spent[chosen] = True
         p, d = lines.points[chosen], lines.directions[chosen]
         ways = cloud.trace(np.tile(p, (2, 1)), np.concatenate([d, -d]))

@@ -43,7 +43,7 @@ def visual_hull(
     """
     if not spacing > 0:
         raise ValueError(f"spacing must be positive, got {spacing}")
-    views = [_View(c, masks[c.name]) for c in cameras if c.name in masks]
+    views = [_MaskView(c, masks[c.name]) for c in cameras if c.name in masks]
     if not views:
         raise ValueError(
             f"no camera has a mask: cameras {[c.name for c in cameras]}, masks {sorted(masks)}"
@@ -60,7 +60,7 @@ def visual_hull(
     return VoxelGrid(box[0] + spacing / 2, spacing, _carve(views, box[0], spacing, shape, least))
 
 
-class _View:
+class _MaskView:
     """A camera, its mask, and for every pixel the distance (pixels) to the mask or to its edge."""
 
     def __init__(self, camera: Camera, mask: Bools) -> None:
@@ -122,7 +122,7 @@ class _View:
         return touches, within
 
 
-def _balls(views: list[_View], points: Array, radius: float, least: int) -> tuple[Bools, Bools]:
+def _balls(views: list[_MaskView], points: Array, radius: float, least: int) -> tuple[Bools, Bools]:
     """Whether balls about `points (M, 3)` may hold a part of the hull, and are wholly inside it."""
     alive, whole = np.arange(len(points)), np.ones(len(points), bool)
     count = np.zeros(len(points), np.int64)
@@ -138,7 +138,7 @@ def _balls(views: list[_View], points: Array, radius: float, least: int) -> tupl
     return out, out & whole
 
 
-def _points(views: list[_View], points: Array, least: int) -> Bools:
+def _points(views: list[_MaskView], points: Array, least: int) -> Bools:
     """Whether `points (M, 3)` are inside the hull."""
     alive, count = np.arange(len(points)), np.zeros(len(points), np.int64)
     for view in views:
@@ -152,7 +152,7 @@ def _points(views: list[_View], points: Array, least: int) -> Bools:
     return out
 
 
-def _carve(views: list[_View], low: Array, spacing: float, shape: Ints, least: int) -> Bools:
+def _carve(views: list[_MaskView], low: Array, spacing: float, shape: Ints, least: int) -> Bools:
     """The inside voxels `shape`: blocks of `BLOCK`³, then the voxels of those that are mixed."""
     blocks = -(-shape // BLOCK)
     out = np.zeros((*blocks, BLOCK, BLOCK, BLOCK), bool)
@@ -176,7 +176,7 @@ def _indices(shape: Ints) -> Ints:
     return np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
 
 
-def _find_bounds(views: list[_View], least: int) -> Array:
+def _find_bounds(views: list[_MaskView], least: int) -> Array:
     """A box `(2, 3)` around the hull: a coarse carve around the masks' common centre, thrice."""
     center = _common_center(views)
     distance = min(float(np.linalg.norm(v.camera.center - center)) for v in views)
@@ -194,7 +194,7 @@ def _find_bounds(views: list[_View], least: int) -> Array:
     return box
 
 
-def _common_center(views: list[_View]) -> Array:
+def _common_center(views: list[_MaskView]) -> Array:
     """The point nearest to the rays through the masks' centroids, in the least-squares sense."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for view in views:

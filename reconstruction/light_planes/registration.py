@@ -10,6 +10,9 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools
 
+BLUR = 1.0
+"""Pixels of the Gaussian that keeps pictures from aliasing."""
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -35,18 +38,18 @@ class Registration:
 class Template:
     """A reference picture prepared once, against which many others are registered.
 
-    `image (H, W)` is smoothed by a Gaussian of `sigma` pixels against aliasing; `mask (H, W)` says
+    `image (H, W)` is smoothed by a Gaussian of `BLUR` pixels against aliasing; `mask (H, W)` says
     which pixels count. Raises `ValueError` for an empty mask or a picture without any detail.
     """
 
-    def __init__(self, image: AnyFloats, mask: Bools, sigma: float = 1.0) -> None:
+    def __init__(self, image: AnyFloats, mask: Bools) -> None:
         if image.shape != mask.shape or image.ndim != 2:
             raise ValueError(f"image {image.shape} and mask {mask.shape} must be the same (H, W)")
         if not mask.any():
             raise ValueError("the registration mask is empty: no pixel of the subject to follow")
-        self.sigma, self.mask = sigma, mask
+        self.mask = mask
         self.raw = np.asarray(image, np.float64)
-        self.image = smooth(image, sigma)
+        self.image = smooth(image, BLUR)
         self.y, self.x = (v.astype(np.float64) for v in np.nonzero(mask))
         self.centre = np.array([self.x.mean(), self.y.mean()])
         dx, dy = self.x - self.centre[0], self.y - self.centre[1]
@@ -61,15 +64,13 @@ class Template:
             raise ValueError("the picture has no detail inside the mask to register by")
         self.inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
 
-    def register(
-        self, image: AnyFloats, *, iterations: int = 30, tolerance: float = 1e-3
-    ) -> Registration:
+    def register(self, image: AnyFloats, *, iterations: int = 30) -> Registration:
         """Register `image (H, W)` by inverse compositional Gauss-Newton (Baker and Matthews 2004).
 
-        `tolerance` in pixels. One iteration gives the linear estimate, which suffices to see that
-        nothing moved.
+        Until steps are under 0.001 pixel. One iteration gives the linear estimate, which
+        suffices to see that nothing moved.
         """
-        other = spline(smooth(image, self.sigma))
+        other = spline(smooth(image, BLUR))
         shift, angle, gain, converged = np.zeros(2), 0.0, 1.0, False
         error = np.zeros_like(self.values)
         dx, dy = self.x - self.centre[0], self.y - self.centre[1]
@@ -85,11 +86,11 @@ class Template:
             angle += step[2]
             c, s = np.cos(angle), np.sin(angle)
             shift = shift + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])
-            if max(np.abs(step[:2]).max(), abs(step[2]) * self.lever) < tolerance:
+            if max(np.abs(step[:2]).max(), abs(step[2]) * self.lever) < 1e-3:
                 converged = True
                 break
         # smoothing correlates neighbours: only one in 4 pi sigma² residuals is independent
-        correlated = max(1.0, 4 * np.pi * self.sigma**2)
+        correlated = max(1.0, 4 * np.pi * BLUR**2)
         variance = float(error @ error) / max(len(error) - 4, 1) * correlated
         deviation = np.sqrt(np.maximum(np.diag(self.inverse)[:3] * variance, 0))
         return Registration(

@@ -56,7 +56,7 @@ STILL: Pose = (np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _TrackedView:
     """One camera's reference picture, prepared, and the points that it saw."""
 
     camera: Camera
@@ -129,7 +129,7 @@ def solve_motion(
 def _solve_all(
     capture: Capture,
     steps: list[Step],
-    views: list[_View],
+    views: list[_TrackedView],
     options: MotionOptions,
     progress: Progress,
     stage: Stage,
@@ -195,7 +195,7 @@ def _solve_all(
 
 
 def from_registrations(
-    found: list[tuple[_View, Registration]],
+    found: list[tuple[_TrackedView, Registration]],
 ) -> tuple[Pose, Determination, float]:
     """The motion that best explains 2D registrations (Photobooth Eq. 2), robustly.
 
@@ -223,7 +223,7 @@ def from_registrations(
 
 
 def align(
-    views: list[_View],
+    views: list[_TrackedView],
     images: dict[str, Array],
     start: Pose,
 ) -> tuple[Pose, Determination]:
@@ -255,7 +255,7 @@ def align(
     return gauss_newton(system, 10, start)
 
 
-def likeness(views: list[_View], images: dict[str, Array], pose: Pose) -> float:
+def likeness(views: list[_TrackedView], images: dict[str, Array], pose: Pose) -> float:
     """How alike `images (H, W)` at the moved points and the reference are: correlation, at most 1.
 
     The median over the cameras; what left a picture counts as unlike.
@@ -276,7 +276,9 @@ def likeness(views: list[_View], images: dict[str, Array], pose: Pose) -> float:
     return float(np.median(out))
 
 
-def _views(capture: Capture, reference: Step, points: PointCloud, stage: Stage) -> list[_View]:
+def _views(
+    capture: Capture, reference: Step, points: PointCloud, stage: Stage
+) -> list[_TrackedView]:
     rng = np.random.default_rng(0)
     views = []
     for camera in capture.rig.cameras:
@@ -303,7 +305,7 @@ def _views(capture: Capture, reference: Step, points: PointCloud, stage: Stage) 
         except ValueError as error:
             stage.warn(f"{camera.name} is not used for motion: {error}")
             continue
-        views.append(_View(camera, template, seen, pixels))
+        views.append(_TrackedView(camera, template, seen, pixels))
     return views
 
 
@@ -315,8 +317,8 @@ def _picture(capture: Capture, step: Step, camera: str) -> Array:
 
 
 def _present(
-    capture: Capture, step: Step, views: list[_View]
-) -> tuple[list[_View], dict[str, Array]]:
+    capture: Capture, step: Step, views: list[_TrackedView]
+) -> tuple[list[_TrackedView], dict[str, Array]]:
     """The views that have a picture of this step, and the pictures."""
     present = [v for v in views if capture.has(step, v.camera.name)]
     return present, {v.camera.name: _picture(capture, step, v.camera.name) for v in present}

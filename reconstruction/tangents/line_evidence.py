@@ -120,11 +120,11 @@ class Tangents:
     confidence: Array
 
 
-def decide(scores: AnyFloats, candidates: Array, sharpness: float | None = None) -> Tangents:
+def decide(scores: AnyFloats, candidates: Array) -> Tangents:
     """The best direction for each row of `scores (N, D)` over `candidates (D, 3)`.
 
     Scores are turned into weights by a softmax whose temperature is their median spread over the
-    rows divided by `sharpness` (default 6). The direction is the main axis of the weighted
+    rows divided by 6. The direction is the main axis of the weighted
     structure tensor of the candidates near the best one: finer than their spacing.
     """
     if scores.shape != (len(scores), len(candidates)):
@@ -132,7 +132,7 @@ def decide(scores: AnyFloats, candidates: Array, sharpness: float | None = None)
     if not len(scores):
         return Tangents(np.zeros((0, 3)), np.zeros(0))
     spread = float(np.median(scores.std(axis=1))) + 1e-12
-    weights = np.exp((sharpness or 6.0) * (scores - scores.max(axis=1, keepdims=True)) / spread / 3)
+    weights = np.exp(6.0 * (scores - scores.max(axis=1, keepdims=True)) / spread / 3)
     pair = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     basis = np.stack([candidates[:, i] * candidates[:, j] for i, j in pair], axis=1)
     total = weights.sum(axis=1, keepdims=True)

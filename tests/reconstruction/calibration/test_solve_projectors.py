@@ -11,7 +11,7 @@ from reconstruction.calibration.boards import Board
 from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.solve_cameras import CameraSolution
 from reconstruction.calibration.solve_projectors import (
-    Rows,
+    DecodedRows,
     calibrate_projector,
     projector_intensities,
     rows_on_board,
@@ -25,14 +25,16 @@ from simulators.subject.props import board_pose
 POSES = (0, 1, 16, 17, 14, 15)
 
 
-def decoded(projector: Projector, poses: tuple[int, ...], board: Board, noise: float) -> Rows:
+def decoded(
+    projector: Projector, poses: tuple[int, ...], board: Board, noise: float
+) -> DecodedRows:
     """Rows of points all over the board, with noise."""
     rng = np.random.default_rng(4)
     flat = np.append(rng.uniform(0, 1, (600, 2)) * board.size, np.zeros((600, 1)), axis=1)
     props = [board_pose(n, board) for n in poses]
     points = np.concatenate([flat @ p.rotation.T + p.translation for p in props])
     row = projector.project(points)[0][:, 1] + noise * rng.standard_normal(len(points))
-    return Rows(points, row, np.full(len(points), max(noise, 1e-3)))
+    return DecodedRows(points, row, np.full(len(points), max(noise, 1e-3)))
 
 
 def worst_plane(ours: Projector, true: Projector) -> float:
@@ -77,7 +79,7 @@ def test_a_board_in_one_plane_leaves_the_planes_of_light_open(
 
 def test_a_board_without_light_is_an_error(nominal_rig: Rig) -> None:
     with pytest.raises(CalibrationError, match="projector beam: 0 points of the board decode"):
-        calibrate_projector(nominal_rig.projectors[0], Rows.join([]))
+        calibrate_projector(nominal_rig.projectors[0], DecodedRows.join([]))
 
 
 def test_rows_decoded_from_frames_give_planes_and_intensity(
@@ -91,7 +93,7 @@ def test_rows_decoded_from_frames_give_planes_and_intensity(
         for k, capture in captures.items()
         for camera in true_rig.cameras[:2]
     ]
-    found = calibrate_projector(nominal_rig.projectors[0], Rows.join(parts))
+    found = calibrate_projector(nominal_rig.projectors[0], DecodedRows.join(parts))
     assert found.rms < 0.15
     assert worst_plane(found.projector, true_rig.projectors[0]) < 1e-3
     known = CameraSolution(true_rig.cameras, to_world, {}, {}, {}, {}, {})
