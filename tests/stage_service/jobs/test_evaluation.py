@@ -1,0 +1,36 @@
+"""A fitted appearance beside the true one."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from appearance.metrics.scores import Exposure
+from appearance.scene.hair_appearance import HairAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance
+from reconstruction.model import Model
+from stage_service.jobs.evaluation import evaluate_appearance
+
+
+def test_one_colour_under_two_azimuthal_roughnesses_is_one_colour(tmp_path):
+    # Chiang et al. 2016, Eq. 9: absorption of a colour grows as the square of 1 / this number.
+    def chiang(beta: float) -> float:
+        return (
+            float(5.969 - 0.215 * beta + 2.532 * beta**2 - 10.73 * beta**3 + 5.574 * beta**4)
+            + 0.245 * beta**5
+        )
+
+    ours = HairAppearance((0.1, 0.2, 0.4), 0.5, 0.2)
+    factor = (chiang(0.2) / chiang(0.6)) ** 2
+    true = HairAppearance(tuple(factor * s for s in ours.sigma_a), 0.3, 0.6)
+    FittedAppearance(ours, (0.5,) * 3, (0.4, 0.3, 0.2), Exposure(1.0), 0.2, 0.2, 0.2).save(
+        Model(tmp_path)
+    )
+    truth = tmp_path / "truth.json"
+    truth.write_text(json.dumps({"hair": true.to_dict(), "skin": [0.5, 0.4, 0.3]}))
+    figures = evaluate_appearance(Model(tmp_path), truth)
+    assert figures["fitted"]["colour"] == pytest.approx(figures["true"]["colour"], rel=1e-6)
+    assert (figures["fitted"]["beta_m"], figures["true"]["beta_m"]) == (0.5, 0.3)
+    assert figures["fitted"]["skin"] == [0.4, 0.3, 0.2]
+    assert figures["true"]["v"] < figures["fitted"]["v"]
