@@ -1,5 +1,6 @@
-"""The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`.
-They import what they need when they run."""
+"""The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`:
+in `stage/` those that run a stage, in `model/` those that work on a model, here all others. They
+import what they need when they run."""
 
 from __future__ import annotations
 
@@ -7,26 +8,9 @@ import argparse
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from stage_service.cli import (
-    bench,
-    calibrate,
-    capture,
-    demo,
-    edit,
-    evaluate,
-    export,
-    fit,
-    head,
-    jobs,
-    lease,
-    reconstruct,
-    render,
-    rig,
-    serve,
-    simulate,
-    verify,
-    worker,
-)
+from stage_service.cli import bench, calibrate, demo, head, rig, verify
+from stage_service.cli.model import edit, evaluate, export, fit, reconstruct, render
+from stage_service.cli.stage import capture, jobs, lease, serve, simulate, worker
 from stage_service.cli.support import EXIT_CODES, run_command
 
 COMMANDS = (

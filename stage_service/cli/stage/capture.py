@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.jobs import add_pipeline, wait_for_job
+from stage_service.cli.stage.jobs import add_pipeline, wait_for_job
 from stage_service.cli.support import (
     FAILED,
     Commands,

@@ -99,7 +99,7 @@ def run_geometry(args: argparse.Namespace, output: Output) -> int:
 
 def run_images(args: argparse.Namespace, output: Output) -> int:
     """Compare pictures."""
-    from stage_service.cli.pictures import compare_pictures, pair_up
+    from stage_service.cli.model.pictures import compare_pictures, pair_up
 
     pairs = pair_up(args.pred, args.true)
     if not pairs:

@@ -1,0 +1,1 @@
+"""Commands that run a stage: its processes, captures and jobs."""
