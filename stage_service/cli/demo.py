@@ -75,7 +75,9 @@ def run_demo(args: argparse.Namespace, output: Output) -> int:
     _prepare(out)
 
     with Children(out / "logs") as children:
-        output.note(f"starting simulated rig, service and worker; their logs: {out.resolve() / 'logs'}")
+        output.note(
+            f"starting simulated rig, service and worker; their logs: {out.resolve() / 'logs'}"
+        )
         with ServiceClient(_start(children, args)) as service:
             capture = _capture(children, service, args, held_out, output)
             job = _job(children, service, capture["job"], out)
