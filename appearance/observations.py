@@ -63,7 +63,7 @@ class Observed:
         )
 
     def under(self, lights: Ints) -> Observed:
-        """The same pixels under some of the lights, by their indices `(l,)`."""
+        """The same pixels under some of the lights, by their indices `(K,)`."""
         return replace(
             self,
             lights=tuple(self.lights[i] for i in lights),

@@ -42,6 +42,7 @@ FILES = {
     "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",
     "relit.png": "the hair under an environment map",
     "relit.exr": "the same as radiance",
+    "render.png": "what `hairstage render` drew last",
     "report.json": "every stage: seconds, figures, error against run time, warnings",
     "plots": "the report's plots",
     "results.json": "the job's figures in one object",

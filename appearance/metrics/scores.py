@@ -23,7 +23,7 @@ _WINDOW /= _WINDOW.sum()
 
 
 def srgb(linear: ArrayLike) -> Array:
-    """The sRGB curve (IEC 61966-2-1) on values clipped to [0, 1]."""
+    """The sRGB curve (IEC 61966-2-1) on values of any shape, clipped to [0, 1]."""
     x = np.clip(np.asarray(linear, float), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
@@ -40,7 +40,7 @@ class Exposure:
 
     @classmethod
     def of(cls, hair_pixels: Iterable[ArrayLike]) -> Exposure:
-        """The exposure that takes the 99th percentile of all training hair pixels' values to 1."""
+        """The exposure that takes the 99th percentile of all `hair_pixels (P, 3)` to 1."""
         values = np.concatenate([np.asarray(p, float).ravel() for p in hair_pixels])
         if len(values) == 0 or not np.percentile(values, 99) > 0:
             raise ValueError("no training hair pixel is lit: the exposure cannot be set")
@@ -107,7 +107,7 @@ def ssim_map(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> A
 
 
 def relative_error(radiance: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> float:
-    """Root of the summed squared radiance error over the summed squared truth, on `mask`."""
+    """Root of the summed squared radiance error over that of the truth, on `mask (H, W)`."""
     radiance, truth, mask = _checked(radiance, truth, mask)
     scale = float(np.sum(truth[mask] ** 2))
     if not scale > 0:

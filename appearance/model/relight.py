@@ -23,7 +23,7 @@ PROCEDURAL = {"studio": studio, "sky": sky}
 
 
 def environment_map(name: str) -> Floats:
-    """The map `(h, w, 3)` "studio" or "sky", or that of an `.hdr` or `.exr` file."""
+    """The map `(H, W, 3)` "studio" or "sky", or that of an `.hdr` or `.exr` file."""
     return PROCEDURAL[name]() if name in PROCEDURAL else load_environment(Path(name))
 
 
@@ -36,7 +36,7 @@ def relight(
     spp: int = 36,
     seed: int = 0,
 ) -> Floats:
-    """Render `fitted` in three-quarter view under an `environment_map`: `(size, size, 3)`.
+    """Render `fitted` in three-quarter view under an `environment_map`: `(N, N, 3)`, N = `size`.
 
     Writes `relit.exr` (radiance) and `relit.png` (the subject's 99th percentile at white, sRGB)
     into `model`.

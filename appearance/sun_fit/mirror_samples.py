@@ -96,7 +96,7 @@ def mirror_samples(
 
 
 def mirror_lights(observed: Observed, fibres: VisibleFibres, *, tilt_deg: float) -> Ints:
-    """Indices `(l,)` of the lights near the mirror direction of a share of 3 % of the pixels."""
+    """Indices `(K,)` of the lights near the mirror direction of a share of 3 % of the pixels."""
     near = _near_mirror(observed, fibres, tilt_deg)[0]
     return np.flatnonzero(near.sum(axis=1) > 0.03 * near.shape[1])
 

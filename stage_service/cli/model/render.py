@@ -39,7 +39,11 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--environment", help="studio (where nothing else is given), sky, or an .hdr or .exr file"
     )
-    render.add_argument("--out", type=Path, help=".png (exposed, sRGB) or .exr (linear)")
+    render.add_argument(
+        "--out",
+        type=Path,
+        help=".png (exposed, sRGB) or .exr (linear), instead of MODEL/render.png",
+    )
     render.add_argument("--spp", type=int, default=64, help="samples a pixel")
     render.add_argument("--seed", type=int, default=0)
 
@@ -69,7 +73,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if capture is None and (args.camera is not None or args.light):
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
     progress("building the scene", 0.0)
-    fitted = FittedModel.load(Model(args.model), capture)
+    model = Model(args.model)
+    fitted = FittedModel.load(model, capture)
     camera = three_quarter_view(fitted.strands, SIZE)
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
@@ -78,7 +83,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     lights = fitted.lights(args.light) if args.light else []
     progress("rendering", 0.2)
     image = fitted.render(camera, lights, maps, Sampling(args.spp, seed=args.seed))
-    out: Path = args.out or args.model / f"render_{camera.name}.png"
+    out: Path = args.out or model.file("render.png")
     with writing(out) as part:
         _write(part, image)
     progress("written", 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,8 +12,10 @@ import pytest
 
 from appearance.bsdf.maps import HairMaps
 from appearance.bsdf.parameters import StrandHit
+from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import Exposure
-from appearance.model.edit import recoloured, wisp_of
+from appearance.model.edit import cut, recoloured, restyled, wisp_of
 from appearance.model.export import at_points, export_maps, export_mitsuba, export_usd
 from appearance.model.fitted_model import FittedModel
 from appearance.render.environment import render_environment
@@ -23,6 +26,7 @@ from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.files.exr import read_exr
 from reconstruction.files.strands import read_strands
 from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.rig import Rig
 from reconstruction.model import Model
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
@@ -149,3 +153,48 @@ def mapped_of(fitted, scene):
     from appearance.bsdf.maps import MappedStrands
 
     return MappedStrands.of(scene, fitted.strands, fitted.root_uv).coordinates
+
+
+def test_cut_strands_end_where_they_were_cut_and_keep_their_colours_in_place(fitted):
+    length = 0.035
+    short = cut(fitted, length)
+    assert (fitted.strands.lengths() > length).all()
+    np.testing.assert_allclose(short.strands.lengths(), length, rtol=1e-4)
+    np.testing.assert_array_equal(short.strands.roots, fitted.strands.roots)
+    # colours at the points that are still there
+    before, after = (at_points(m.maps, m.strands, m.root_uv)[0] for m in (fitted, short))
+    k = 2
+    old = before[fitted.strands.offsets[:-1] + k]
+    # a point's place along its strand is counted in points, and the cut strands have fewer of them
+    counts = [np.diff(m.strands.offsets) - 1 for m in (fitted, short)]
+    assert counts[1].max() < counts[0].min()
+    np.testing.assert_allclose(after[short.strands.offsets[:-1] + k], old, rtol=0.1)
+    with pytest.raises(ValueError, match="above 0"):
+        cut(fitted, 0)
+    long = cut(fitted, 1.0)
+    np.testing.assert_array_equal(long.strands.points, fitted.strands.points)
+    np.testing.assert_allclose(long.maps.sigma_a, fitted.maps.sigma_a)
+
+
+def test_other_strands_take_the_place_of_the_nearest_root(fitted):
+    few = fitted.strands.subset([7, 3])
+    np.testing.assert_array_equal(restyled(fitted, few).root_uv, fitted.root_uv[[7, 3]])
+    assert restyled(fitted, few).scene().hair == fitted.maps.mean()
+    with pytest.raises(ValueError, match="needs strands"):
+        restyled(fitted, fitted.strands.subset([]))
+
+
+def test_lights_are_as_found_where_they_were_fitted(fitted, model, small):
+    front, behind, _ = small.lights()
+    found = LightDeviations(np.array([[0.01, 0, 0]]), np.zeros((1, 3)), np.array([0.5]), np.ones(1))
+    copy = Model(model.path.parent / "found")
+    fitted.save(copy)
+    save_lights(copy, found, [front])
+    rig = Rig("r", (CAMERA,), (front, behind))
+    capture = SimpleNamespace(rig=rig, head=None)
+    ours, calibrated = FittedModel.load(copy, capture).lights(["front", "behind"])
+    np.testing.assert_allclose(ours.position, front.position + np.array([0.01, 0, 0]))
+    np.testing.assert_allclose(ours.intensity, 0.5 * front.intensity)
+    assert calibrated is behind
+    with pytest.raises(ValueError, match="capture"):
+        fitted.lights(["front"])
