@@ -6,6 +6,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -75,7 +76,7 @@ class Service:
     def __init__(self, rig_file: RigFile, root: Path) -> None:
         self.rig_file, self.root = rig_file, root
         self._captures = CaptureManager(rig_file, root, on_complete=self._enqueue_pipeline)
-        self._control = Control(self._captures)
+        self._control = Control(self._captures.audit)
         self._queue = JobQueue(root)
         self._closing = threading.Lock()
         self._closed = threading.Event()
@@ -112,7 +113,7 @@ class Service:
         return resolve(plan, self.rig_file).cost
 
     def start_capture(self, request: CaptureRequest, by: Caller) -> CaptureView:
-        """Begin a capture. Raises `BadInput`, and what `Control.start` raises."""
+        """Begin a capture. Raises `BadInput`, `Leased`, and what `CaptureManager.start` raises."""
         if request.pipeline is not None:
             _check_names(request.pipeline, self.rig_file.rig)
             if "reconstruct" not in PIPELINES[request.pipeline.name]:
@@ -130,14 +131,16 @@ class Service:
                 head = read_obj(request.head)
             except (OSError, ValueError) as error:
                 raise BadInput(f"head: {error}") from error
-        capture = self._control.start(
-            by,
+        work = partial(
+            self._captures.start,
             request.plan,
             armed_by=request.armed_by,
             head=head,
             masks=self._masks(request.masks) if request.masks is not None else None,
             extra={"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {},
         )
+        capture = self._control.do(by, "capture.start", work, None)
+        self._control.record_arming(by, capture, request.armed_by, request.plan.consent)
         return self.capture(capture)
 
     def capture(self, capture_id: str) -> CaptureView:
@@ -150,15 +153,20 @@ class Service:
 
     def pause(self, capture_id: str, by: Caller) -> CaptureView:
         """Pause at the next step boundary. Raises `UnknownCapture`, `WrongState`, `Leased`."""
-        return self._view(self._control.pause(by, capture_id))
+        work = partial(self._captures.pause, capture_id)
+        return self._view(self._control.do(by, "capture.pause", work, capture_id))
 
     def resume(self, capture_id: str, by: Caller, armed_by: str | None = None) -> CaptureView:
         """Go on after a pause; of a capture that did not complete, shoot the frames it lacks."""
-        return self._view(self._control.resume(by, capture_id, armed_by=armed_by))
+        work = partial(self._captures.resume, capture_id, armed_by=armed_by)
+        status = self._control.do(by, "capture.resume", work, capture_id)
+        self._control.record_arming(by, capture_id, armed_by)
+        return self._view(status)
 
     def abort(self, capture_id: str, by: Caller) -> CaptureView:
         """Abort at the next step boundary; anybody may. Raises `UnknownCapture`, `WrongState`."""
-        return self._view(self._control.abort(by, capture_id))
+        work = partial(self._captures.abort, capture_id)
+        return self._view(self._control.do(by, "capture.abort", work, capture_id, steers=False))
 
     def _view(self, status: CaptureStatus) -> CaptureView:
         """The status together with the job that follows it."""
@@ -251,11 +259,13 @@ class Service:
 
     def blackout(self, by: Caller) -> dict[str, Any]:
         """All lamps and projectors off, verified; aborts a running capture. Anybody may."""
-        return self._control.blackout(by)
+        return self._control.blackout(by, self._captures.blackout)
 
     def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:
         """Take a person's word that the lamps are off. Raises `CannotAcknowledge`."""
-        return self._control.acknowledge(by, request.name, request.note)
+        work, detail = self._captures.latch.acknowledge, f"{request.name}: {request.note}"
+        self._control.do(by, "acknowledge", work, detail=detail)
+        return self._captures.darkness()
 
     def lease(self) -> LeaseView:
         """Who steers, if anybody in particular."""
@@ -266,15 +276,20 @@ class Service:
 
     def take_lease(self, request: LeaseRequest, by: Caller) -> LeaseGrant:
         """Steer alone for some time. Raises `Leased`."""
-        return _grant(self._control.take_lease(by, request.holder, request.seconds))
+        work = partial(self._control.leases.take, request.holder, request.seconds)
+        detail = f"{request.holder}, {request.seconds:g} s"
+        return _grant(self._control.do(by, "lease.take", work, detail=detail, steers=False))
 
     def renew_lease(self, request: RenewRequest, by: Caller) -> LeaseGrant:
         """Let the caller's lease end so many seconds from now. Raises `NoLease`."""
-        return _grant(self._control.renew_lease(by, request.seconds))
+        work = partial(self._control.leases.renew, by.token or "", request.seconds)
+        detail = f"{request.seconds:g} s"
+        return _grant(self._control.do(by, "lease.renew", work, detail=detail, steers=False))
 
     def release_lease(self, by: Caller) -> LeaseView:
         """End the caller's lease. Raises `NoLease`."""
-        self._control.release_lease(by)
+        work = partial(self._control.leases.release, by.token or "")
+        self._control.do(by, "lease.release", work, steers=False)
         return self.lease()
 
     def audit(self, limit: int) -> list[Action]:
