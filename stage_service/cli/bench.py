@@ -30,8 +30,10 @@ def add(commands: Commands) -> None:
         "bench",
         help="measure error against run time (in a checkout)",
         description="Run a benchmark of the checkout; what follows NAME is its own.",
+        epilog="\n".join(f"  {name:<13}{text}" for name, text in BENCHMARKS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    bench.add_argument("name", choices=tuple(BENCHMARKS))
+    bench.add_argument("name", choices=tuple(BENCHMARKS), metavar="NAME")
     bench.add_argument("arguments", nargs=argparse.REMAINDER)
     bench.set_defaults(run=run_bench, json=False)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rich.console import Console
 from scipy import ndimage
 
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, cycles_folder, within
@@ -188,8 +189,6 @@ def run_imported(
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Every patch of `TARGETS`, or one; fewer cameras and lights, and `study`, on Sintel's only."""
-    from rich.console import Console
-
     if args.only not in (None, *TARGETS):
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(TARGETS)}")
     names = ["wavy"] if args.quick else [n for n in TARGETS if args.only in (None, n)]
