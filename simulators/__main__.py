@@ -89,8 +89,8 @@ def _run(
         key = cache_key(subject.digest(), rig.to_dict(), asdict(quality), args.seed)
         frames = FrameMaker(rig, responder, sensor, args.seed, args.cache, key)
         log = args.truth / EXPOSURES if args.truth is not None else None
-        lamps, moves = Lamps(len(rig.lights)), args.drift_mm > 0
-        world = World(rig, lamps, faults, frames.counts, log, args.processes, moves)
+        counts = frames.counts if args.drift_mm > 0 else frames.counts_at_rest
+        world = World(rig, Lamps(len(rig.lights)), faults, counts, log, args.processes)
         free = args.ports == "auto"
         wires, paced = rig_file.devices, args.paced
         stage = SimulatedStage(world, sensor, args.state, wires, free, paced)

@@ -52,8 +52,6 @@ class World:
     exposure stays at its pose. The subject takes their place again, pose 0, when a new capture
     begins: when the first pulse after a reset sees no light, or a lamp alone is lit.
 
-    A subject that does not `move` keeps pose 0 throughout.
-
     `make` renders and exposes on one thread for each of `lanes`; camera number i belongs to lane
     i modulo `lanes`, and a camera's frames are made one after the other. `log`, when given, gets
     one JSON line a pulse with its pose.
@@ -67,7 +65,6 @@ class World:
         make: MakeCounts,
         log: Path | None = None,
         lanes: int = 1,
-        moves: bool = True,
     ) -> None:
         self.rig = rig
         self.lamps = lamps
@@ -76,7 +73,6 @@ class World:
         self.faults = faults
         self._make = make
         self._log = log
-        self._moves = moves
         self._lock = threading.RLock()
         self._pulses = 0
         self._fired = 0
@@ -114,7 +110,7 @@ class World:
             if self.faults.once("lights", "stuck", self._pulses):
                 self.lamps.stick()
             power, show = self.lamps.power(), self.projectors.show
-            if fires and self._moves:
+            if fires:
                 self._move_subject(power, show)
             shot = Snapshot(self._pulses, power, show, self._pose)
             for _ in range(fires):

@@ -7,7 +7,7 @@ import json
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,10 @@ class FrameMaker:
         index = [c.name for c in self._rig.cameras].index(camera)
         radiance = self.radiance(camera, shot)
         return self._sensor.expose(radiance, exposure, (self._seed, index, shot.pulse))
+
+    def counts_at_rest(self, camera: str, shot: Snapshot, exposure: float) -> NDArray[np.uint16]:
+        """`counts (H, W, 3)` of a subject whose poses are all the same: nothing is made twice."""
+        return self.counts(camera, replace(shot, pose=0), exposure)
 
     def radiance(self, camera: str, shot: Snapshot) -> Floats:
         """Radiance `(H, W, 3)`, W/(sr m²), without noise."""

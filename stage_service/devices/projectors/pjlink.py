@@ -10,7 +10,6 @@ import hashlib
 import re
 import socket
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -20,7 +19,6 @@ from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnrea
 
 PORT = 4352
 _LONGEST_LINE = 136
-_POLL_S = 0.5
 _ERRORS = {
     "1": ("ERR1, an undefined command", "The projector does not offer this; use its own panel."),
     "2": ("ERR2, a parameter out of range", "The projector does not offer this state."),
@@ -87,36 +85,8 @@ class PjLinkProjector:
         return tuple(Lamp(int(hours), lit == "1") for hours, lit in pairs)
 
     def switch(self, on: bool) -> None:
-        """Ask for power on or standby. OK means accepted, not reached: see `wait_for`."""
+        """Ask for power on or standby. OK means accepted: `power` says when it is reached."""
         self._ask(f"POWR {on:d}", "OK", f"switching the power {'on' if on else 'off'}")
-
-    def wait_for(
-        self, wanted: Power, within_s: float, wait: Callable[[float], object] = time.sleep
-    ) -> None:
-        """Return once it reports `wanted`; raises `DeviceTimeout` that names what it reports.
-
-        ERR3 counts as not yet. `wait(seconds)` passes the time between two questions; what it
-        raises ends the waiting.
-        """
-        deadline = time.monotonic() + within_s
-        while True:
-            try:
-                state = self.power()
-                if state is wanted:
-                    return
-                received = f"{state.name} ({state:d})"
-            except ProjectorBusy as busy:
-                received = busy.received
-            if time.monotonic() + _POLL_S > deadline:
-                raise DeviceTimeout(
-                    self.name,
-                    f"waiting for the power state {wanted.name}",
-                    expected=f"{wanted.name} ({wanted:d})",
-                    received=received,
-                    deadline_s=within_s,
-                    todo="Lamps take minutes to start and to cool; see the projector itself.",
-                )
-            wait(_POLL_S)
 
     def _ask(self, command: str, answer: str, doing: str) -> str:
         """Send `command` and return what follows `=` in its answer, which is like `answer`."""

@@ -240,33 +240,6 @@ def test_several_lamps_are_read() -> None:
     assert lamps == (Lamp(12, True), Lamp(99_999, False))
 
 
-def test_waiting_ends_when_the_state_is_reached_and_err3_is_not_yet(rig: Rig) -> None:
-    projector = rig.projector(warm_up_s=60.0)
-    projector.switch(True)
-    rig.faults = [("%1POWR ?", "busy")]
-    waits: list[float] = []
-
-    def wait(seconds: float) -> None:
-        waits.append(seconds)
-        rig.clock.advance(25.0)
-
-    projector.wait_for(Power.ON, within_s=10.0, wait=wait)
-    assert len(waits) == 3
-
-
-@pytest.mark.parametrize(
-    ("fault", "says"), [(None, r"WARM_UP \(3\)"), ("lie", r"STANDBY \(0\)")], ids=["slow", "lie"]
-)
-def test_power_that_was_accepted_and_does_not_come_is_told_with_what_it_says(
-    rig: Rig, fault: str | None, says: str
-) -> None:
-    projector = rig.projector(warm_up_s=float("inf"))
-    rig.faults = [("%1POWR 1", fault)] if fault else []
-    projector.switch(True)
-    with pytest.raises(DeviceTimeout, match=rf"expected ON \(1\) within 0\.2 s, received {says}"):
-        projector.wait_for(Power.ON, within_s=0.2)
-
-
 def test_the_simulated_projector_answers_what_it_does_not_know_with_errors() -> None:
     projector = SimulatedProjector()
     assert projector.reply("%1POWR 2") == "%1POWR=ERR2"
