@@ -16,6 +16,7 @@ from appearance.bsdf.longitudinal import (
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut, Observed, chosen, observe
 from appearance.render.olat import render_olat
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -25,7 +26,6 @@ from appearance.sun_fit.roughness_and_colour import (
     Colours,
     Lobe,
     Pixels,
-    Sampling,
     fit_colour,
     fit_lobe,
     fit_lobe_as_printed,

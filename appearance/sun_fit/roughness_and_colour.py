@@ -23,12 +23,14 @@ from appearance.bsdf.longitudinal import (
 )
 from appearance.observations import Observed
 from appearance.render.olat import render_olat
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
+SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
 
@@ -126,15 +128,6 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """Paths a pixel, vertices a path, and the seed."""
-
-    spp: int = 32
-    max_depth: int = 16
-    seed: int = 0
-
-
-@dataclass(frozen=True)
 class Colours:
     """What Algorithm 1 found: C, its hair and the skin's albedo.
 
@@ -155,7 +148,7 @@ def fit_colour(
     *,
     start: Array | None = None,
     iterations: int = 5,
-    sampling: Sampling | None = None,
+    sampling: Sampling = SAMPLING,
     on_iteration: Callable[[float], None] = lambda error: None,
 ) -> Colours:
     """Sun's Algorithm 1: the multiple-scattering albedo C whose rendering has the captured colour.
@@ -167,7 +160,6 @@ def fit_colour(
     within `TOLERANCE`, or after `iterations` with one more update. Every rendering draws other
     random numbers, so that the fit averages their noise.
     """
-    sampling = sampling or Sampling()
     if not isinstance(scene.hair, HairAppearance):
         raise TypeError("fit_colour needs a scene with HairAppearance, not diffuse fibres")
     beta_n = scene.hair.beta_n
@@ -211,7 +203,12 @@ def fit_diffuse(
     for step in range(3):
         lit = scene.with_hair(DiffuseHair(_rgb(albedo)))
         pairs.append(
-            (albedo, _mean_colour([_rendered(lit, o, Sampling(seed=seed + step)) for o in hair]))
+            (
+                albedo,
+                _mean_colour(
+                    [_rendered(lit, o, replace(SAMPLING, seed=seed + step)) for o in hair]
+                ),
+            )
         )
         albedo = next_colour(pairs, target)
     return _rgb(albedo)
