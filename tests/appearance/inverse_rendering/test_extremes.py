@@ -1,4 +1,4 @@
-"""Stiff and extreme cases: the fit ends by itself, never with a NaN, never worse than its start."""
+"""Stiff and extreme cases: the fit ends by itself, and nearer to the truth than it began."""
 
 from __future__ import annotations
 
@@ -20,48 +20,57 @@ FEW = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=5)
 OPTIONS = InverseRenderingOptions(
     variant="original", steps=4, check_every=2, validation_views=1, effort=FEW
 )
+ENOUGH = replace(OPTIONS, effort=Effort(pixels=80, spp=16, gradient_spp=4, max_depth=5))
 
 
 def check(
     problem: Problem, start: HairMaps, options: InverseRenderingOptions = OPTIONS
 ) -> HairMaps:
     found = run(problem, start, options=options)
-    assert np.isfinite([found.error, found.start_error]).all()
-    assert found.error <= found.start_error
+    assert found.error < found.start_error
     assert np.isfinite(found.maps.sigma_a).all()
     assert found.ended
     return found.maps
 
 
-@pytest.mark.parametrize(
-    "truth",
-    [
-        HairAppearance((6.0, 9.0, 15.0), 0.25, 0.3),
-        HairAppearance((0.001, 0.002, 0.008), 0.25, 0.3),
-    ],
-    ids=["black hair", "white hair"],
-)
-def test_black_and_white_hair(tufted, truth):
-    check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START))
+def off(maps: HairMaps, truth: HairAppearance) -> float:
+    """The largest |log| of a found number over its true one: absorption, beta_m."""
+    found = [*maps.sigma_a.reshape(-1, 3).mean(0), maps.beta_m]
+    return float(np.abs(np.log(np.array(found) / [*truth.sigma_a, truth.beta_m])).max())
+
+
+def test_black_hair_is_found_darker_than_the_start(tufted):
+    truth = HairAppearance((6.0, 9.0, 15.0), 0.25, 0.3)
+    found = check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START))
+    assert found.sigma_a.min() > 1.3 * START.sigma_a[0]
+
+
+def test_white_hair_is_found_lighter_than_the_start(tufted):
+    truth = HairAppearance((0.001, 0.002, 0.008), 0.25, 0.3)
+    found = check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START), ENOUGH)
+    assert found.sigma_a.max() < 0.7 * START.sigma_a[0]
 
 
 @pytest.mark.parametrize("beta_m", [0.02, 0.9])
-def test_a_roughness_that_starts_at_either_end(plain, beta_m):
-    check(plain, HairMaps.of(replace(START, beta_m=beta_m)))
+def test_a_roughness_that_starts_at_either_end(plain, tufted, beta_m):
+    found = check(plain, HairMaps.of(replace(START, beta_m=beta_m)))
+    assert off(found, tufted.truth) < 0.75
 
 
 def test_one_light_and_one_view(tufted):
-    lone = tufted.problem(views=1, lights=tufted.dome(8)[1:2])
-    check(lone, HairMaps.of(START), replace(OPTIONS, variant="lights", shape=(2, 2, 2)))
+    lone = tufted.problem(views=1, lights=tufted.dome(8)[:1])
+    found = check(lone, HairMaps.of(START), ENOUGH)
+    assert (np.diff(found.sigma_a[0, 0, 0]) > 0).all(), "brown hair takes most of the blue"
 
 
-def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain):
+def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain, tufted):
     views = []
     for o in plain.views:
         bright = o.radiance.max(axis=-1) > np.percentile(o.radiance, 95)
         radiance = np.where(bright[..., None], 1e9, o.radiance).astype(np.float32)
         views.append(replace(o, radiance=radiance, valid=~bright))
-    check(Problem(plain.mapped, views, plain.scale, plain.skin), HairMaps.of(START))
+    cut = Problem(plain.mapped, views, plain.scale, plain.skin)
+    assert off(check(cut, HairMaps.of(START), ENOUGH), tufted.truth) < 0.4
 
 
 def test_a_cell_that_no_ray_meets_stays_at_its_prior(tufted, plain):
@@ -89,12 +98,14 @@ def test_gradients_at_no_rotation_are_finite_and_not_all_zero(plain):
 
 def test_lights_at_a_third_of_the_distance(tufted):
     near = tufted.problem(views=1, lights=tufted.dome(8, 0.33))
-    check(near, HairMaps.of(START), replace(OPTIONS, variant="lights", shape=(2, 2, 2)))
+    found = check(near, HairMaps.of(START), replace(ENOUGH, variant="lights", shape=(2, 2, 2)))
+    assert off(found, tufted.truth) < 0.75
 
 
-def test_a_constant_image_is_fitted_as_far_as_it_goes(plain):
+def test_a_bright_constant_image_makes_the_hair_lighter(plain):
     views = [replace(o, radiance=np.full_like(o.radiance, 0.5 / plain.scale)) for o in plain.views]
-    check(Problem(plain.mapped, views, plain.scale, plain.skin), HairMaps.of(START))
+    grey = Problem(plain.mapped, views, plain.scale, plain.skin)
+    assert check(grey, HairMaps.of(START), ENOUGH).sigma_a.max() < START.sigma_a[0]
 
 
 def test_black_frames_end_the_fit_at_once_with_the_reason(plain):

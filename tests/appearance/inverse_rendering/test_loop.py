@@ -93,8 +93,7 @@ def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_pa
 def test_a_fit_from_the_truth_does_not_leave_it_for_noise(plain, tufted, original):
     few = replace(tufted.quick, pixels=20, spp=1, gradient_spp=1)
     found = run(plain, HairMaps.of(tufted.truth), options=replace(original, steps=10, effort=few))
-    assert found.error <= found.start_error
-    assert far(found.maps, tufted.truth) < 0.7
+    assert far(found.maps, tufted.truth) < 0.1
 
 
 @pytest.mark.parametrize(

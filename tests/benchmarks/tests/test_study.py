@@ -17,7 +17,6 @@ def test_opencvs_loop_gives_what_our_bank_gives() -> None:
     bank = LogGaborBank(count=12, spread=1.0, wavelength=5.0)
     found = study.compare_filters(bank, image)
     assert found["difference"] < 0.03
-    assert found["faster"] > 0
 
 
 def test_brute_force_agrees_with_itself_and_worse_searches_find_less(

@@ -22,11 +22,23 @@ BEAM = Projector.look_at("beam", 12, 12, (1.0, -0.2, 0.2), (0, 0, 0), 20.0)
 RIG = Rig("props", (CAMERA,), LAMPS, (BEAM,))
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [("board:3", BoardProp), ("mirror:1", SphereProp), ("diffuse:0", SphereProp)]
-)
-def test_props_have_names(name: str, kind: type) -> None:
-    assert isinstance(named_prop(name), kind)
+@pytest.mark.parametrize(("name", "mirror"), [("mirror:1", True), ("diffuse:0", False)])
+def test_spheres_have_names(name: str, mirror: bool) -> None:
+    sphere, again = named_prop(name), named_prop(f"{name[:-1]}{int(name[-1]) + 4}")
+    assert isinstance(sphere, SphereProp)
+    assert sphere.mirror == mirror
+    assert np.linalg.norm(sphere.centre) == pytest.approx(0.1118 if mirror else 0.02, abs=1e-4)
+    assert isinstance(again, SphereProp)
+    assert (again.centre == sphere.centre).all(), "there are four places"
+
+
+def test_a_boards_number_is_a_sixteenth_turn_about_the_stage() -> None:
+    for number in range(16):
+        board = named_prop(f"board:{number}")
+        assert isinstance(board, BoardProp)
+        x, y, _ = board.rotation[:, 2]  # away from where the board faces
+        off = np.degrees(np.arctan2(-y, -x)) - 22.5 * number
+        assert abs((off + 180) % 360 - 180) < 8
 
 
 @pytest.mark.parametrize("name", ["wavy", "board", "board:x", "hair.npz"])
