@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections.abc import Callable
@@ -172,12 +171,11 @@ class Service:
         """The status together with the job that follows it."""
         job = None
         if status.outcome == "completed" and status.request.get("pipeline") is not None:
-            job = job_of(status.id)
             try:
-                self._queue.get(job)
+                job = self._queue.get(job_of(status.id))
             except NoSuchJob:  # the capture's own thread is just about to enqueue it
-                self._enqueue_pipeline(status)
-        return CaptureView(**status.model_dump(), job=job)
+                job = self._enqueue_pipeline(status)
+        return CaptureView(**status.model_dump(), job=None if job is None else job.id)
 
     def frame(self, capture_id: str, step: int, camera: str, read: Callable[[Path], T]) -> T:
         """What `read` makes of a frame's EXR file, wherever compression has just put it.
@@ -199,10 +197,10 @@ class Service:
         try:
             return self._captures.path(capture_id)
         except UnknownCapture:
-            with contextlib.suppress(UnknownArtifact):
-                path = inside(self.root / "captures", capture_id)
-                if (path / "plan.json").is_file():
-                    return path
+            folder = (self.root / "captures").resolve()
+            path = (folder / capture_id).resolve()
+            if path.parent == folder and (path / "plan.json").is_file():
+                return path
             raise
 
     def submit(self, request: JobRequest) -> Job:
@@ -212,20 +210,14 @@ class Service:
             raise NotFinished(f"capture {request.capture} has no manifest yet: it is not finished")
         _check_names(request.pipeline, Capture(path).rig)
         job = new_job_id()
-        model = self.root / "models" / (request.model or job)
+        model = Model(self.root / "models" / (request.model or job))
         rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
-        if not rebuilds and not (model / "strands.npz").is_file():
+        if not rebuilds and not model.has("strands.npz"):
             raise BadInput(
                 f"model: {request.pipeline.name!r} needs a model with strands: name one that "
                 "'reconstruct' made"
             )
-        return self._queue.submit(
-            request.pipeline.name,
-            path,
-            model,
-            request.pipeline.options,
-            job=job,
-        )
+        return self._queue.submit(request.pipeline, path, model, job=job)
 
     def jobs(self, limit: int) -> list[Job]:
         """The latest `limit` jobs, newest first."""
@@ -248,10 +240,10 @@ class Service:
 
     def artifact(self, job_id: str, path: str) -> Path:
         """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
-        file = inside(Path(self._queue.get(job_id).model), path)
-        if not file.is_file():
+        model = Model(self._queue.get(job_id).model)
+        if Path(path) not in model.listing():
             raise UnknownArtifact(f"job {job_id} has no file {path!r}")
-        return file
+        return model.path / path
 
     def devices(self) -> dict[str, Any]:
         """Each device and whether it answers; "safety": whether the lamps are known to be off."""
@@ -325,23 +317,18 @@ class Service:
             raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
         return masks
 
-    def _enqueue_pipeline(self, status: CaptureStatus) -> None:
+    def _enqueue_pipeline(self, status: CaptureStatus) -> Job | None:
         asked = status.request.get("pipeline")
         if asked is None:
-            return
+            return None
         try:
             pipeline = PipelineRequest.model_validate(asked)
         except ValidationError as error:  # a capture of another version must not stop this one
             log.warning("%s: its pipeline cannot be run: %s", status.path, error)
-            return
+            return None
         # One id per capture: enqueuing again after a crash is not a second job.
-        self._queue.submit(
-            pipeline.name,
-            Path(status.path),
-            self.root / "models" / status.id,
-            pipeline.options,
-            job=job_of(status.id),
-        )
+        model = Model(self.root / "models" / status.id)
+        return self._queue.submit(pipeline, Path(status.path), model, job=job_of(status.id))
 
     def _watch_jobs(self) -> None:
         seen: dict[str, Job] = {}
@@ -364,15 +351,6 @@ def _grant(lease: Lease) -> LeaseGrant:
 def job_of(capture_id: str) -> str:
     """The id of the job that a capture's completion enqueues."""
     return f"job-{capture_id}"
-
-
-def inside(folder: Path, path: str) -> Path:
-    """`folder / path`, or `UnknownArtifact` where that leads out of the folder."""
-    root = folder.resolve()
-    file = (root / path).resolve()
-    if not file.is_relative_to(root) or file == root:
-        raise UnknownArtifact(f"{path!r} is not a file in this folder")
-    return file
 
 
 def _check_names(pipeline: PipelineRequest, rig: Rig) -> None:

@@ -66,7 +66,7 @@ class CaptureManager:
         self,
         rig_file: RigFile,
         root: Path,
-        on_complete: Callable[[CaptureStatus], None] | None = None,
+        on_complete: Callable[[CaptureStatus], object] | None = None,
     ) -> None:
         self.rig_file = rig_file
         self.folder = root / "captures"

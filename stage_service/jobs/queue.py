@@ -12,9 +12,8 @@ from typing import Any
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, WorkflowStatus
 
 from reconstruction.model import Model
-from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.progress import read_progress
-from stage_service.jobs.records import Job, JobError, JobOptions, JobOutcome, JobState
+from stage_service.jobs.records import Job, JobError, JobOutcome, JobState, PipelineRequest
 
 APP = "hairstage"
 QUEUE = "jobs"
@@ -62,20 +61,13 @@ class JobQueue:
         """Let go of the database."""
         self._client.destroy()
 
-    def submit(
-        self, pipeline: str, capture: Path, model: Path, options: JobOptions, *, job: str
-    ) -> Job:
-        """Put a job on the queue; where there is a job of this id already, return that one.
-
-        Raises `ValueError` for an unknown pipeline.
-        """
-        if pipeline not in PIPELINES:
-            raise ValueError(f"there is no pipeline {pipeline!r}; there are {sorted(PIPELINES)}")
+    def submit(self, request: PipelineRequest, capture: Path, model: Model, *, job: str) -> Job:
+        """Put a job on the queue; where there is a job of this id already, return that one."""
         spec = {
-            "pipeline": pipeline,
+            "pipeline": request.name,
             "capture": str(capture.resolve()),
-            "model": str(model.resolve()),
-            "options": options.to_dict(),
+            "model": str(model.path.resolve()),
+            "options": request.options.to_dict(),
         }
         self._client.enqueue(
             {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job}, spec

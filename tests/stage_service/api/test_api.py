@@ -17,10 +17,11 @@ from waiting import until
 
 from reconstruction.capture.folder import Step
 from reconstruction.files.exr import read_exr
+from reconstruction.model import Model
 from stage_service.api.app import LOOPBACK, create_app
 from stage_service.api.problems import KINDS, Problem, errors_page
 from stage_service.config import RigFile
-from stage_service.jobs.records import Job, JobOptions
+from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.plan import resolved, steps
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.service import Service
@@ -213,7 +214,7 @@ def test_artifacts_stay_inside_the_model_folder(http, server, tmp_path):
     (tmp_path / "secret").write_text("secret")
     (model / "way_out").symlink_to(tmp_path / "secret")
     queue = server.service._queue
-    queue.submit("fit", tmp_path, model, JobOptions(), job="job-1")
+    queue.submit(PipelineRequest(name="fit"), tmp_path, Model(model), job="job-1")
     listed = {a["path"]: a["bytes"] for a in http.get("/jobs/job-1/artifacts").json()}
     assert listed == {"masks/cam_0.png": 3, "report.json": 14}
     assert http.get("/jobs/job-1/artifacts/masks/cam_0.png").content == b"png"
@@ -259,7 +260,8 @@ def test_events_are_numbered_and_replay_from_the_last_seen(http, server):
 
 def test_job_events_follow_the_queue(http, server, tmp_path):
     before = server.service.events.last
-    server.service._queue.submit("fit", tmp_path, tmp_path / "m", JobOptions(), job="job-7")
+    request, model = PipelineRequest(name="fit"), Model(tmp_path / "m")
+    server.service._queue.submit(request, tmp_path, model, job="job-7")
     (event,) = read_events(http, 1, {"Last-Event-ID": str(before)})
     assert (event["kind"], event["data"]["state"]) == ("job.state", "queued")
 
