@@ -1,9 +1,13 @@
-"""From a capture folder to strands: every stage of the light-plane method, with its report."""
+"""From a capture folder to strands: the stages, in order.
+
+`reconstruct` is the way of a capture through all of them; `_Stages` has each of them, with what it
+says in the report.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,18 +22,20 @@ from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
-from reconstruction.head.fitted import FittedHead, digitised_points, lay_head, skin_points
+from reconstruction.head.capture_head import (
+    FittedHead,
+    HeadPoints,
+    digitised_points,
+    fit_capture_head,
+    skin_points,
+)
 from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
+from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.line_strands import line_strands, merge
-from reconstruction.light_planes import (
-    Motion,
-    PointCloud,
-    solve_motion,
-    sweep_peaks,
-    triangulate,
-)
+from reconstruction.light_codes.segments import Segments
+from reconstruction.light_planes import Motion, PointCloud, solve_motion, sweep_peaks, triangulate
 from reconstruction.masks import MaskedCapture, hair_masks, usable_masks
 from reconstruction.methods import METHODS, Method
 from reconstruction.model import Model
@@ -63,124 +69,31 @@ def reconstruct(
     Writes `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`, `scalp_map.npz`,
     `masks/*.png`, `head.obj` where the capture has none, and `report.json`, whose stages of the
     same name are replaced. Raises `CaptureError` where the capture lacks what the method cannot do
-    without: OLAT frames, a head or points to lay one under, two cameras.
+    without: OLAT frames, a head or points to fit one to, two cameras.
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
-    report = model.create().report()
-    whole = _undistorted(capture, report)
+    stages = _Stages(model.create(), options, progress, model.report())
+    whole = stages.undistorted(capture)
     capture = _without(whole, options.held_out)
-    head, fitted = capture.head, _digitised_head(capture, model, options, report)
-    if fitted is not None:
-        head = fitted.mesh
-
-    with report.stage("triangulation") as stage:
-        cloud = _points(capture, motion, options, report, stage, progress)
-        model.write_points(cloud)
-    with report.stage("masks") as stage:
-        # a held-out camera's mask says where to compare pictures; nothing here looks at it
-        network = None if options.network is None else Network(options.network)
-        every = hair_masks(whole, cloud if len(cloud) else None, head, network=network)
-        if network is not None:
-            stage.figures["network"] = network.to_dict()
-        for name, mask in every.items():
-            model.write_mask(name, "hair", whole.mask_as_shot(name, mask.hair))
-            model.write_mask(name, "skin", whole.mask_as_shot(name, mask.skin))
-        masks = usable_masks(capture, every, stage)
-        stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
-        stage.figures["source"] = {k: m.source for k, m in masks.items()}
-    masked = MaskedCapture(capture, masks)
-    if method in ("photometric", "lmvs"):
-        strands = _line_strands(masked, head, method, options, report, progress)
-        model.write_strands(strands)
-        model.write_report(report)
-        return report
-    if head is None:
-        with report.stage("head") as stage:
-            skin = skin_points(capture, cloud, masks)
-            fitted = lay_head(skin, options.head_mesh, stage, cloud=cloud, seed=options.seed)
-            model.write_head(fitted.mesh)
-        head = fitted.mesh
-    with report.stage("envelope") as stage:
-        envelope, depths = build_envelope(
-            masked, cloud, head, grid=options.grid, margin=options.margin, stage=stage
-        )
-    with report.stage("orientation") as stage:
-        measured = measure_tangents(masked, cloud.points, depths, options.measure, stage, progress)
-    seen = _surface(measured, cloud, options, report, progress)
-    if method == "fused":
-        more, segments = line_strands(
-            masked, head, report, options=options.light_codes, progress=progress
-        )
-        seen += more
-        measured = merge(measured, segments)
-    with report.stage("field") as stage:
-        scalp = find_scalp(head, envelope)
-        field = _field(envelope, measured, scalp, options, stage)
-    with report.stage("strands") as stage:
-        strands = grow(field, scalp, options, stage, progress, seen)
-        model.write_strands(strands)
-        write_root_map(model, strands, scalp, fitted.scalp_map if fitted else None, stage)
-    model.write_report(report)
-    return report
-
-
-def _line_strands(
-    masked: MaskedCapture,
-    head: Mesh | None,
-    method: Literal["photometric", "lmvs"],
-    options: ReconstructOptions,
-    report: Report,
-    progress: Progress,
-) -> Strands:
-    """Strands from line stereo alone: only what is seen, none of them rooted."""
-    polylines, _ = line_strands(
-        masked, head, report, method=method, options=options.light_codes, progress=progress
-    )
-    with report.stage("strands") as stage:
-        radius = options.radius or float(np.clip(HEAD_OF_HAIR / max(len(polylines), 1), 4e-5, 4e-4))
-        strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
-        stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
-        stage.leave_out(
-            "roots",
-            "line stereo measures what is seen; the method 'fused' leads it to the scalp",
-            "the field and the growth",
-        )
-    return strands
-
-
-def _digitised_head(
-    capture: Capture, model: Model, options: ReconstructOptions, report: Report
-) -> FittedHead | None:
-    """The head under the user's scalp points; they win over `head.obj` where asked for."""
-    model.remove("head.obj")
-    report.stages = [s for s in report.stages if s.name != "head"]
-    if capture.head is not None and options.scalp_points is None:
-        return None
-    points = digitised_points(capture, options.scalp_points)
-    if points is None:
-        return None
-    with report.stage("head") as stage:
-        fitted = lay_head(points, options.head_mesh, stage, seed=options.seed)
-        model.write_head(fitted.mesh)
-    return fitted
-
-
-def _undistorted(capture: Capture, report: Report) -> Capture:
-    """The capture through pinholes; "lenses" says how much of each picture with a lens is left."""
-    report.stages = [s for s in report.stages if s.name != "lenses"]
-    if not any(c.distorted for c in capture.rig.cameras):
-        return capture
-    with report.stage("lenses") as stage:
-        out = capture.view(undistorted=True)
-        kept = {name: lens.kept() for name, lens in out.lenses.items()}
-        stage.figures["pixels_kept"] = kept
-        for name, share in kept.items():
-            if share < 0.85:
-                stage.warn(
-                    f"{name}: {1 - share:.0%} of the picture lie outside the undistorted one"
-                )
-    return out
+    head = stages.known_head(capture)
+    cloud = stages.points(capture, motion)
+    masked = stages.masks(whole, capture, cloud, head)
+    if method == "photometric" or method == "lmvs":
+        stages.seen_strands(masked, head, method)
+    else:
+        head = head or stages.head_under_skin(masked, cloud)
+        envelope, measured = stages.tangents(masked, cloud, head.mesh)
+        seen = stages.surface(measured, cloud)
+        if method == "fused":
+            more, segments = stages.lines(masked, head, "photometric")
+            seen += more
+            measured = merge(measured, segments)
+        scalp = find_scalp(head.mesh, envelope)
+        field = stages.field(envelope, measured, scalp)
+        stages.strands(field, scalp, seen, head.scalp_map)
+    model.write_report(stages.report)
+    return stages.report
 
 
 def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
@@ -193,140 +106,259 @@ def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
     return capture.view(cameras=left)
 
 
-def _points(
-    capture: Capture,
-    motion: Motion | None,
-    options: ReconstructOptions,
-    report: Report,
-    stage: Stage,
-    progress: Progress,
-) -> PointCloud:
-    """Triangulated points in the reference pose; none where there was no sweep."""
-    names = tuple(c.name for c in capture.rig.cameras)
-    if not capture.of_kind("scanline"):
-        why = "the rig has no projector" if not capture.rig.projectors else "no sweep was shot"
-        stage.leave_out("triangulation and motion", why, "the scanline sweep and its solve")
-        return PointCloud.empty(names, tuple(p.name for p in capture.rig.projectors))
-    peaks = sweep_peaks(capture, progress=progress)
-    if motion is None:
-        first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
-        with report.stage("motion") as motion_stage:
-            motion = solve_motion(
-                capture, first, options=options.motion, progress=progress, stage=motion_stage
+@dataclass(frozen=True)
+class _Stages:
+    """The stages; each times itself and leaves its figures and warnings in the report."""
+
+    model: Model
+    options: ReconstructOptions
+    progress: Progress
+    report: Report
+
+    def undistorted(self, capture: Capture) -> Capture:
+        """The capture through pinholes; "lenses" says how much of each picture is left."""
+        self.report.drop("lenses")
+        if not any(c.distorted for c in capture.rig.cameras):
+            return capture
+        with self.report.stage("lenses") as stage:
+            out = capture.view(undistorted=True)
+            kept = {name: lens.kept() for name, lens in out.lenses.items()}
+            stage.figures["pixels_kept"] = kept
+            for name, share in kept.items():
+                if share < 0.85:
+                    stage.warn(
+                        f"{name}: {1 - share:.0%} of the picture lie outside the undistorted one"
+                    )
+        return out
+
+    def known_head(self, capture: Capture) -> FittedHead | None:
+        """The head under the user's scalp points, which win where asked for, or the capture's."""
+        self.model.remove("head.obj")
+        self.report.drop("head")
+        asked = self.options.scalp_points
+        if capture.head is not None and asked is None:
+            return FittedHead(capture.head, None)
+        points = digitised_points(capture, asked)
+        return None if points is None else self._fitted(points)
+
+    def head_under_skin(self, masked: MaskedCapture, cloud: PointCloud) -> FittedHead:
+        """The head under the triangulated points on bare skin."""
+        return self._fitted(skin_points(masked, cloud), cloud)
+
+    def _fitted(self, points: HeadPoints, cloud: PointCloud | None = None) -> FittedHead:
+        with self.report.stage("head") as stage:
+            seed = self.options.seed
+            head = fit_capture_head(points, self.options.head_mesh, stage, cloud=cloud, seed=seed)
+            self.model.write_head(head.mesh)
+        return head
+
+    def points(self, capture: Capture, motion: Motion | None) -> PointCloud:
+        """Triangulated points in the reference pose; none where there was no sweep."""
+        rig = capture.rig
+        with self.report.stage("triangulation") as stage:
+            if capture.of_kind("scanline"):
+                cloud = self._triangulated(capture, motion, stage)
+            else:
+                why = "no sweep was shot" if rig.projectors else "the rig has no projector"
+                stage.leave_out("triangulation and motion", why, "the scanline sweep and its solve")
+                cloud = PointCloud.empty(
+                    tuple(c.name for c in rig.cameras), tuple(p.name for p in rig.projectors)
+                )
+            self.model.write_points(cloud)
+        return cloud
+
+    def _triangulated(self, capture: Capture, motion: Motion | None, stage: Stage) -> PointCloud:
+        peaks = sweep_peaks(capture, progress=self.progress)
+        if motion is None:
+            first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
+            with self.report.stage("motion") as solving:
+                motion = solve_motion(
+                    capture,
+                    first,
+                    options=self.options.motion,
+                    progress=self.progress,
+                    stage=solving,
+                )
+        return triangulate(
+            capture,
+            motion=None if motion.still else motion,
+            peaks=peaks,
+            progress=self.progress,
+            stage=stage,
+        )
+
+    def masks(
+        self, whole: Capture, capture: Capture, cloud: PointCloud, head: FittedHead | None
+    ) -> MaskedCapture:
+        """The masks of all cameras of `whole`, of which those of `capture` are used.
+
+        A held-out camera's mask says where to compare pictures; nothing here looks at it.
+        """
+        asked = self.options.network
+        network = None if asked is None else Network(asked)
+        with self.report.stage("masks") as stage:
+            mesh = None if head is None else head.mesh
+            every = hair_masks(whole, cloud if len(cloud) else None, mesh, network=network)
+            if network is not None:
+                stage.figures["network"] = network.to_dict()
+            for name, mask in every.items():
+                self.model.write_mask(name, "hair", whole.mask_as_shot(name, mask.hair))
+                self.model.write_mask(name, "skin", whole.mask_as_shot(name, mask.skin))
+            masks = usable_masks(capture, every, stage)
+            stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
+            stage.figures["source"] = {k: m.source for k, m in masks.items()}
+        return MaskedCapture(capture, masks)
+
+    def lines(
+        self,
+        masked: MaskedCapture,
+        head: FittedHead | None,
+        method: Literal["photometric", "lmvs"],
+    ) -> tuple[list[AnyFloats], Segments]:
+        """Polylines `(N, 3)` from line stereo, and the segments that they come from."""
+        polylines, segments = line_strands(
+            masked,
+            None if head is None else head.mesh,
+            self.report,
+            method=method,
+            options=self.options.light_codes,
+            progress=self.progress,
+        )
+        return list(polylines), segments
+
+    def seen_strands(
+        self,
+        masked: MaskedCapture,
+        head: FittedHead | None,
+        method: Literal["photometric", "lmvs"],
+    ) -> None:
+        """Strands from line stereo alone: only what is seen, none of them rooted."""
+        polylines, _ = self.lines(masked, head, method)
+        with self.report.stage("strands") as stage:
+            strands = Strands.from_list(
+                [p.astype(np.float32) for p in polylines], self._radius(len(polylines))
             )
-    return triangulate(
-        capture,
-        motion=None if motion.still else motion,
-        peaks=peaks,
-        progress=progress,
-        stage=stage,
-    )
-
-
-def _surface(
-    measured: Measured,
-    cloud: PointCloud,
-    options: ReconstructOptions,
-    report: Report,
-    progress: Progress,
-) -> list[AnyFloats]:
-    """Polylines through the measured lines; none of them rooted."""
-    with report.stage("surface") as stage:
-        if not len(cloud):
+            stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
             stage.leave_out(
-                "strands through the measured lines themselves",
-                "without a sweep lines lie on the visual hull, millimetres off",
-                "this stage; strands follow the field alone",
+                "roots",
+                "line stereo measures what is seen; the method 'fused' leads it to the scalp",
+                "the field and the growth",
             )
-            return []
-        progress("tracing the surface", 0.0)
-        surface = SurfaceOptions(apart=options.measure.thin, longest=options.max_length)
-        good = measured.where(measured.confidence >= LEAST_CONFIDENCE)
-        polylines = surface_strands(good, surface, seed=options.seed)
-        stage.figures.update(strands=len(polylines), options=asdict(surface))
-    return list(polylines)
+            self.model.write_strands(strands)
 
+    def tangents(
+        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh
+    ) -> tuple[VoxelGrid, Measured]:
+        """The hair's envelope, and the measured tangents in it."""
+        o = self.options
+        with self.report.stage("envelope") as stage:
+            envelope, depths = build_envelope(
+                masked, cloud, head, grid=o.grid, margin=o.margin, stage=stage
+            )
+        with self.report.stage("orientation") as stage:
+            measured = measure_tangents(
+                masked, cloud.points, depths, o.measure, stage, self.progress
+            )
+        return envelope, measured
 
-def _field(
-    envelope: VoxelGrid,
-    measured: Measured,
-    scalp: Scalp,
-    options: ReconstructOptions,
-    stage: Stage,
-) -> OrientationField:
-    keep = measured.confidence >= LEAST_CONFIDENCE
-    if not keep.any():
-        raise CaptureError("no hair pixel has a direction: are the OLAT frames in focus and lit?")
-    kept = measured.where(keep)
-    field, series = solve_field(
-        envelope,
-        kept.points,
-        kept.directions,
-        kept.confidence,
-    )
-    if series is not None:
-        stage.series.append(series)
-    stage.figures.update(
-        unknowns=int((~field.measured).sum()),
-        measured_voxels=int(field.measured.sum()),
-        empty_voxels=int(field.empty.sum()),
-        degenerate_voxels=int(field.degenerate.sum()),
-        scalp_cm2=scalp.area * 1e4,
-        scalp_marked=scalp.marked,
-    )
-    if field.empty.any():
-        stage.warn(f"{int(field.empty.sum())} voxels hang together with no measurement: left empty")
-    return field
+    def surface(self, measured: Measured, cloud: PointCloud) -> list[AnyFloats]:
+        """Polylines `(N, 3)` through the measured lines; none of them rooted."""
+        with self.report.stage("surface") as stage:
+            if not len(cloud):
+                stage.leave_out(
+                    "strands through the measured lines themselves",
+                    "without a sweep lines lie on the visual hull, millimetres off",
+                    "this stage; strands follow the field alone",
+                )
+                return []
+            self.progress("tracing the surface", 0.0)
+            o = self.options
+            surface = SurfaceOptions(apart=o.measure.thin, longest=o.max_length)
+            good = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+            polylines = surface_strands(good, surface, seed=o.seed)
+            stage.figures.update(strands=len(polylines), options=asdict(surface))
+        return list(polylines)
 
+    def field(self, envelope: VoxelGrid, measured: Measured, scalp: Scalp) -> OrientationField:
+        """The orientation field in the envelope."""
+        kept = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+        with self.report.stage("field") as stage:
+            if not len(kept.points):
+                raise CaptureError(
+                    "no hair pixel has a direction: are the OLAT frames in focus and lit?"
+                )
+            field, series = solve_field(envelope, kept.points, kept.directions, kept.confidence)
+            if series is not None:
+                stage.series.append(series)
+            stage.figures.update(
+                unknowns=int((~field.measured).sum()),
+                measured_voxels=int(field.measured.sum()),
+                empty_voxels=int(field.empty.sum()),
+                degenerate_voxels=int(field.degenerate.sum()),
+                scalp_cm2=scalp.area * 1e4,
+                scalp_marked=scalp.marked,
+            )
+            if field.empty.any():
+                stage.warn(
+                    f"{int(field.empty.sum())} voxels hang together with no measurement: left empty"
+                )
+        return field
 
-def grow(
-    field: OrientationField,
-    scalp: Scalp,
-    options: ReconstructOptions,
-    stage: Stage,
-    progress: Progress = silent,
-    seen: Sequence[AnyFloats] = (),
-) -> Strands:
-    """Strands from the scalp, then through the gaps that those leave, all of them rooted.
+    def strands(
+        self,
+        field: OrientationField,
+        scalp: Scalp,
+        seen: Sequence[AnyFloats],
+        flat: ScalpMap | None,
+    ) -> None:
+        """Strands from the scalp, then through the gaps that those leave, all of them rooted.
 
-    `seen` polylines `(n, 3)` were measured as they are; they get roots like those through gaps.
-    """
-    roots, normals = sample_roots(scalp, options.roots, options.seed)
-    progress("growing strands", 0.1)
-    tracing = Tracing(max_length=options.max_length)
-    rooted = grow_from_roots(field, roots, normals, tracing)
-    coverage = Coverage(field)
-    for path in rooted:
-        coverage.add(path)
-    for polyline in seen:
-        coverage.add(polyline)
-    share = float(coverage.covered[field.valid].mean())
-    progress("filling gaps", 0.4)
-    loose = fill_gaps(field, coverage, tracing, seed=options.seed, within=options.within)
-    filled = float(coverage.covered[field.valid].mean())
-    progress("rooting strands", 0.7)
-    loose = [polyline.astype(np.float32) for polyline in seen] + loose
-    result = root_all(rooted, loose, scalp)
-    if not result.strands:
-        raise CaptureError("no strand could be grown: the envelope does not reach the scalp")
-    radius = options.radius
-    if radius is None:
-        radius = float(np.clip(HEAD_OF_HAIR / len(result.strands), 4e-5, 4e-4))
-    strands = Strands.from_list(result.strands, radius).resampled(SPACING)
-    stage.figures.update(
-        strands=len(strands),
-        from_roots=len(rooted),
-        roots_without_strand=options.roots - len(rooted),
-        through_gaps=len(loose),
-        gaps_led_to_scalp=result.to_scalp,
-        gaps_joined_to_strand=result.joined,
-        gaps_dropped=result.dropped,
-        covered_by_roots=share,
-        covered=filled,
-        metres=float(strands.lengths().sum()),
-        radius=radius,
-        options=asdict(options),
-    )
-    if result.dropped:
-        stage.warn(f"{result.dropped} strands through gaps reached no root and were dropped")
-    return strands
+        `seen` polylines `(N, 3)` were measured as they are; they get roots like those through gaps.
+        Where the roots lie on the scalp's map (`flat` where the head has it) is written, too.
+        """
+        o = self.options
+        with self.report.stage("strands") as stage:
+            roots, normals = sample_roots(scalp, o.roots, o.seed)
+            self.progress("growing strands", 0.1)
+            tracing = Tracing(max_length=o.max_length)
+            rooted = grow_from_roots(field, roots, normals, tracing)
+            coverage = Coverage(field)
+            for path in [*rooted, *seen]:
+                coverage.add(path)
+            share = coverage.share()
+            self.progress("filling gaps", 0.4)
+            gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=o.within)
+            filled = coverage.share()
+            self.progress("rooting strands", 0.7)
+            loose = [polyline.astype(np.float32) for polyline in seen] + gaps
+            result = root_all(rooted, loose, scalp)
+            if not result.strands:
+                raise CaptureError(
+                    "no strand could be grown: the envelope does not reach the scalp"
+                )
+            radius = self._radius(len(result.strands))
+            strands = Strands.from_list(result.strands, radius).resampled(SPACING)
+            stage.figures.update(
+                strands=len(strands),
+                from_roots=len(rooted),
+                roots_without_strand=o.roots - len(rooted),
+                through_gaps=len(loose),
+                gaps_led_to_scalp=result.to_scalp,
+                gaps_joined_to_strand=result.joined,
+                gaps_dropped=result.dropped,
+                covered_by_roots=share,
+                covered=filled,
+                metres=float(strands.lengths().sum()),
+                radius=radius,
+                options=asdict(o),
+            )
+            if result.dropped:
+                stage.warn(
+                    f"{result.dropped} strands through gaps reached no root and were dropped"
+                )
+            self.model.write_strands(strands)
+            write_root_map(self.model, strands, scalp, flat, stage)
+
+    def _radius(self, count: int) -> float:
+        """Metres: the user's, or what keeps a head of hair's coverage with so many strands."""
+        return self.options.radius or float(np.clip(HEAD_OF_HAIR / max(count, 1), 4e-5, 4e-4))

@@ -165,6 +165,10 @@ class Coverage:
         n = self.field.voxel(points)
         self.covered[n[n >= 0]] = True
 
+    def share(self) -> float:
+        """Of the voxels with an orientation."""
+        return float(self.covered[self.field.valid].mean())
+
     def gaps(self) -> Ints:
         """Numbers `(G,)` of the voxels with an orientation and no strand."""
         return np.flatnonzero(self.field.valid & ~self.covered)

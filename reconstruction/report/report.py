@@ -73,7 +73,8 @@ class Report:
     def stage(self, name: str) -> Iterator[Stage]:
         """Time a stage; a stage of the same name from an earlier run is replaced."""
         stage = Stage(name)
-        self.stages = [s for s in self.stages if s.name != name] + [stage]
+        self.drop(name)
+        self.stages.append(stage)
         start = time.perf_counter()
         with peak_memory() as peak:
             try:
@@ -81,6 +82,10 @@ class Report:
             finally:
                 stage.seconds = time.perf_counter() - start
         stage.peak_gb = peak.gb
+
+    def drop(self, name: str) -> None:
+        """Forget the stage of that name from an earlier run, where there is one."""
+        self.stages = [s for s in self.stages if s.name != name]
 
     def __getitem__(self, name: str) -> Stage:
         for stage in self.stages:

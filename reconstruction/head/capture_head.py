@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from reconstruction.head.generic import generic_head
 from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
 from reconstruction.light_planes.point_cloud import PointCloud
-from reconstruction.masks import HairMask, distance_to
+from reconstruction.masks import MaskedCapture, distance_to
 from reconstruction.report.report import Stage
 from reconstruction.tangents.reflection import surface_normals
 
@@ -73,7 +72,7 @@ def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | 
     return HeadPoints(*_thinned(points, normals), "scalp", file.name)
 
 
-def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMask]) -> HeadPoints:
+def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
     """Reconstructed points that the mask of the camera that saw them calls skin.
 
     Points with a neighbour that some mask calls hair within a cell's size are left out: a fringe's
@@ -82,6 +81,7 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
     and to lie some way under the hair of its crown: skin alone leaves its size open. Raises
     `CaptureError` where too few are left to fit a head to.
     """
+    capture, masks = masked.capture, masked.masks
     skin = np.zeros(len(cloud), bool)
     hair = np.zeros(len(cloud), bool)
     for index, name in enumerate(cloud.cameras):
@@ -114,7 +114,7 @@ def skin_points(capture: Capture, cloud: PointCloud, masks: Mapping[str, HairMas
     return HeadPoints(points, normals, "above chin", "reconstructed skin", turn, guides)
 
 
-def lay_head(
+def fit_capture_head(
     points: HeadPoints,
     head_mesh: str | Path | None,
     stage: Stage,

@@ -15,20 +15,20 @@ from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.strands import Strands
-from reconstruction.head.fit import HeadFitError
-from reconstruction.head.fitted import (
+from reconstruction.head.capture_head import (
     FEWEST_SKIN,
     digitised_points,
-    lay_head,
+    fit_capture_head,
     skin_points,
 )
+from reconstruction.head.fit import HeadFitError
 from reconstruction.head.generic import generic_head
 from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
 from reconstruction.light_planes import PointCloud
-from reconstruction.masks import HairMask
+from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.model import Model
 from reconstruction.report.report import Stage
 
@@ -107,7 +107,7 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
     assert known is not None
     assert known.part == "scalp"
     stage = Stage("head")
-    fitted = lay_head(known, None, stage)
+    fitted = fit_capture_head(known, None, stage)
     assert np.median(off(fitted.mesh)) < 0.5
     assert stage.figures["source"] == "scalp.obj"
     assert stage.figures["rms_mm"] < 0.6
@@ -117,13 +117,13 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
 @pytest.mark.parametrize("turn_deg", [0.0, 35.0])
 def test_a_head_is_laid_under_the_skin_that_was_seen(capture: Capture, turn_deg: float) -> None:
     cloud, masks = cloud_of(capture, turn_deg)
-    skin = skin_points(capture, cloud, masks)
+    skin = skin_points(MaskedCapture(capture, masks), cloud)
     assert skin.turn == pytest.approx(np.radians(turn_deg), abs=np.radians(30))
     apart = ClosestPoint(the_head(turn_deg), 8e-3)(skin.points)[2]
     assert np.percentile(apart, 95) < 2e-3
     assert skin.normals is not None
     stage = Stage("head")
-    fitted = lay_head(skin, None, stage, cloud=cloud)
+    fitted = fit_capture_head(skin, None, stage, cloud=cloud)
     assert np.median(off(fitted.mesh, turn_deg)) < 3.0
     assert stage.figures["cloud_inside_share"] < 0.05
     assert stage.warnings == []
@@ -137,10 +137,10 @@ def test_too_little_skin_says_what_to_give(capture: Capture) -> None:
     }
     words = rf"no head\.obj, and only 0 cells.*at least {FEWEST_SKIN}.*option scalp_points"
     with pytest.raises(CaptureError, match=words):
-        skin_points(capture, cloud, all_hair)
+        skin_points(MaskedCapture(capture, all_hair), cloud)
     empty = PointCloud.empty(cloud.cameras, cloud.projectors)
     with pytest.raises(CaptureError, match="only 0 cells"):
-        skin_points(capture, empty, masks)
+        skin_points(MaskedCapture(capture, masks), empty)
 
 
 def test_points_that_are_no_head_are_a_capture_error(capture: Capture, tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_points_that_are_no_head_are_a_capture_error(capture: Capture, tmp_path:
     known = digitised_points(capture, tmp_path / "scalp.npy")
     assert known is not None
     with pytest.raises(CaptureError, match=r"no head fits the points of scalp\.npy.*millimetres"):
-        lay_head(known, None, Stage("head"))
+        fit_capture_head(known, None, Stage("head"))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_the_users_head_is_a_template(
     known = digitised_points(capture, tmp_path / "scalp.npy")
     assert known is not None
     stage = Stage("head")
-    fitted = lay_head(known, tmp_path / "own.obj", stage)
+    fitted = fit_capture_head(known, tmp_path / "own.obj", stage)
     assert stage.figures["template"] == "own.obj"
     assert np.median(off(fitted.mesh)) < 1.0
     roots, _ = sample_roots(find_scalp(fitted.mesh), 500, seed=0)
