@@ -71,7 +71,6 @@ def hair_masks(
     points: PointCloud | None = None,
     head: Mesh | None = None,
     *,
-    stands_off: float = STANDS_OFF,
     network: Network | None = None,
 ) -> dict[str, HairMask]:
     """Masks of every camera that has a user's mask or a silhouette.
@@ -100,7 +99,7 @@ def hair_masks(
         elif not subject.any():
             masks[camera.name] = HairMask(subject, subject, subject, "silhouette", 0.0)
         elif head is not None:
-            masks[camera.name] = _decide(capture, camera, subject, points, head, off, stands_off)
+            masks[camera.name] = _decide(capture, camera, subject, points, head, off)
         else:
             unknown[camera.name] = subject
     return masks | _by_looks(capture, unknown)
@@ -162,14 +161,13 @@ def _decide(
     points: PointCloud | None,
     head: Mesh,
     off: Array | None,
-    stands_off: float,
 ) -> HairMask:
     """A mask from where points lie on the head, and from the light where they lie on it."""
     contrast = light_contrast(capture, camera.name, subject)
     covered = head_coverage(head, camera)
     hair, skin = subject & ~ndimage.binary_dilation(covered), np.zeros_like(subject)
     if points is not None and off is not None:
-        standing, lying = _votes(points, camera, off, stands_off)
+        standing, lying = _votes(points, camera, off)
         hair |= subject & (standing > lying)
         skin |= subject & covered & (lying > standing) & ~hair
     if contrast is not None:
@@ -187,9 +185,7 @@ def _decide(
     return HairMask(subject, hair, subject & ~hair, "geometry", decided)
 
 
-def _votes(
-    points: PointCloud, camera: Camera, off: Array, stands_off: float
-) -> tuple[Array, Array]:
+def _votes(points: PointCloud, camera: Camera, off: Array) -> tuple[Array, Array]:
     """Weights of the points that stand off the head and that lie on it, per pixel `(H, W)`.
 
     The camera's own points, none where it took no part in the triangulation.
@@ -202,7 +198,7 @@ def _votes(
     shape = (camera.height, camera.width)
     flat = np.clip(y, 0, shape[0] - 1) * shape[1] + np.clip(x, 0, shape[1] - 1)
     weight = points.weight[mine][seen].astype(np.float64)
-    standing = off[mine][seen] > stands_off
+    standing = off[mine][seen] > STANDS_OFF
     votes = [np.zeros(shape[0] * shape[1]) for _ in range(2)]
     np.add.at(votes[0], flat[standing], weight[standing])
     np.add.at(votes[1], flat[~standing], weight[~standing])

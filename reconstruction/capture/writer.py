@@ -141,10 +141,6 @@ class CaptureWriter:
         *,
         full_scale: float = math.inf,
         count_scale: float = 0.0,
-        pulse: int | None = None,
-        block_id: int | None = None,
-        timestamp: float | None = None,
-        attempt: int = 0,
     ) -> FrameRecord:
         """Write one frame durably and append its journal line: `store_frame`, then `commit`.
 
@@ -155,9 +151,6 @@ class CaptureWriter:
         """
         record = self.store_frame(
             step, camera, radiance, full_scale=full_scale, count_scale=count_scale
-        )
-        record = replace(
-            record, pulse=pulse, block_id=block_id, timestamp=timestamp, attempt=attempt
         )
         self.commit([record])
         return record
@@ -229,8 +222,6 @@ class CaptureWriter:
         *,
         reason: str,
         pulse: int | None = None,
-        block_id: int | None = None,
-        timestamp: float | None = None,
         attempt: int = 0,
     ) -> FrameRecord:
         """Journal that a frame did not come and why; a later `write_frame` of it still counts."""
@@ -240,8 +231,6 @@ class CaptureWriter:
             camera,
             None,
             pulse=pulse,
-            block_id=block_id,
-            timestamp=timestamp,
             attempt=attempt,
             recorded=utc_now(),
             reason=reason,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.files.points import read_points
 from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.head.fit import HeadFit, HeadFitError, Part, fit_head
+from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head
 from reconstruction.head.generic import generic_head
 from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
@@ -37,16 +37,13 @@ _CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
 class HeadPoints:
     """Points `(N, 3)` of a head, metres, outward unit `normals (N, 3)` where known.
 
-    `part` says where on the head they lie, `source` who gave them, `turn` is the head's about z
-    (radians, 0 faces −y) where that is known, and `guides` see `fit_head`.
+    `source` says who gave them, `hints` what else is known of them.
     """
 
     points: Array
     normals: Array | None
-    part: Part
+    hints: HeadHints
     source: str
-    turn: float | None = None
-    guides: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +66,7 @@ def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | 
     if path is None and not file.is_file():
         return None
     points, normals = read_points(file)
-    return HeadPoints(*_thinned(points, normals), "scalp", file.name)
+    return HeadPoints(*_thinned(points, normals), HeadHints(part="scalp"), file.name)
 
 
 def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
@@ -111,7 +108,8 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
     x, y = points[:, :2].mean(axis=0) - middle
     turn = float(np.arctan2(x, -y))
     guides = _under_the_hair(cloud.subset(hair & face), len(points))
-    return HeadPoints(points, normals, "above chin", "reconstructed skin", turn, guides)
+    hints = HeadHints(part="above chin", turn=turn, guides=guides)
+    return HeadPoints(points, normals, hints, "reconstructed skin")
 
 
 def fit_capture_head(
@@ -133,17 +131,10 @@ def fit_capture_head(
         shape = generic_head() if own is None else template(own, seed=seed)[0]
 
         def fitted(turn: float | None) -> HeadFit:
-            return fit_head(
-                points.points,
-                points.normals,
-                shape,
-                part=points.part,
-                turn=turn,
-                guides=points.guides,
-                seed=seed,
-            )
+            hints = replace(points.hints, turn=turn)
+            return fit_head(points.points, points.normals, shape, hints, seed=seed)
 
-        fit = fitted(points.turn)
+        fit = fitted(points.hints.turn)
         if fit.pose.margin < _AMBIGUOUS:
             stage.warn(
                 "the points fit a head that faces another way nearly as well (its cost is "

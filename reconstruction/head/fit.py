@@ -13,7 +13,15 @@ from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.generic import generic_head
-from reconstruction.head.pose import MOTIONS, Pose, Surface, find_pose, similarity, tukey
+from reconstruction.head.pose import (
+    MOTIONS,
+    Pose,
+    PoseSearch,
+    Surface,
+    find_pose,
+    similarity,
+    tukey,
+)
 from reconstruction.head.shape import deform
 
 FEWEST = 10
@@ -78,28 +86,38 @@ class HeadFit:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class HeadHints:
+    """What is known beforehand of points on a head.
+
+    They lie on any part of the template, on what is above its chin, or on its scalp alone (`part`),
+    in the template's unit, metres, unless `any_unit`. `landmarks` are places `(L, 3)` on the
+    template and the same places `(L, 3)` among the points, L at least 3; without them all turns
+    about z are tried, or those about `turn` (radians, 0 faces −y). `guides` are further points and
+    normals `(G, 3)` that only roughly lie on the head: they take part in the pose alone.
+    """
+
+    part: Part = "head"
+    landmarks: tuple[AnyFloats, AnyFloats] | None = None
+    turn: float | None = None
+    guides: tuple[AnyFloats, AnyFloats] | None = None
+    any_unit: bool = False
+
+
 def fit_head(
     points: AnyFloats,
     normals: AnyFloats | None = None,
     template: Mesh | None = None,
+    hints: HeadHints = HeadHints(),
     *,
-    part: Part = "head",
-    landmarks: tuple[AnyFloats, AnyFloats] | None = None,
-    turn: float | None = None,
-    guides: tuple[AnyFloats, AnyFloats] | None = None,
-    any_unit: bool = False,
     seed: int = 0,
 ) -> HeadFit:
     """Fit `template` (the generic head where None) to `points (N, 3)`, both with z upwards.
 
-    The points, with outward unit `normals (N, 3)` where known, lie on any part of the template, on
-    what is above its chin, or on its scalp alone (`part`), and may have outliers, up to about two
-    in five. `landmarks` are places `(L, 3)` on the template and the same places `(L, 3)` among the
-    points, L at least 3; without them all turns about z are tried, or those about `turn` (radians).
-    `guides` are further points and normals `(G, 3)` that only roughly lie on the head: they take
-    part in the pose alone. Points are in the template's unit, metres, unless `any_unit`. Raises
-    `HeadFitError`.
+    `normals (N, 3)` are outward unit ones, where known; up to about two in five of the points may
+    be outliers. Raises `HeadFitError`.
     """
+    part, landmarks, any_unit = hints.part, hints.landmarks, hints.any_unit
     template = generic_head() if template is None else template
     at: Array = np.asarray(points, np.float64).reshape(-1, 3)
     facing: Array | None = None
@@ -120,16 +138,15 @@ def fit_head(
             start = similarity(*(np.asarray(side, float) for side in landmarks))
         except ValueError as error:
             raise HeadFitError(str(error)) from error
-    pose = find_pose(
-        surface,
-        *_with(at, facing, guides),
+    search = PoseSearch(
         start=start,
-        turn=turn,
+        turn=hints.turn,
         scales=(0.7 * middle, middle, 1.4 * middle) if any_unit else (1.0,),
         scale_deviation=None if any_unit else 0.1,
         size=size,
         seed=seed,
     )
+    pose = find_pose(surface, *_with(at, facing, hints.guides), search)
     if not any_unit and not _SCALES[0] < pose.scale < _SCALES[1]:
         raise HeadFitError(
             f"the head under the points would be {pose.scale:.2f} times the template's size, "
@@ -153,7 +170,7 @@ def mark_scalp(mesh: Mesh, *, seed: int = 0) -> tuple[Mesh, HeadFit]:
     spacing = float(np.ptp(mesh.vertices, axis=0).max()) / 80
     places, normals, _ = surface_samples(mesh, spacing)
     few = np.random.default_rng(seed).permutation(len(places))[:3000]
-    fit = fit_head(places[few], normals[few], any_unit=True, seed=seed)
+    fit = fit_head(places[few], normals[few], hints=HeadHints(any_unit=True), seed=seed)
     assert fit.mesh.scalp is not None
     nearest = ClosestPoint(fit.mesh, spacing)
     face, _, distance = nearest(mesh.vertices[mesh.faces].mean(axis=1))

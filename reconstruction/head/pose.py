@@ -60,6 +60,11 @@ class Pose:
     weakest: str
     margin: float = np.inf
 
+    @property
+    def placed(self) -> tuple[float, Array, Array]:
+        """Scale, rotation `(3, 3)` and translation `(3,)`."""
+        return self.scale, self.rotation, self.translation
+
     def __call__(self, points: Array) -> Array:
         """Points `(N, 3)` of the mesh's frame in the points' frame."""
         return self.scale * points @ self.rotation.T + self.translation
@@ -93,31 +98,36 @@ def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
     return scale, found.params[:3, :3] / scale, np.asarray(found.translation)
 
 
+@dataclass(frozen=True, eq=False)
+class PoseSearch:
+    """Where a pose is searched.
+
+    Without a `start` (scale, rotation `(3, 3)`, translation `(3,)`), twelve turns about z (or
+    `turn`, radians, and thirty degrees to either side) at each of `scales` are tried on a few
+    hundred points, the tops of both at one height. `scale_deviation` is what is known of the scale
+    beforehand, a standard deviation of its logarithm about the middle of `scales`, or None. `size`
+    is the head's radius in the points' unit, which distances are judged by.
+    """
+
+    start: tuple[float, Array, Array] | None = None
+    turn: float | None = None
+    scales: tuple[float, ...] = (1.0,)
+    scale_deviation: float | None = 0.1
+    size: float = 0.1
+    seed: int = 0
+
+
 def find_pose(
-    surface: Surface,
-    points: Array,
-    normals: Array | None = None,
-    *,
-    start: tuple[float, Array, Array] | None = None,
-    turn: float | None = None,
-    scales: tuple[float, ...] = (1.0,),
-    scale_deviation: float | None = 0.1,
-    size: float = 0.1,
-    seed: int = 0,
+    surface: Surface, points: Array, normals: Array | None = None, search: PoseSearch = PoseSearch()
 ) -> Pose:
     """The pose in which `surface` lies on `points (N, 3)`, both with z about upwards.
 
-    Without a `start`, twelve turns about z (or `turn`, radians, and thirty degrees to either side)
-    at each of `scales` are tried on a few hundred points, the tops of both at one height.
-    `scale_deviation` is what is known of the scale beforehand, a standard deviation of its
-    logarithm about the middle of `scales`, or None. `size` is the head's radius in the points'
-    unit, which distances are judged by.
+    `normals (N, 3)` are unit, outward.
     """
-    middle = float(np.exp(np.mean(np.log(scales))))
-    known = None if scale_deviation is None else (middle, scale_deviation)
-    if start is not None:
-        return _refine(surface, points, normals, *start, known, size, 60)
-    order = np.random.default_rng(seed).permutation(len(points))
+    if search.start is not None:
+        return _refine(surface, (points, normals), search.start, search, 60)
+    turn, size = search.turn, search.size
+    order = np.random.default_rng(search.seed).permutation(len(points))
 
     def some(count: int) -> tuple[Array, Array | None]:
         few = order[:count]
@@ -126,13 +136,13 @@ def find_pose(
     coarse, facing = some(_COARSE)
     yaws = np.arange(_YAWS) * 2 * np.pi / _YAWS if turn is None else turn + _ABOUT
     tries = []
-    for scale in scales:
+    for scale in search.scales:
         for yaw in yaws:
             rotation = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
             moved = scale * surface.points @ rotation.T
             shift = np.median(coarse, axis=0) - np.median(moved, axis=0)
             shift[2] = np.percentile(coarse[:, 2], 85) - np.percentile(moved[:, 2], 85)
-            pose = _refine(surface, coarse, facing, scale, rotation, shift, known, size, 20)
+            pose = _refine(surface, (coarse, facing), (scale, rotation, shift), search, 20)
             tries.append((_cost(surface, pose, coarse, facing, size), pose))
     tries.sort(key=lambda t: t[0])
     distinct: list[Pose] = []
@@ -141,10 +151,10 @@ def find_pose(
             distinct.append(pose)
     ends = []
     for t in distinct[:3]:
-        p = _refine(surface, *some(1000), t.scale, t.rotation, t.translation, known, size, 60)
+        p = _refine(surface, some(1000), t.placed, search, 60)
         ends.append((_cost(surface, p, *some(1000), size), p))
     p = min(ends, key=lambda end: end[0])[1]
-    best = _refine(surface, points, normals, p.scale, p.rotation, p.translation, known, size, 60)
+    best = _refine(surface, (points, normals), p.placed, search, 60)
     others = [*(pose for _, pose in ends), *distinct[3:]]
     others = [p for p in others if turn is None and _apart(p, best) > np.radians(10)]
     return replace(best, margin=_margin(surface, best, others, points, normals, size))
@@ -185,17 +195,15 @@ def _cost(surface: Surface, pose: Pose, points: Array, normals: Array | None, si
 
 def _refine(
     surface: Surface,
-    points: Array,
-    normals: Array | None,
-    scale: float,
-    rotation: Array,
-    translation: Array,
-    known: tuple[float, float] | None,
-    size: float,
+    cloud: tuple[Array, Array | None],
+    start: tuple[float, Array, Array],
+    search: PoseSearch,
     limit: int,
 ) -> Pose:
-    """ICP from one start."""
-    rotation, translation = rotation.copy(), translation.copy()
+    """ICP on the points and normals of `cloud` from one start."""
+    (points, normals), size, known = cloud, search.size, search.scale_deviation
+    scale, rotation, translation = start
+    middle = float(np.exp(np.mean(np.log(search.scales))))
     for _ in range(limit):
         there = (points - translation) @ rotation / scale
         distance, index = surface.nearest(there, size / scale)
@@ -215,9 +223,9 @@ def _refine(
         variance = float(weight @ r**2) / total
         stiffness, motions = np.linalg.eigh(normal)
         if known is not None:
-            strength = max(variance, (1e-3 * size) ** 2) / (total * (known[1] * radius) ** 2)
+            strength = max(variance, (1e-3 * size) ** 2) / (total * (known * radius) ** 2)
             normal[3, 3] += strength
-            right[3] += strength * radius * np.log(known[0] / scale)
+            right[3] += strength * radius * np.log(middle / scale)
         values, vectors = np.linalg.eigh(normal)
         free = values > 1e-4 * values[-1]  # what nothing determines is left where it is
         step = vectors[:, free] @ (vectors[:, free].T @ right / values[free])

@@ -51,7 +51,7 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
 
     from reconstruction.files.points import read_points
     from reconstruction.geometry.mesh import read_obj, write_obj
-    from reconstruction.head.fit import fit_head
+    from reconstruction.head.fit import HeadHints, fit_head
     from reconstruction.head.generic import generic_head
     from reconstruction.head.template import template
 
@@ -59,7 +59,7 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
     shape = generic_head() if args.mesh is None else template(read_obj(args.mesh))[0]
     points, normals = read_points(args.points)
     turn = None if args.turn_deg is None else float(np.radians(args.turn_deg))
-    fit = fit_head(points, normals, shape, part=args.part, turn=turn)
+    fit = fit_head(points, normals, shape, hints=HeadHints(part=args.part, turn=turn))
     write_obj(args.out, fit.mesh)
     rms, used = 1e3 * fit.deformed.to_mesh_rms, 1 - float(fit.outliers.mean())
     lines = [f"{args.out}: {rms:.2f} mm rms from {used:.0%} of {len(points)} points"]

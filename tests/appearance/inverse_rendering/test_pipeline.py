@@ -60,7 +60,7 @@ def made(plain, tufted, tmp_path_factory):
         for step, values in zip(steps, o.radiance, strict=True):
             image = np.zeros((*size, 3), np.float32)
             image[mask] = values
-            writer.write_frame(step, o.camera.name, image, pulse=1, block_id=1, timestamp=0.0)
+            writer.write_frame(step, o.camera.name, image)
     writer.finish("completed", {})
     start = HairAppearance((0.2, 0.2, 0.2), 0.4, 0.3)
     skin = (0.3, 0.3, 0.3)

@@ -65,7 +65,7 @@ def made(tmp_path_factory):
     for camera in cameras:
         images = render_olat(scene, camera, lights, spp=256, seed=7)
         for step, image in zip(steps, images, strict=True):
-            writer.write_frame(step, camera.name, image, pulse=1, block_id=1, timestamp=0.0)
+            writer.write_frame(step, camera.name, image)
         mask = coverage(scene, camera)["hair"] > 0.5
         bright.append(images[:, mask])
         model.write_mask(camera.name, "hair", mask)

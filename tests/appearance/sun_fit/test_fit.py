@@ -66,7 +66,7 @@ def made(tmp_path_factory):
     for camera in cameras:
         images = render_olat(scene, camera, lights, spp=16, deep_lights=16, seed=7)
         for step, image in zip(steps, images, strict=True):
-            writer.write_frame(step, camera.name, 0.5 * image, pulse=1, block_id=1, timestamp=0.0)
+            writer.write_frame(step, camera.name, 0.5 * image)
         share = coverage(scene, camera)
         for kind, mask in (("hair", share["hair"] > 0.5), ("skin", share["head"] > 0.95)):
             model.write_mask(camera.name, kind, mask)
@@ -139,7 +139,7 @@ def test_saturated_samples_are_not_valid(made, tmp_path):
     )
     image = np.zeros((24, 24, 3), np.float32)
     image[0, 1] = 2.0
-    writer.write_frame(steps[0], "cam_0", image, full_scale=2.0, pulse=1, block_id=1, timestamp=0.0)
+    writer.write_frame(steps[0], "cam_0", image, full_scale=2.0)
     writer.finish("completed", {})
     o = observe(Capture(tmp_path / "c"), "cam_0", [light.name, "l1"], np.array([0, 1]))
     assert o.valid.tolist() == [[True, False], [False, False]]

@@ -23,7 +23,7 @@ from benchmarks.results import save
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import write_obj
 from reconstruction.geometry.strands import Strands
-from reconstruction.head.fit import fit_head
+from reconstruction.head.fit import HeadHints, fit_head
 from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions, ReconstructOptions
 from reconstruction.report.report import Progress
 
@@ -106,7 +106,7 @@ def ponytail(source: Path, folder: Path) -> tuple[Path, Path]:
     strands = Strands(strands.points @ turn, strands.offsets, strands.radius)
     roots = strands.points[strands.offsets[:-1]]
     hair, head = folder / "ponytail.npz", folder / "ponytail_head.obj"
-    fit = fit_head(roots, part="scalp")
+    fit = fit_head(roots, hints=HeadHints(part="scalp"))
     write_strands(hair, strands)
     write_obj(head, fit.mesh)
     return hair, head

@@ -43,9 +43,7 @@ def image(step: Step, camera: str) -> np.ndarray:
 def write(writer: CaptureWriter, *keys: tuple[int, str]) -> None:
     for index, camera in keys:
         step = STEPS[index]
-        writer.write_frame(
-            step, camera, image(step, camera), full_scale=4.0, count_scale=1e-3, pulse=index + 1
-        )
+        writer.write_frame(step, camera, image(step, camera), full_scale=4.0, count_scale=1e-3)
 
 
 EVERY = [(s.index, c.name) for s in STEPS for c in RIG.cameras]

@@ -105,7 +105,7 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
     write_obj(capture.path / "scalp.obj", Mesh(points[on], np.zeros((0, 3))))
     known = digitised_points(capture, None)
     assert known is not None
-    assert known.part == "scalp"
+    assert known.hints.part == "scalp"
     stage = Stage("head")
     fitted = fit_capture_head(known, None, stage)
     assert np.median(off(fitted.mesh)) < 0.5
@@ -118,7 +118,7 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
 def test_a_head_is_laid_under_the_skin_that_was_seen(capture: Capture, turn_deg: float) -> None:
     cloud, masks = cloud_of(capture, turn_deg)
     skin = skin_points(MaskedCapture(capture, masks), cloud)
-    assert skin.turn == pytest.approx(np.radians(turn_deg), abs=np.radians(30))
+    assert skin.hints.turn == pytest.approx(np.radians(turn_deg), abs=np.radians(30))
     apart = ClosestPoint(the_head(turn_deg), 8e-3)(skin.points)[2]
     assert np.percentile(apart, 95) < 2e-3
     assert skin.normals is not None

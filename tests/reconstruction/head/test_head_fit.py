@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from reconstruction.geometry.closest_point import ClosestPoint, closest_on_triangles
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.mesh_queries import surface_samples
-from reconstruction.head.fit import HeadFit, HeadFitError, fit_head, mark_scalp
+from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head, mark_scalp
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import similarity
 from reconstruction.head.scalp_map import ScalpMap
@@ -89,7 +89,7 @@ def posed(fit: HeadFit) -> Mesh:
 )
 def test_the_scalp_is_found_from(where, part, outliers, normals, median) -> None:  # type: ignore[no-untyped-def]
     points, facing = seen(where, 2000, outliers)
-    fit = fit_head(points, facing if normals else None, part=part)
+    fit = fit_head(points, facing if normals else None, hints=HeadHints(part=part))
     assert fit.pose.scale == pytest.approx(1.06, abs=0.05)
     off = off_the_true_scalp(fit.mesh)
     assert np.median(off) < median
@@ -110,12 +110,12 @@ def test_few_points_give_a_pose() -> None:
 
 def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> None:
     points, normals = seen(crown, 500)
-    fit = fit_head(points, normals, part="scalp")
+    fit = fit_head(points, normals, hints=HeadHints(part="scalp"))
     assert any("hardly determine" in w for w in fit.warnings)
     assert any("give landmarks" in w for w in fit.warnings)
     vertices = generic_head().vertices[::1500]
     known = another_head().vertices[::1500]
-    fit = fit_head(points, normals, part="scalp", landmarks=(vertices, known))
+    fit = fit_head(points, normals, hints=HeadHints(part="scalp", landmarks=(vertices, known)))
     assert not any("give landmarks" in w for w in fit.warnings)
     assert np.degrees(Rotation.from_matrix(fit.pose.rotation @ TURN.T).magnitude()) < 15
 
@@ -155,15 +155,15 @@ def test_what_else_is_asked_wrongly() -> None:
     points, normals = seen(everywhere, 50)
     bare = Mesh(generic_head().vertices, generic_head().faces)
     with pytest.raises(HeadFitError, match="marks no scalp"):
-        fit_head(points, template=bare, part="scalp")
+        fit_head(points, template=bare, hints=HeadHints(part="scalp"))
     with pytest.raises(HeadFitError, match="50 points but 49 normals"):
         fit_head(points, normals[1:])
     with pytest.raises(HeadFitError, match="at least 3 pairs of landmarks"):
-        fit_head(points, landmarks=(points[:2], points[:2]))
+        fit_head(points, hints=HeadHints(landmarks=(points[:2], points[:2])))
     with pytest.raises(HeadFitError, match="lie on a line"):
-        fit_head(points, landmarks=(np.eye(3) * [1, 0, 0], np.eye(3) * [1, 0, 0]))
+        fit_head(points, hints=HeadHints(landmarks=(np.eye(3) * [1, 0, 0], np.eye(3) * [1, 0, 0])))
     with pytest.raises(ValueError, match="part must be"):
-        fit_head(points, part="nose")  # type: ignore[arg-type]
+        fit_head(points, hints=HeadHints(part="nose"))  # type: ignore[arg-type]
 
 
 @given(st.integers(0, 1000), st.floats(1e-3, 1e3))
@@ -231,5 +231,7 @@ def test_the_scalp_is_marked_on_other_heads_of_any_unit(
     assert ScalpMap.of(marked).stretch().min() > 0.3
     points, normals, _ = surface_samples(marked, 0.02 * scale)
     here = marked.vertices[::500]  # and then it is a template like any other
-    again = fit_head(1.02 * points, normals, marked, landmarks=(here, here), any_unit=True)
+    again = fit_head(
+        1.02 * points, normals, marked, hints=HeadHints(landmarks=(here, here), any_unit=True)
+    )
     assert again.pose.scale == pytest.approx(1.02, rel=1e-3)
