@@ -160,7 +160,7 @@ class Capture:
         return mask if lens is None else lens.distort_mask(mask)
 
     def mask_in_view(self, camera: str, mask: Bools) -> Bools:
-        """The inverse of `mask_as_shot`."""
+        """A mask `(H, W)` in the pixels of the frames on disk, in those of this view."""
         lens = self._lenses.get(camera)
         return mask if lens is None else lens.undistort_mask(mask)
 
@@ -197,7 +197,7 @@ class Capture:
         return image if lens is None else lens.undistort(image)
 
     def response(self, step: Step, camera: str) -> Floats:
-        """`frame` divided by the step's level: the answer to the lamp at full intensity."""
+        """`frame (H, W, 3)` over the step's level: the answer to the light at full intensity."""
         image = self.frame(step, camera)
         return image if step.level in (0, 1) else image / np.float32(step.level)
 
@@ -206,7 +206,7 @@ class Capture:
         return self.response_and_saturated(step, camera)[1]
 
     def response_and_saturated(self, step: Step, camera: str) -> tuple[Floats, Bools]:
-        """`response` and `saturated` of one frame for the price of reading it once."""
+        """`response (H, W, 3)` and `saturated (H, W)` of one frame, read once."""
         image, attributes = self._read(step, camera)
         full_scale = float(attributes.get("fullScale", np.inf))
         saturated = np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))

@@ -17,7 +17,7 @@ from reconstruction.head.pose import (
     MOTIONS,
     Pose,
     PoseSearch,
-    Surface,
+    SurfaceSamples,
     find_pose,
     similarity,
     tukey,
@@ -126,7 +126,7 @@ def fit_head(
     faces = _faces(template, part)
     extent = float(np.ptp(template.vertices, axis=0).max())
     places, own, face = surface_samples(template, extent / 35)
-    surface = Surface(places[faces[face]], own[faces[face]])
+    surface = SurfaceSamples(places[faces[face]], own[faces[face]])
     ratio = _ratio(at, facing, surface.points)
     if not any_unit:
         _require_unit(ratio, part)

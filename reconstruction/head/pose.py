@@ -24,7 +24,7 @@ _ABOUT = np.radians([-30.0, 0.0, 30.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SurfaceSamples:
     """Samples of a mesh to match with: `points (M, 3)`, unit `normals (M, 3)`, outward."""
 
     points: Array
@@ -118,7 +118,10 @@ class PoseSearch:
 
 
 def find_pose(
-    surface: Surface, points: Array, normals: Array | None = None, search: PoseSearch = PoseSearch()
+    surface: SurfaceSamples,
+    points: Array,
+    normals: Array | None = None,
+    search: PoseSearch = PoseSearch(),
 ) -> Pose:
     """The pose in which `surface` lies on `points (N, 3)`, both with z about upwards.
 
@@ -161,7 +164,7 @@ def find_pose(
 
 
 def _margin(
-    surface: Surface,
+    surface: SurfaceSamples,
     best: Pose,
     others: list[Pose],
     points: Array,
@@ -183,7 +186,9 @@ def _apart(a: Pose, b: Pose) -> float:
     return float(Rotation.from_matrix(a.rotation @ b.rotation.T).magnitude())
 
 
-def _cost(surface: Surface, pose: Pose, points: Array, normals: Array | None, size: float) -> float:
+def _cost(
+    surface: SurfaceSamples, pose: Pose, points: Array, normals: Array | None, size: float
+) -> float:
     """Mean squared distance, cut off at an eighth of the head's radius, in units of that."""
     cut = 0.125 * size / pose.scale
     distance, index = surface.nearest(pose.inverse(points), cut)
@@ -194,7 +199,7 @@ def _cost(surface: Surface, pose: Pose, points: Array, normals: Array | None, si
 
 
 def _refine(
-    surface: Surface,
+    surface: SurfaceSamples,
     cloud: tuple[Array, Array | None],
     start: tuple[float, Array, Array],
     search: PoseSearch,

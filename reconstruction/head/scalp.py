@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.mesh import Mesh
@@ -91,15 +92,13 @@ def _above_hairline(points: Array, covered: Bools) -> Bools:
 
 
 def sample_roots(scalp: Scalp, count: int, seed: int) -> tuple[Array, Array]:
-    """`count` roots `(count, 3)` uniform over the scalp's area, and their normals.
+    """`count` roots `(count, 3)` uniform over the scalp's area, and their normals `(count, 3)`.
 
     Faces are drawn by their scalp area; on faces that are only partly scalp, roots are redrawn
     until they fall near a scalp point.
     """
     if count < 1:
         raise ValueError(f"the number of roots must be positive, got {count}")
-    from scipy.spatial import cKDTree
-
     rng = np.random.default_rng(seed)
     head = scalp.head
     weight = head.face_areas() * (scalp.share > 0)

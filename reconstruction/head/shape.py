@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
-from reconstruction.head.pose import Surface, tukey
+from reconstruction.head.pose import SurfaceSamples, tukey
 
 _NEAR = 8
 
@@ -93,7 +93,7 @@ def deform(
     for stiffness in STIFFNESS:
         for _ in range(ROUNDS):
             now = places + spread @ shift
-            distance, index = Surface(now, own).nearest(points, 0.3 * size)
+            distance, index = SurfaceSamples(now, own).nearest(points, 0.3 * size)
             n = own[index]
             weight = tukey(distance, 0.01 * size)
             if normals is not None:

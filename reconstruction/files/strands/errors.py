@@ -19,7 +19,7 @@ class StrandFileError(ValueError):
 def strands_of(
     path: Path, points: NDArray[Any], offsets: NDArray[Any], radius: float | NDArray[Any] = 4e-5
 ) -> Strands:
-    """`Strands`, whose complaints are raised as this file's."""
+    """`Strands` of `points (N, 3)` and `offsets (S + 1,)`; complaints are raised as this file's."""
     try:
         return Strands(points, offsets, radius)
     except (ValueError, TypeError, OverflowError) as error:
