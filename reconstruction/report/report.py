@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from reconstruction.files.durable import write_json
 from reconstruction.report.memory import peak_memory
@@ -106,17 +107,4 @@ class Report:
         """Read a report; an absent file gives an empty one."""
         if not Path(path).is_file():
             return cls()
-        stages = [
-            Stage(
-                **{
-                    **s,
-                    "series": [
-                        Series(x["name"], x["error"], [tuple(p) for p in x["points"]])
-                        for x in s["series"]
-                    ],
-                    "left_out": [LeftOut(**x) for x in s["left_out"]],
-                }
-            )
-            for s in json.loads(Path(path).read_text())["stages"]
-        ]
-        return cls(stages)
+        return TypeAdapter(cls).validate_json(Path(path).read_bytes())

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,9 @@ def image(step: Step, camera: str) -> np.ndarray:
 def write(writer: CaptureWriter, *keys: tuple[int, str]) -> None:
     for index, camera in keys:
         step = STEPS[index]
-        writer.write_frame(step, camera, image(step, camera), full_scale=4.0, count_scale=1e-3)
+        frame = image(step, camera)
+        record = writer.store_frame(step, camera, frame, full_scale=4.0, count_scale=1e-3)
+        writer.commit([replace(record, pulse=index + 1)])
 
 
 EVERY = [(s.index, c.name) for s in STEPS for c in RIG.cameras]
