@@ -40,7 +40,7 @@ class RenderProcess:
         return answer
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`; raises `RenderError`."""
+        """See `Responder.lights_together`; `power (L,)`. Raises `RenderError`."""
         answer: Response = self._call("lights_together", camera, pose, power)
         return answer
 
@@ -88,7 +88,7 @@ class RenderPool:
         return self._of(camera).lights(camera)
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`; raises `RenderError`."""
+        """See `Responder.lights_together`; `power (L,)`. Raises `RenderError`."""
         return self._of(camera).lights_together(camera, pose, power)
 
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:

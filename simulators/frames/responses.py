@@ -124,7 +124,7 @@ class MitsubaResponder:
         return Response(pixels, images)
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`; a vertex asks a sample of those that are lit."""
+        """See `Responder.lights_together`; `power (L,)`. A vertex asks a sample of them."""
         from appearance.render.olat import render_olat
 
         seen, pixels = self._view(camera, pose)

@@ -156,7 +156,7 @@ class PropResponder:
         return Response(seen.pixels, images)
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`."""
+        """See `Responder.lights_together`; `power (L,)`."""
         response = self.lights(camera)
         images = np.tensordot(power.astype(np.float32), response.images, 1)
         return Response(response.pixels, images[None].astype(np.float32))
