@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from stage_service.cli.support import (
-    BadInput,
+    BadArgument,
     Commands,
     Output,
     add_command,
@@ -75,7 +75,7 @@ def run_rig(args: argparse.Namespace, output: Output) -> int:
     from stage_service.config import load_rig_file
 
     if args.out.suffix != ".json":
-        raise BadInput(f"--out must end in .json, got {args.out}")
+        raise BadArgument(f"--out must end in .json, got {args.out}")
     boards = [Capture(p) for p in args.boards]
     tables: dict[str, Any] = {}
     if args.rig is None:
@@ -128,7 +128,7 @@ def run_board(args: argparse.Namespace, output: Output) -> int:
     board = _board(args)
     per_square = round(board.square / 0.0254 * args.dpi)
     if per_square < 8 or not cv2.imwrite(str(args.out), board.picture(per_square)):
-        raise BadInput(
+        raise BadArgument(
             f"{args.out}: cannot be written, or squares of {per_square} pixels are too small"
         )
     width, height = (1e3 * board.size).tolist()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.support import (
     FAILED,
-    BadInput,
+    BadArgument,
     CommandError,
     Commands,
     Output,
@@ -69,7 +69,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> int:
         value = getattr(args, field)
         if "." in value or "/" in value:
             if not Path(value).is_file():
-                raise BadInput(f"--{field}: there is no file {value}")
+                raise BadArgument(f"--{field}: there is no file {value}")
             setattr(args, field, str(Path(value).resolve()))
     chosen_variant()  # what is missing is told before anything is started
     _prepare(out)
@@ -181,7 +181,7 @@ def _prepare(out: Path) -> None:
     """Make `out` an empty folder; what an earlier demo left there goes, anything else stays."""
     if out.is_dir() and any(out.iterdir()):
         if not (out / MARK).is_file():
-            raise BadInput(
+            raise BadArgument(
                 f"{out} holds something that no demo wrote: choose another folder with --out"
             )
         shutil.rmtree(out)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from stage_service.cli.support import (
-    BadInput,
+    BadArgument,
     Commands,
     Output,
     add_command,
@@ -97,4 +97,4 @@ def run_mark(args: argparse.Namespace, output: Output) -> int:
 
 def _require_obj(path: Path) -> None:
     if path.suffix != ".obj":
-        raise BadInput(f"--out must end in .obj, got {path}")
+        raise BadArgument(f"--out must end in .obj, got {path}")

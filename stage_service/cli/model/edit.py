@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.support import BadInput, Commands, Output, add_command
+from stage_service.cli.support import BadArgument, Commands, Output, add_command
 
 if TYPE_CHECKING:
     from appearance.bsdf.maps import HairMaps
@@ -78,11 +78,13 @@ def run(args: argparse.Namespace, output: Output) -> int:
     names = ("strands", "cut", "recolour", "pigment", "roughen")
     edits = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
     if not edits:
-        raise BadInput(f"say what to edit: one of {', '.join('--' + n for n in names)}")
+        raise BadArgument(f"say what to edit: one of {', '.join('--' + n for n in names)}")
     if (args.wisp or args.along != (0.0, 1.0)) and not {"recolour", "pigment"} & set(edits):
-        raise BadInput("--wisp and --along say where to colour: give --recolour or --pigment too")
+        raise BadArgument(
+            "--wisp and --along say where to colour: give --recolour or --pigment too"
+        )
     if args.out.exists() and any(args.out.iterdir()):
-        raise BadInput(f"--out {args.out} is not empty: choose a new folder")
+        raise BadArgument(f"--out {args.out} is not empty: choose a new folder")
     source = Model(args.model)
     fitted = FittedModel.load(source, Capture(args.capture) if args.capture else None)
     if args.strands is not None:
@@ -114,7 +116,7 @@ def _coloured(fitted: FittedModel, args: argparse.Namespace) -> HairMaps:
         uv = fitted.root_uv
         inside = np.flatnonzero(np.hypot(uv[:, 0] - u, uv[:, 1] - v) <= radius)
         if not len(inside):
-            raise BadInput(f"--wisp: no strand is rooted within {radius} of ({u}, {v})")
+            raise BadArgument(f"--wisp: no strand is rooted within {radius} of ({u}, {v})")
         columns, rows = (max(n, WISP_CELLS) for n in maps.shape[1:])
         brush = wisp_of(inside, uv, (columns, rows))
     if args.along != (0.0, 1.0):
@@ -130,10 +132,10 @@ def _absorption(args: argparse.Namespace, beta_n: float) -> Array:
 
     if args.pigment is not None:
         if min(args.pigment) < 0:
-            raise BadInput(f"--pigment: concentrations must be 0 or more, got {args.pigment}")
+            raise BadArgument(f"--pigment: concentrations must be 0 or more, got {args.pigment}")
         return np.array(of_melanin(*args.pigment))
     if not all(0 < c <= 1 for c in args.recolour):
-        raise BadInput(f"--recolour: three numbers above 0 and at most 1, got {args.recolour}")
+        raise BadArgument(f"--recolour: three numbers above 0 and at most 1, got {args.recolour}")
     return absorption_of_colour(args.recolour, beta_n)
 
 

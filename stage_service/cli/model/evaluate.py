@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from stage_service.cli.support import (
-    BadInput,
+    BadArgument,
     Commands,
     Output,
     add_command,
@@ -70,7 +70,7 @@ def run_geometry(args: argparse.Namespace, output: Output) -> int:
 
     pred, true = read_strands(args.pred), read_strands(args.true)
     if not len(true):
-        raise BadInput(f"{args.true}: no strands to compare with")
+        raise BadArgument(f"{args.true}: no strands to compare with")
     capture = Capture(args.capture) if args.capture is not None else None
     head = capture.head if capture is not None else None
     with progress_bar("evaluate") as progress:
@@ -103,7 +103,7 @@ def run_images(args: argparse.Namespace, output: Output) -> int:
 
     pairs = pair_up(args.pred, args.true)
     if not pairs:
-        raise BadInput(f"{args.pred} and {args.true} have no file name in common")
+        raise BadArgument(f"{args.pred} and {args.true} have no file name in common")
     images = {name: compare_pictures(a, b, args.mask) for name, a, b in pairs}
     mean = {
         key: sum(figures[key] for figures in images.values()) / len(images)
@@ -123,7 +123,9 @@ def run_table(args: argparse.Namespace, output: Output) -> int:
         results = json.loads(path.read_text())
         absent = {"geometry", "baselines", "images", "appearance"} - set(results)
         if absent:
-            raise BadInput(f"{path} has no {', '.join(sorted(absent))}: not a demo's results.json")
+            raise BadArgument(
+                f"{path} has no {', '.join(sorted(absent))}: not a demo's results.json"
+            )
         rows[f"{results['subject']}, seed {results['seed']}"] = results
     output.result({"rows": rows}, markdown_table(rows))
     return 0

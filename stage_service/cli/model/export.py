@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from stage_service.cli.support import BadInput, Commands, Output, add_command
+from stage_service.cli.support import BadArgument, Commands, Output, add_command
 
 SUFFIXES = {"usd": (".usd", ".usda", ".usdc"), "abc": (".abc",), "hair": (".hair",)}
 SIZE = 512
@@ -42,9 +42,11 @@ def run(args: argparse.Namespace, output: Output) -> int:
 
     out: Path = args.out
     if args.to in SUFFIXES and out.suffix not in SUFFIXES[args.to]:
-        raise BadInput(f"--out {out}: expected a file ending in {' or '.join(SUFFIXES[args.to])}")
+        raise BadArgument(
+            f"--out {out}: expected a file ending in {' or '.join(SUFFIXES[args.to])}"
+        )
     if args.camera is not None and (args.capture is None or args.to != "mitsuba"):
-        raise BadInput("--camera is a view for mitsuba, of the rig of --capture")
+        raise BadArgument("--camera is a view for mitsuba, of the rig of --capture")
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
     files = [out]
     if args.to in ("abc", "hair"):

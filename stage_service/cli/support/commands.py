@@ -39,7 +39,7 @@ class CommandError(Exception):
         self.code, self.kind, self.more = code, kind, more
 
 
-class BadInput(CommandError):
+class BadArgument(CommandError):
     """The user gave something that cannot be used."""
 
     def __init__(self, message: str) -> None:
@@ -118,7 +118,7 @@ def read_json(text: str | Path | None) -> Any:
     try:
         return json.loads(str(text) if inline else Path(text).read_text())
     except json.JSONDecodeError as error:
-        raise BadInput(f"{text} is not JSON: {error}") from error
+        raise BadArgument(f"{text} is not JSON: {error}") from error
 
 
 def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
