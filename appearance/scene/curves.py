@@ -16,10 +16,8 @@ MOST_UNEVEN = 2.0
 """Ratio of a strand's longest to its shortest segment above which a uniform spline overshoots."""
 
 
-def spline_control_points(
-    strands: Strands,
-) -> tuple[Array, Ints]:
-    """Control points `(N + 2 S, 4)` (x, y, z, radius) and first control points of the segments.
+def spline_control_points(strands: Strands) -> tuple[Array, Ints]:
+    """Control points `(M, 4)`, M = N + 2 S (x, y, z, radius), and the segments' first `(N - S,)`.
 
     Points are interpolated with natural ends (no curvature at root and tip), for all strands of one
     length at a time. Strands whose points are spaced too unevenly are resampled at equal arc

@@ -1,5 +1,7 @@
 """Held-out images, their baselines and the pictures, on a small capture of known appearance."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -122,6 +124,18 @@ def test_a_group_with_nothing_held_out_is_left_out(made):
     found = assess(capture, model, held_out=HeldOut((), ("l4",)), options=OPTIONS)
     assert "held_out_lights" in found
     assert "held_out_camera" not in found
+
+
+def test_with_nothing_held_out_the_model_is_relit_and_it_is_said(made, tmp_path):
+    capture, model, _ = made
+    copy = Model(tmp_path / "copy")
+    shutil.copytree(model.path, copy.path)
+    for name in ("relit.png", "comparison.png", "report.json"):
+        copy.remove(name)
+    assert set(assess(capture, copy, held_out=HeldOut(), options=OPTIONS)) <= {"lpips"}
+    assert copy.has("relit.png")
+    assert not copy.has("comparison.png")
+    assert "nothing is compared" in copy.report()["images"].warnings[0]
 
 
 def test_three_nearest_lights_are_training_lights(made):
