@@ -22,7 +22,7 @@ from appearance.inverse_rendering.problem import Problem
 from appearance.observations import Observed
 from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
 from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
-from benchmarks.appearance.known_subjects import SUBJECTS, Captured, Rig, known_subject
+from benchmarks.appearance.known_subjects import SUBJECTS, Captured, SmallStage, known_subject
 from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
 from benchmarks.results import markdown, save, spread
@@ -36,7 +36,7 @@ OPTIONS = InverseRenderingOptions(
     shape=(6, 24, 24),
     effort=Effort(pixels=400, spp=512, gradient_spp=64, max_depth=8),
 )
-STAGE = Rig(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
+STAGE = SmallStage(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
 STARTS = (
     (0.4, 0.2, 1.45, (0.75, 1.25, 1.3)),
     (0.9, 0.9, 1.55, (1.0, 1.0, 1.0)),
@@ -54,7 +54,7 @@ def run_bench(
     *,
     seeds: int = 1,
     options: InverseRenderingOptions = OPTIONS,
-    rig: Rig = STAGE,
+    rig: SmallStage = STAGE,
     seed: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -322,7 +322,7 @@ QUICK = InverseRenderingOptions(
     shape=(2, 2, 2),
     effort=Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4),
 )
-SMALL = Rig(size=14, cameras=3, lights=6, spp=64, max_depth=4)
+SMALL = SmallStage(size=14, cameras=3, lights=6, spp=64, max_depth=4)
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:

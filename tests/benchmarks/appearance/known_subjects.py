@@ -32,7 +32,7 @@ _BEND = 0.1
 
 
 @dataclass(frozen=True)
-class Rig:
+class SmallStage:
     """A small stage: cameras on a ring, lights on a dome; every other one is held out.
 
     Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`.
@@ -89,7 +89,7 @@ class Captured:
 
 
 def known_subject(
-    name: str, subject: Subject, rig: Rig, seed: int = 0, before: Captured | None = None
+    name: str, subject: Subject, rig: SmallStage, seed: int = 0, before: Captured | None = None
 ) -> Captured:
     """Subject `name` of `SUBJECTS`, its base colour and roughness those of `subject`.
 
@@ -199,7 +199,7 @@ def _rms_angle(one: Array, other: Array) -> float:
     return float(np.sqrt((np.arctan2(sine, (one * other).sum(axis=1)) ** 2).mean()))
 
 
-def _ring(strands: Strands, rig: Rig) -> list[Camera]:
+def _ring(strands: Strands, rig: SmallStage) -> list[Camera]:
     low, high = strands.points.min(axis=0).astype(float), strands.points.max(axis=0).astype(float)
     middle = 0.5 * (low + high)
     reach = 0.5 * float(np.linalg.norm(high - low))
@@ -213,6 +213,6 @@ def _ring(strands: Strands, rig: Rig) -> list[Camera]:
     return out
 
 
-def _dome(rig: Rig) -> list[Light]:
+def _dome(rig: SmallStage) -> list[Light]:
     places = dome_positions(rig.lights, 1.2, lowest_deg=-30)
     return [Light(f"light_{i:02d}", p, np.full(3, 8.0)) for i, p in enumerate(places)]

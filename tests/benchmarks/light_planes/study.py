@@ -45,7 +45,7 @@ KINDS: tuple[Literal["hair", "skin"], ...] = ("hair", "skin")
 
 
 @dataclass(frozen=True)
-class Case:
+class SubjectCaptures:
     """One subject: its capture while still, the one while drifting, and the truth of each."""
 
     still: tuple[Path, Path]
@@ -54,7 +54,7 @@ class Case:
 
 def study(
     out: Path,
-    case: Case,
+    case: SubjectCaptures,
     options: ReconstructOptions,
     *,
     studies: bool = False,

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.captures import Optics, SimulatedCapture, levels, rig_file
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, within
-from benchmarks.light_planes.study import PAPER, Case, study
+from benchmarks.light_planes.study import PAPER, SubjectCaptures, study
 from benchmarks.results import save
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import write_obj
@@ -151,7 +151,13 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         options = replace(OPTIONS, max_length=framing.longest)
         if args.quick:
             options = replace(options, grid=4e-3, roots=500)
-        study(folder / name, Case(*captures), options, studies=name == "sintel", progress=tell)
+        study(
+            folder / name,
+            SubjectCaptures(*captures),
+            options,
+            studies=name == "sintel",
+            progress=tell,
+        )
     done = {f.parent.name: json.loads(f.read_text()) for f in sorted(folder.glob("*/result.json"))}
     results = {"paper": PAPER, "subjects": done}
     save(args.out / "light_planes.json", results)

@@ -68,7 +68,7 @@ def agreement(
         progress("reading the capture", 0.0)
         capture = import_folder(folder, Path(scratch) / "capture")
         lamps = [capture.rig.lights[i] for i in lights]
-        views: list[View] = []
+        views: list[Renderings] = []
         for i in cameras:
             progress("rendering", len(views) / len(cameras))
             views.append(_view(capture, scene, capture.rig.cameras[i], lamps, depth, (seeds, spp)))
@@ -88,7 +88,7 @@ def agreement(
 
 
 @dataclass(frozen=True)
-class View:
+class Renderings:
     """A camera's hair pixels `(P,)` in all renderings of it.
 
     `radiance[name]` is `(K, L, P, 3)`: K independent runs, one for Cycles; `tile (P,)` numbers the
@@ -124,7 +124,7 @@ def _view(
     lights: Sequence[Light],
     depth: int,
     samples: tuple[int, int],
-) -> View:
+) -> Renderings:
     mask = capture.mask(camera.name)
     if mask is None or not mask.any():
         raise ValueError(f"{capture.path}: no hair mask of {camera.name}: nothing to compare")
@@ -136,7 +136,7 @@ def _view(
     def runs(render: Callable[[int], Floats]) -> Floats:
         return np.stack([render(k) for k in range(seeds)])
 
-    return View(
+    return Renderings(
         camera,
         lights,
         pixels,
@@ -152,7 +152,7 @@ def _view(
     )
 
 
-def compare(views: Sequence[View], one: str, other: str, seed: int = 0) -> dict[str, Any]:
+def compare(views: Sequence[Renderings], one: str, other: str, seed: int = 0) -> dict[str, Any]:
     """The figures of a pair, see `agreement`; lists are by channel."""
     whole = [_tiles(v, v.radiance[one].mean(0), v.radiance[other].mean(0)) for v in views]
     runs = max(len(views[0].radiance[name]) for name in (one, other))
@@ -177,7 +177,7 @@ def compare(views: Sequence[View], one: str, other: str, seed: int = 0) -> dict[
     return figures
 
 
-def _tiles(view: View, one: Floats, other: Floats) -> _Tiles:
+def _tiles(view: Renderings, one: Floats, other: Floats) -> _Tiles:
     tile = view.tile
     count = np.bincount(tile).astype(float)
 
@@ -226,7 +226,7 @@ def table(result: Mapping[str, Any]) -> str:
     return markdown(head, rows)
 
 
-def _picture(path: Path, views: Sequence[View]) -> None:
+def _picture(path: Path, views: Sequence[Renderings]) -> None:
     """A picture of each camera, each under another light, cut to the hair."""
     rows: list[Row] = []
     for i, v in enumerate(views):

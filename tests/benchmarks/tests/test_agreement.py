@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from benchmarks.renderers.agreement import View, agreement, compare
+from benchmarks.renderers.agreement import Renderings, agreement, compare
 
 from reconstruction.geometry.cameras import Camera
 
@@ -21,7 +21,7 @@ def views():
         truth = (shade * rng.uniform(1, 2, (2, 1)))[None, :, :, None] * np.ones(3)
         noise = rng.normal(scale=0.3, size=(8, *truth.shape[1:]))
         radiance = {"Cycles": truth, "bright": truth * [1.1, 1.0, 0.9] + noise, "noise": 1 + noise}
-        out.append(View(camera, (), pixels, radiance))
+        out.append(Renderings(camera, (), pixels, radiance))
     return out
 
 
