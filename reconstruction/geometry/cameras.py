@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reconstruction.arrays import Array, Bools
+from reconstruction.arrays import Array, Bools, Ints
 
 
 def facing(forward: ArrayLike, roll_deg: float = 0.0) -> Array:
@@ -133,6 +133,16 @@ class Pinhole:
             & (p[..., 1] >= -0.5)
             & (p[..., 1] < self.height - 0.5)
         )
+
+    def pixels_of(self, points: ArrayLike) -> tuple[Bools, Ints, Ints, Array]:
+        """Which of `points (N, 3)` fall on the image, their pixels' x and y, and depths: all `(N,)`.
+
+        x and y are 0 where a point falls on no pixel; depths are metres along z.
+        """
+        pixels, depth = self.project(points)
+        seen = (depth > 0) & self.inside(pixels)
+        x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+        return seen, x, y, depth
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Self:
         """The pinhole that a moved subject sees: `x -> rotation (3, 3) @ x + translation (3,)`.

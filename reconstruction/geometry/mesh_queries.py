@@ -98,10 +98,8 @@ def depth_map(camera: Camera, points: AnyFloats) -> Array:
     A pixel has a point for each projector that reaches it; the lower median of those outvotes a
     single wrong one, and of two takes the nearer, which carves less.
     """
-    xy, depth = camera.project(points)
-    ok = (depth > 0) & camera.inside(xy)
-    x, y = np.rint(xy[ok]).astype(int).T
-    flat, depth = y * camera.width + x, depth[ok]
+    seen, x, y, depth = camera.pixels_of(points)
+    flat, depth = (y * camera.width + x)[seen], depth[seen]
     order = np.lexsort((depth, flat))
     pixel, start, count = np.unique(flat[order], return_index=True, return_counts=True)
     out = np.zeros(camera.height * camera.width)

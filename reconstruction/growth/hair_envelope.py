@@ -84,9 +84,7 @@ def build_envelope(
 
 def _on(mask: Bools, camera: Camera, points: Array) -> Bools:
     """Which of `points (N, 3)` fall on `mask (H, W)`."""
-    pixels, depth = camera.project(points)
-    seen = (depth > 0) & camera.inside(pixels)
-    x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+    seen, x, y, _ = camera.pixels_of(points)
     return np.asarray(seen & mask[y, x])
 
 
@@ -101,11 +99,9 @@ def _holding(grid: VoxelGrid, points: Array) -> Bools:
 
 def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
     """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
-    pixels, depth = camera.project(envelope.centers())
-    ok = (depth > 0) & camera.inside(pixels)
-    x, y = np.rint(pixels[ok]).astype(int).T
+    seen, x, y, depth = camera.pixels_of(envelope.centers())
     out = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(out, (y, x), depth[ok])
+    np.minimum.at(out, (y[seen], x[seen]), depth[seen])
     return np.where(np.isfinite(out), out, 0.0)
 
 

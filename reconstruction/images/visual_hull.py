@@ -242,9 +242,7 @@ def space_carve(
                 f"{camera.name}: first_surface must be {(camera.height, camera.width)}, "
                 f"got {first.shape}"
             )
-        pixels, depth = camera.project(hull.centers(index))
-        seen = (depth > 0) & camera.inside(pixels)
-        x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+        seen, x, y, depth = camera.pixels_of(hull.centers(index))
         index = index[~seen | (depth >= first[y, x] - margin)]
     inside = np.zeros_like(hull.inside)
     inside[tuple(index.T)] = True

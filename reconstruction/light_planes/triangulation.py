@@ -200,12 +200,8 @@ def inside_hull(capture: Capture, points: Array, stage: Stage | None = None) -> 
         if not mask.any():
             continue
         outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
-        pixels, depth = camera.project(points)
-        seen = (depth > 0) & camera.inside(pixels)
-        x, y = np.rint(pixels[seen]).astype(int).T
-        y, x = np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)
-        far = outside[y, x] > HULL_MARGIN
-        keep[np.flatnonzero(seen)[far]] = False
+        seen, x, y, _ = camera.pixels_of(points)
+        keep &= ~(seen & (outside[y, x] > HULL_MARGIN))
     return keep
 
 

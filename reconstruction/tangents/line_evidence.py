@@ -49,11 +49,9 @@ def line_support(responses: AnyFloats) -> Floats:
 
 def seen_by(evidence: LineEvidence, points: AnyFloats, tolerance: float) -> Bools:
     """Points `(N,)` that project onto the mask at no more than `tolerance` behind its depth."""
-    pixels, depth = evidence.camera.project(points)
-    ok = (depth > 0) & evidence.camera.inside(pixels)
-    x, y = np.rint(np.where(ok[:, None], pixels, 0)).astype(int).T
+    on, x, y, depth = evidence.camera.pixels_of(points)
     there = evidence.depth[y, x]
-    return np.asarray(ok & evidence.mask[y, x] & (there > 0) & (depth <= there + tolerance))
+    return np.asarray(on & evidence.mask[y, x] & (there > 0) & (depth <= there + tolerance))
 
 
 def line_scores(
