@@ -135,7 +135,7 @@ class Pinhole:
         )
 
     def pixels_of(self, points: ArrayLike) -> tuple[Bools, Ints, Ints, Array]:
-        """Which of `points (N, 3)` fall on the image, their pixels' x and y, and depths: all `(N,)`.
+        """Which of `points (N, 3)` fall on the image, the pixels' x and y, and depths; `(N,)` each.
 
         x and y are 0 where a point falls on no pixel; depths are metres along z.
         """
