@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -31,13 +31,7 @@ class Segments:
 
     def subset(self, which: Bools) -> Segments:
         """The segments where `which (N,)`."""
-        return Segments(
-            self.points[which],
-            self.directions[which],
-            self.confidence[which],
-            self.view[which],
-            self.supports[which],
-        )
+        return Segments(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 def to_segments(views: Sequence[View], maps: Sequence[DepthMap]) -> Segments:
@@ -90,9 +84,7 @@ def count_supports(
             cosine = np.einsum("nk,nk->n", segments.directions[i], segments.directions[j])
             agrees[some] = near & (np.abs(cosine) >= least)
         supports[other[agrees]] += 1
-    return Segments(
-        segments.points, segments.directions, segments.confidence, segments.view, supports
-    )
+    return replace(segments, supports=supports)
 
 
 def thinned_lines(

@@ -234,16 +234,7 @@ def fuse(cloud: PointCloud) -> PointCloud:
     outer = kept.view[:, :, None] * kept.view[:, None, :]
     covariance = kept.covariance + (along - 1 / information[best][:, None, None]) * outer
     weight = np.minimum(1.0, kept.weight * total / information[best]).astype(np.float32)
-    columns = {name: getattr(kept, name) for name in ("view", "pixel", "camera", "projector")}
-    columns |= {name: getattr(kept, name) for name in ("row", "step", "brightness")}
-    return PointCloud(
-        points=points / total[:, None],
-        covariance=covariance,
-        weight=weight,
-        cameras=kept.cameras,
-        projectors=kept.projectors,
-        **columns,
-    )
+    return replace(kept, points=points / total[:, None], covariance=covariance, weight=weight)
 
 
 def _cut(origin: Array, rays: Array, projector: Projector, row: Array) -> tuple[Array, Array]:
