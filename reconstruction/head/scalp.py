@@ -92,7 +92,7 @@ def _above_hairline(points: Array, covered: Bools) -> Bools:
 
 
 def sample_roots(scalp: Scalp, count: int, seed: int) -> tuple[Array, Array]:
-    """`count` roots `(count, 3)` uniform over the scalp's area, and their normals `(count, 3)`.
+    """`count` roots `(N, 3)` uniform over the scalp's area, and their normals `(N, 3)`.
 
     Faces are drawn by their scalp area; on faces that are only partly scalp, roots are redrawn
     until they fall near a scalp point.

@@ -80,7 +80,7 @@ class ScalpMap:
         return np.clip(uv, 0, 1), distance
 
     def stretch(self) -> Array:
-        """Area on the map over area on the head, by scalp face, in units of their mean `(F',)`."""
+        """Area on the map over area on the head, by scalp face, in units of their mean `(F,)`."""
         scalp = _scalp(self.head)
         areas = self.head.face_areas()[scalp]
         ratio = _signed_areas(self.uv[self.head.faces[scalp]]) / np.maximum(areas, 1e-300)

@@ -22,7 +22,7 @@ BANDWIDTH = float(np.log(2))
 
 
 def filters(bank: LogGaborBank, height: int, width: int) -> Iterator[Floats]:
-    """The bank's `count` transfer functions `(height, width)`, in the layout of `fft2`.
+    """The bank's `count` transfer functions `(H, W)`, in the layout of `fft2`.
 
     exp(−log²(ρλ)/(2σ_λ²)) · exp(−Δ²/(2σ_φ²)): Sun Eq. 13 with the square that its print lost; ρ is
     the frequency in cycles per pixel, Δ the angle to the filter's own. Filter k answers to lines at
