@@ -49,7 +49,7 @@ class HairMaps:
 
     @classmethod
     def of(cls, hair: HairAppearance, shape: tuple[int, int, int] = (1, 1, 1)) -> HairMaps:
-        """Maps of `shape` (n_c, w, h) that are `hair` everywhere."""
+        """Maps of `shape` (n_c, w, h), absorption `(n_c, w, h, 3)`, that are `hair` everywhere."""
         sigma_a = np.broadcast_to(hair.sigma_a, (*shape, 3))
         return cls(
             sigma_a, np.zeros((*shape, 2)), hair.beta_m, hair.beta_n, hair.eta, hair.tilt_deg

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
+from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from reconstruction.arrays import Array
 
@@ -41,18 +42,18 @@ def direction(theta: ArrayLike, gamma: ArrayLike) -> Array:
 
 
 def variance(p: int, beta_m: ArrayLike) -> Array:
-    """v of lobe `p`: Chiang's map of the longitudinal roughness, a quarter for TT, four for TRT."""
+    """v of lobe `p`, of the shape of `beta_m`: Chiang's map, a quarter for TT, four for TRT."""
     return np.asarray((1, 0.25, 4, 4)[p] * variance_of_roughness(beta_m))
 
 
 def logistic_scale(beta_n: ArrayLike) -> Array:
-    """s: Chiang's map of the azimuthal roughness to the scale of a logistic distribution."""
+    """s, of the shape of `beta_n`: Chiang's map to the scale of a logistic distribution."""
     b = np.asarray(beta_n, float)
     return np.asarray(np.sqrt(np.pi / 8) * (0.265 * b + 1.194 * b**2 + 5.372 * b**22))
 
 
 def tilted(p: int, theta: ArrayLike, tilt: ArrayLike) -> Array:
-    """theta that lobe `p` sees under a cuticle tilt, folded back into [-pi/2, pi/2]."""
+    """theta, of any shape, that lobe `p` sees under a cuticle tilt, folded into [-pi/2, pi/2]."""
     turned = np.asarray(theta, float) + (2, -1, -4, 0)[p] * np.asarray(tilt, float)
     return np.arcsin(np.sin(turned))
 
@@ -60,35 +61,39 @@ def tilted(p: int, theta: ArrayLike, tilt: ArrayLike) -> Array:
 def m_p(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
     """M_p: the longitudinal lobe (d'Eon 2011, eq. 7), of unit integral over cos(theta_o) dtheta_o.
 
-    `appearance.bsdf.longitudinal` has it, and is tested against arbitrary precision.
+    Arguments broadcast to one shape. `appearance.bsdf.longitudinal` has it, and is tested against
+    arbitrary precision.
     """
     return longitudinal(theta_i, theta_o, v)
 
 
 def refracted_azimuth(theta: ArrayLike, gamma: ArrayLike, eta: ArrayLike) -> Array:
-    """gamma_t inside the fibre, by Bravais' modified index eta'."""
+    """gamma_t inside the fibre, by Bravais' modified index eta'; arguments of any one shape."""
     eta_p = np.sqrt(np.asarray(eta, float) ** 2 - np.sin(theta) ** 2) / np.cos(theta)
     return np.arcsin(np.sin(gamma) / eta_p)
 
 
 def refracted_inclination(theta: ArrayLike, eta: ArrayLike) -> Array:
-    """theta_t inside the fibre."""
+    """theta_t inside the fibre, of the shape of `theta`."""
     return np.arcsin(np.sin(theta) / np.asarray(eta, float))
 
 
 def phi(p: int, gamma: ArrayLike, gamma_t: ArrayLike) -> Array:
-    """Phi_p: how far lobe `p` turns the azimuth in a smooth fibre."""
+    """Phi_p, of the shape of `gamma`: how far lobe `p` turns the azimuth in a smooth fibre."""
     return np.asarray(2 * p * np.asarray(gamma_t, float) - 2 * np.asarray(gamma) + p * np.pi)
 
 
 def logistic(x: ArrayLike, s: ArrayLike) -> Array:
-    """Logistic density of scale `s`."""
+    """Logistic density of scale `s` at `x` of any shape."""
     z = np.exp(-np.abs(x) / s)
     return np.asarray(z / (s * (1 + z) ** 2))
 
 
 def n_p(p: int, turn: ArrayLike, gamma: ArrayLike, gamma_t: ArrayLike, s: ArrayLike) -> Array:
-    """N_p: density of the turn gamma_o - gamma_i; a logistic trimmed to [-pi, pi] about Phi_p."""
+    """N_p: density of the turn gamma_o - gamma_i; a logistic trimmed to [-pi, pi] about Phi_p.
+
+    Arguments broadcast to one shape.
+    """
     s = np.asarray(s, float)
     if p == LOBES - 1:
         return np.full(np.broadcast(turn, gamma, s).shape, 0.5 / np.pi)
@@ -98,7 +103,7 @@ def n_p(p: int, turn: ArrayLike, gamma: ArrayLike, gamma_t: ArrayLike, s: ArrayL
 
 
 def fresnel(mu: ArrayLike, eta: ArrayLike) -> Array:
-    """F: unpolarised reflectance of a dielectric at the cosine `mu` to its normal."""
+    """F, of the shape of `mu`: unpolarised reflectance at the cosine `mu` to the normal."""
     mu, eta = np.asarray(mu, float), np.asarray(eta, float)
     inside = np.sqrt(1 - (1 - mu**2) / eta**2)
     s = (mu - eta * inside) / (mu + eta * inside)
@@ -107,7 +112,7 @@ def fresnel(mu: ArrayLike, eta: ArrayLike) -> Array:
 
 
 def a_p(p: int, f: ArrayLike, t: ArrayLike) -> Array:
-    """A_p: share of light that leaves by lobe `p`, from Fresnel's `f` and the transmission `t`."""
+    """A_p, of the shape of `f`: light that leaves by lobe `p`, `t` of it transmitted a crossing."""
     f, t = np.asarray(f, float), np.asarray(t, float)
     if p == 0:
         return np.broadcast_to(f, np.broadcast(f, t).shape)
@@ -116,47 +121,26 @@ def a_p(p: int, f: ArrayLike, t: ArrayLike) -> Array:
 
 
 def transmission(theta: ArrayLike, gamma: ArrayLike, eta: ArrayLike, sigma_a: ArrayLike) -> Array:
-    """T: what absorption leaves of light that crosses the fibre once."""
+    """T, of the shape of `theta`: what absorption leaves of light that crosses the fibre once."""
     gamma_t = refracted_azimuth(theta, gamma, eta)
     length = 2 * np.cos(gamma_t) / np.cos(refracted_inclination(theta, eta))
     return np.exp(-np.asarray(sigma_a, float) * length)
 
 
-def lobe(
-    p: int,
-    wi: ArrayLike,
-    wo: ArrayLike,
-    *,
-    beta_m: ArrayLike,
-    beta_n: ArrayLike,
-    eta: ArrayLike,
-    tilt: ArrayLike,
-) -> Array:
-    """M_p N_p: the density by solid angle of lobe `p` towards `wo`, of unit integral."""
+def lobe(p: int, fibre: Fibre, wi: ArrayLike, wo: ArrayLike) -> Array:
+    """M_p N_p `(...)`: the density by solid angle of lobe `p` towards `wo (..., 3)`, integral 1."""
     theta, gamma = inclination(wi), azimuth(wi)
-    m = m_p(tilted(p, theta, tilt), inclination(wo), variance(p, beta_m))
-    gamma_t = refracted_azimuth(theta, gamma, eta)
-    return m * n_p(p, azimuth(wo) - gamma, gamma, gamma_t, logistic_scale(beta_n))
+    m = m_p(tilted(p, theta, fibre.tilt), inclination(wo), variance(p, fibre.beta_m))
+    gamma_t = refracted_azimuth(theta, gamma, fibre.eta)
+    return m * n_p(p, azimuth(wo) - gamma, gamma, gamma_t, logistic_scale(fibre.beta_n))
 
 
-def evaluate(
-    wi: ArrayLike,
-    wo: ArrayLike,
-    *,
-    sigma_a: ArrayLike,
-    beta_m: ArrayLike,
-    beta_n: ArrayLike,
-    eta: ArrayLike = 1.55,
-    tilt: ArrayLike = 0.0,
-) -> Array:
-    """BSDF times cosine: sum of A_p M_p N_p, per steradian.
+def evaluate(fibre: Fibre, wi: ArrayLike, wo: ArrayLike) -> Array:
+    """BSDF times cosine `(...)`: sum of A_p M_p N_p, per steradian.
 
-    `wi`, `wo` `(..., 3)` are unit directions; `sigma_a` is one channel's absorption per fibre
-    radius; `beta_m`, `beta_n` in (0, 1]; `eta` > 1 the relative index; `tilt` the cuticle's tilt
-    in radians, positive where R moves towards the root.
+    `wi`, `wo` `(..., 3)` are unit directions; the fibre's `sigma_a` is that of one channel.
     """
     theta, gamma = inclination(wi), azimuth(wi)
-    f = fresnel(np.cos(theta) * np.abs(np.cos(gamma)), eta)
-    t = transmission(theta, gamma, eta, sigma_a)
-    shape = {"beta_m": beta_m, "beta_n": beta_n, "eta": eta, "tilt": tilt}
-    return np.asarray(sum(a_p(p, f, t) * lobe(p, wi, wo, **shape) for p in range(LOBES)))
+    f = fresnel(np.cos(theta) * np.abs(np.cos(gamma)), fibre.eta)
+    t = transmission(theta, gamma, fibre.eta, fibre.sigma_a)
+    return np.asarray(sum(a_p(p, f, t) * lobe(p, fibre, wi, wo) for p in range(LOBES)))

@@ -17,7 +17,7 @@ from appearance.inverse_rendering.batches import Batch, Comparison, Pairs, Patch
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode, encode, hair_values
 from appearance.observations import Observed
-from appearance.render.differentiable import DifferentiableOlat
+from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
 from reconstruction.array_backend import for_kernels
@@ -80,8 +80,8 @@ class Problem:
     ) -> tuple[Raw, Comparison]:
         """The loss's derivative by each free number, and the patch rendered beside captured.
 
-        `seeds` are the picture's and the gradient's. Threads would add up a gradient in no fixed
-        order: it takes a single one, and is the same on every run.
+        `gain (L,)`; `seeds` are the picture's and the gradient's. Threads would add up a gradient
+        in no fixed order: it takes a single one, and is the same on every run.
         """
         leaves = {k: mi.TensorXf(for_kernels(v)) for k, v in raw.items()}
         for name in objective.free:
@@ -108,7 +108,7 @@ class Problem:
     def error(
         self, raw: Raw, gain: Array, validation: ValidationSet, effort: Effort, seed: int
     ) -> float:
-        """Weighted mean squared difference, noise taken off, with fixed random numbers."""
+        """Weighted mean squared difference, noise taken off, at `gain (L,)`, of fixed seeds."""
         values = []
         for patch, share in validation:
             a, b = self._twice(raw, gain, patch, effort, seed)
@@ -125,7 +125,7 @@ class Problem:
     def validation(
         self, raw: Raw, gain: Array, pairs: Sequence[Batch], effort: Effort, seed: int
     ) -> ValidationSet:
-        """What `error` observes: some pixels of `pairs`, weighted by their noise about `raw`."""
+        """What `error` observes: pixels of `pairs`, weighted by noise about `raw`, `gain (L,)`."""
         out = []
         for batch in pairs:
             patch = self.patch(batch, effort.pixels, np.random.default_rng(seed))
@@ -153,7 +153,7 @@ class Problem:
         return Comparison(rendered, captured, level, o.valid[patch.lights][:, patch.few])
 
     def render(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> Array:
-        """A patch in exposure units `(k, P, 3)`."""
+        """A patch under `gain (L,)` in exposure units `(k, P, 3)`."""
         moved = self.lights_at(raw, gain)
         o = self.views[patch.view]
         radiance = render_olat(
@@ -169,7 +169,7 @@ class Problem:
         return radiance.astype(float) * self.scale
 
     def lights_at(self, raw: Raw, gain: Array) -> list[Light]:
-        """All lights as `raw` has them."""
+        """All lights as `raw` and `gain (L,)` have them."""
         profile = np.exp(raw["profile"])[self.profile_of]
         return LightDeviations(raw["position"], raw["turn"], gain, profile).applied(self.lights)
 
@@ -200,9 +200,7 @@ class Problem:
             o.camera,
             [moved[i] for i in patch.lights],
             o.pixels[patch.few],
-            spp=effort.gradient_spp,
-            max_depth=effort.max_depth,
-            rr_depth=effort.rr_depth,
+            ReplaySampling(effort.gradient_spp, effort.max_depth, effort.rr_depth),
         )
 
     def _light_values(

@@ -38,11 +38,29 @@ _GRADIENT_STREAM = 1 << 29
 _UNITS = {"lights.position": SCALE, "lights.intensity": SCALE**2, "lights.turn": 1.0}
 
 
+@dataclass(frozen=True)
+class ReplaySampling:
+    """`spp` paths a pixel of at most `max_depth` vertices, with roulette from vertex `rr_depth`."""
+
+    spp: int = 32
+    max_depth: int = 8
+    rr_depth: int = 4
+
+    def __post_init__(self) -> None:
+        if self.spp < 1 or self.max_depth < 1:
+            raise ValueError(
+                f"spp and max_depth must be positive, got {self.spp}, {self.max_depth}"
+            )
+
+
+SAMPLING = ReplaySampling()
+
+
 class DifferentiableOlat:
     """The pixels `(P,)` of `camera` under each of `lights` alone, as a function of parameters.
 
-    `spp` paths a pixel of at most `max_depth` vertices serve all lights; roulette starts at vertex
-    `rr_depth`. The BSDF of `scene` holds the parameters' values during a call only.
+    The paths of `sampling` serve all lights. The BSDF of `scene` holds the parameters' values
+    during a call only.
 
     With a `guide`, the same geometry with materials of its own (`scene.with_hair(…)`), directions
     are drawn from those, and the paths are the same for all values of the parameters: but for
@@ -56,23 +74,17 @@ class DifferentiableOlat:
         camera: Camera,
         lights: Sequence[Light],
         pixels: ArrayLike,
-        *,
-        spp: int = 32,
-        max_depth: int = 8,
-        rr_depth: int = 4,
+        sampling: ReplaySampling = SAMPLING,
         guide: HairScene | None = None,
     ) -> None:
-        if spp < 1 or max_depth < 1 or not lights:
-            raise ValueError(
-                "spp and max_depth must be positive, and lights must not be empty, "
-                f"got {spp}, {max_depth} and {len(lights)} lights"
-            )
+        if not lights:
+            raise ValueError("lights must not be empty")
         if guide is not None and guide.hair_bsdf is scene.hair_bsdf is not None:
             raise ValueError("the guide must have a hair BSDF of its own: see HairScene.with_hair")
         self.scene, self.camera, self.lights = scene, camera, tuple(lights)
         self.guide = guide
         self.index = pixel_indices(camera, pixels)
-        self.spp, self.max_depth, self.rr_depth = spp, max_depth, rr_depth
+        self.sampling = sampling
         self._bank = LightBank.of(self.lights)
 
     def parameters(self) -> dict[str, Any]:
@@ -154,7 +166,7 @@ class DifferentiableOlat:
                 walk.along(mi.Color3f(0), paths.rng)
 
             self._each_sample(seed, trace)
-        return mi.TensorXf(film / self.spp, (len(self.lights), len(self.index), 3))
+        return mi.TensorXf(film / self.sampling.spp, (len(self.lights), len(self.index), 3))
 
     def gradients(
         self, values: Mapping[str, Any], wanted: Sequence[str], weight: Any, seed: int
@@ -163,7 +175,7 @@ class DifferentiableOlat:
         leaves = _scaled(values)
         for name in wanted:
             dr.enable_grad(leaves[name])
-        share = mi.Float(weight.array) / self.spp
+        share = mi.Float(weight.array) / self.sampling.spp
         dr.make_opaque(share)
         generator: Any = mi.PCG32
         suspend: Any = dr.suspend_grad  # untyped
@@ -180,7 +192,9 @@ class DifferentiableOlat:
         return {k: dr.grad(leaves[k]) * _UNITS.get(k, 1.0) for k in wanted}
 
     def _each_sample(self, seed: int, trace: Any) -> None:
-        each_sample(self.camera, _array(self.index), len(self.index), self.spp, (seed,), trace)
+        each_sample(
+            self.camera, _array(self.index), len(self.index), self.sampling.spp, (seed,), trace
+        )
 
 
 def _array(index: Ints) -> Any:
@@ -263,7 +277,7 @@ class _Walk:
     def along(self, total: Any, rng: Any) -> Any:
         """Walk all paths, starting from the sum `total`; returns the sum."""
         si = self.surface.interact(self.paths.rays, mi.Bool(True))
-        max_depth = self.owner.max_depth
+        max_depth = self.owner.sampling.max_depth
 
         def more(si: Any, beta: Any, total: Any, depth: Any, rng: Any, active: Any) -> Any:
             return active
@@ -271,7 +285,7 @@ class _Walk:
         def body(si: Any, beta: Any, total: Any, depth: Any, rng: Any, active: Any) -> Any:
             total = self._lights(si, beta, total, rng, active)
             active = active & (depth + 1 < max_depth)
-            roulette = depth + 1 >= self.owner.rr_depth
+            roulette = depth + 1 >= self.owner.sampling.rr_depth
             ray, beta, active = continue_path(self.surface, si, beta, rng, roulette, active)
             if self.replay:
                 self._bounce(si, ray, total, active)

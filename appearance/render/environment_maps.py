@@ -46,7 +46,7 @@ def check_environment(envmap: AnyFloats, name: str) -> Floats:
 
 
 def studio(height: int = 128) -> Floats:
-    """A dim grey room with three soft boxes `(height, 2 height, 3)`: key, cool fill, warm rim.
+    """A dim grey room of shape `(height, 2 height, 3)` with key, cool fill and warm rim.
 
     The key is in front of a subject that faces −y, high on its right; mean radiance about 1.
     """
@@ -67,7 +67,7 @@ def studio(height: int = 128) -> Floats:
 def sky(
     height: int = 128, sun_azimuth_deg: float = -120.0, sun_elevation_deg: float = 40.0
 ) -> Floats:
-    """A clear sky with a sun 4° wide over grey ground `(height, 2 height, 3)`.
+    """A clear sky of shape `(height, 2 height, 3)`, a sun 4° wide, over grey ground.
 
     A gradient from a pale horizon to a blue zenith with a glow about the sun; not a physical sky
     model. Azimuth in the world's frame, from +x towards +y.

@@ -30,7 +30,7 @@ _USUAL = 0.99  # quantile of the pilot's pixels beyond which a path is a rare br
 
 @dataclass(frozen=True)
 class OlatOptions:
-    """How `render_olat` and `olat_tiles` spend their time.
+    """How `render_olat` spends its time.
 
     `spp` paths a pixel serve all lights. `max_depth` is the number of vertices a path may have (1
     is direct light); None measures what is needed, see `bounce_limit`.
@@ -40,8 +40,8 @@ class OlatOptions:
     their sum. A contribution below `thrift` times the standard deviation of what a path brings
     from that light (from a pilot pass) casts its shadow ray by roulette; 0 casts all of them. A
     shadow ray takes as long as the BSDF of twenty lights: 3 halves the time and more for 5 to 10 %
-    more variance on hair, where 2 to 8 do as well within a tenth. `roulette`
-    of paths is that of `PathLimits`. The estimate is unbiased for every choice of these numbers.
+    more variance on hair, where 2 to 8 do as well within a tenth. The estimate is unbiased for
+    every choice of these numbers.
 
     `memory` bounds, in bytes, what the tiles of pixels take at a time; the images that
     `render_olat` returns come on top.
@@ -52,7 +52,6 @@ class OlatOptions:
     first_lights: int | None = None
     deep_lights: int | None = None
     thrift: float = 3.0
-    roulette: float = 0.5
     memory: int = 1 << 30
 
     def __post_init__(self) -> None:
@@ -63,10 +62,8 @@ class OlatOptions:
                 f"{self.spp}, {self.max_depth}, {self.first_lights}, {self.deep_lights}, "
                 f"{self.memory}"
             )
-        if not min(self.thrift, self.roulette) >= 0:
-            raise ValueError(
-                f"thrift and roulette must be 0 or more, got {self.thrift}, {self.roulette}"
-            )
+        if not self.thrift >= 0:
+            raise ValueError(f"thrift must be 0 or more, got {self.thrift}")
 
 
 def render_olat(
@@ -82,35 +79,18 @@ def render_olat(
 
     Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`: then
     a cheap pass finds the pixels that see the subject and only those are traced. `options` are
-    those of `OlatOptions`. Same arguments, same bytes, with any number of threads. Where all
-    images are too much to hold, use `olat_tiles`. Raises `ValueError` for options out of range.
-    """
-    if pixels is None:
-        image = np.zeros((len(lights), camera.height * camera.width, 3), np.float32)
-        for index, radiance in olat_tiles(scene, camera, lights, seed=seed, **options):
-            image[:, index] = radiance
-        return image.reshape(len(lights), camera.height, camera.width, 3)
-    index = pixel_indices(camera, pixels)
-    some = np.zeros((len(lights), len(index), 3), np.float32)
-    tiles = _tiles(scene, camera, lights, index, OlatOptions(**options), seed)
-    for part, radiance in tiles:
-        some[:, part] = radiance
-    return some
-
-
-def olat_tiles(
-    scene: HairScene, camera: Camera, lights: Sequence[Light], *, seed: int = 0, **options: Any
-) -> Iterator[tuple[Ints, Floats]]:
-    """`render_olat` of the pixels that see the subject, a tile at a time.
-
-    Yields flat pixel indices `(P,)` and their radiance `(L, P, 3)`. A tile is spread over the
-    whole image. No more than `memory` bytes are in use at a time, whatever the number of lights
-    and pixels, if one pixel fits.
+    those of `OlatOptions`. Same arguments, same bytes, with any number of threads. Raises `ValueError` for options out of range.
     """
     chosen = OlatOptions(**options)
-    index = covered_pixels(scene, camera)
+    index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
+    some = np.zeros((len(lights), len(index), 3), np.float32)
     for part, radiance in _tiles(scene, camera, lights, index, chosen, seed):
-        yield index[part], radiance
+        some[:, part] = radiance
+    if pixels is not None:
+        return some
+    image = np.zeros((len(lights), camera.height * camera.width, 3), np.float32)
+    image[:, index] = some
+    return image.reshape(len(lights), camera.height, camera.width, 3)
 
 
 def _tiles(
@@ -121,7 +101,7 @@ def _tiles(
     options: OlatOptions,
     seed: int,
 ) -> Iterator[tuple[slice, Floats]]:
-    """Slices of `index` and the radiance `(L, P, 3)` of their pixels."""
+    """Slices of `index`, each spread over the whole image, and the radiance `(L, P, 3)` there."""
     if not len(lights) or not len(index):
         return
     plan = _plan(scene, camera, lights, index, options, seed)
@@ -161,7 +141,7 @@ def _plan(
     if depth is None:
         depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    plan = _Plan(lights, (first, deep), PathLimits(depth, options.roulette), none)
+    plan = _Plan(lights, (first, deep), PathLimits(depth), none)
     if options.thrift > 0:
         spread = _spread(scene, camera, index, options.spp, plan, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)

@@ -28,24 +28,23 @@ _REACH = 4.0  # standard deviations of the line's blur beyond which a row is not
 
 @dataclass(frozen=True)
 class ScanlineOptions:
-    """How `render_scanlines` and `scanline_tiles` spend their time.
+    """How `render_scanlines` spends its time.
 
-    `spp` paths a pixel serve all rows. `max_depth`, `thrift`, `roulette` and `memory` are as in
-    `OlatOptions`; here a path costs more than its shadow rays, and fewer of them are spared.
+    `spp` paths a pixel serve all rows. `max_depth`, `thrift` and `memory` are as in `OlatOptions`;
+    here a path costs more than its shadow rays, and fewer of them are spared.
     """
 
     spp: int = 16
     max_depth: int | None = None
     thrift: float = 0.2
-    roulette: float = 0.5
     memory: int = 1 << 30
 
     def __post_init__(self) -> None:
         depth = 1 if self.max_depth is None else self.max_depth
-        if min(self.spp, self.memory, depth) < 1 or not min(self.thrift, self.roulette) >= 0:
+        if min(self.spp, self.memory, depth) < 1 or not self.thrift >= 0:
             raise ValueError(
-                "spp, max_depth and memory must be positive and thrift and roulette 0 or more, "
-                f"got {self.spp}, {self.max_depth}, {self.memory}, {self.thrift}, {self.roulette}"
+                "spp, max_depth and memory must be positive and thrift 0 or more, "
+                f"got {self.spp}, {self.max_depth}, {self.memory}, {self.thrift}"
             )
 
 
@@ -67,7 +66,7 @@ def render_scanlines(
     pass answers the whole sweep. The sum over all rows is that projector with all rows on.
     `rows` limits a projector to a range of its rows; `options` are those of `ScanlineOptions`. A
     moved subject is rendered with the camera and the projectors `moved` instead: the scene stays as
-    it is. Where all rows are too much to hold, use `scanline_tiles`.
+    it is.
     """
     sweep = _sweep(projectors, rows)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
@@ -80,25 +79,6 @@ def render_scanlines(
     if pixels is not None:
         return out
     return {n: o.reshape(len(o), camera.height, camera.width, 3) for n, o in out.items()}
-
-
-def scanline_tiles(
-    scene: HairScene,
-    camera: Camera,
-    projectors: Sequence[Projector],
-    *,
-    seed: int = 0,
-    rows: Mapping[str, range] | None = None,
-    **options: Any,
-) -> Iterator[tuple[Ints, dict[str, Floats]]]:
-    """`render_scanlines` of the pixels that see the subject, a tile at a time, as `olat_tiles`.
-
-    Yields flat pixel indices `(P,)` and radiance `(rows, P, 3)` by projector.
-    """
-    sweep, chosen = _sweep(projectors, rows), ScanlineOptions(**options)
-    index = covered_pixels(scene, camera)
-    for part, films in _tiles(scene, camera, sweep, index, chosen, seed):
-        yield index[part], films
 
 
 Sweep = Sequence[tuple[Projector, range]]
@@ -145,7 +125,7 @@ def _tiles(
     depth = options.max_depth
     if depth is None:
         depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
-    plan = _Plan(sweep, PathLimits(depth, options.roulette), (0.0,) * len(sweep))
+    plan = _Plan(sweep, PathLimits(depth), (0.0,) * len(sweep))
     if options.thrift > 0:
         few = index[:: -(-len(index) // _PILOT)]
         films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))

@@ -37,7 +37,7 @@ def test_float64_matches_the_reference(sigma_a):
         wo = scattered(case)
         known = lobes.known(fibre(case, True), known_direction(case, True))
         value, _ = lobes.evaluate_known(known, array_types(True)[1](wo.T))
-        want = reference.evaluate(case.wi, wo, sigma_a=sigma_a, **case.optics)
+        want = reference.evaluate(lobes.Fibre(sigma_a, **case.optics), case.wi, wo)
         assert np.array(value.x) == pytest.approx(want, rel=1e-6, abs=1e-9), case
 
 
@@ -118,7 +118,7 @@ def test_plain_numbers_work_like_arrays():
     wi, wo = vector(*case.wi), vector(*reference.direction(0.3, 2.0))
     plain = lobes.Fibre(vector(0.4), **case.optics)
     value, pdf = lobes.evaluate(plain, wi, wo)
-    want = reference.evaluate(case.wi, np.array(wo), sigma_a=0.4, **case.optics)
+    want = reference.evaluate(lobes.Fibre(0.4, **case.optics), case.wi, np.array(wo))
     assert value.x == pytest.approx(float(want))
     assert pdf > 0
     wo, pdf, weight = lobes.sample(plain, wi, 0.3, 0.6, 0.2)
@@ -129,7 +129,7 @@ def test_every_back_end_gives_the_same():
     """LLVM and, where there is one, CUDA."""
     case = Case(theta_deg=20, h=0.2, sigma_a=0.4, tilt_deg=3)
     wo = reference.direction(np.linspace(-1.5, 1.5, 100), np.linspace(-3, 3, 100))
-    want = reference.evaluate(case.wi, wo, sigma_a=0.4, **case.optics)
+    want = reference.evaluate(lobes.Fibre(0.4, **case.optics), case.wi, wo)
     modules = [dr.llvm.ad]
     if dr.has_backend(dr.JitBackend.CUDA):
         modules.append(dr.cuda.ad)
@@ -156,5 +156,5 @@ def test_lanes_may_have_fibres_of_their_own():
     )
     value, _ = lobes.evaluate(fibres, vector(np.stack([c.wi for c in some], -1)), vector(wo.T))
     for i, case in enumerate(some):
-        want = reference.evaluate(case.wi, wo[i], sigma_a=case.sigma_a, **case.optics)
+        want = reference.evaluate(lobes.Fibre(case.sigma_a, **case.optics), case.wi, wo[i])
         assert np.array(value.x)[i] == pytest.approx(float(want))

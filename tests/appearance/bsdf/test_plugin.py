@@ -12,6 +12,7 @@ from benchmarks.bsdf.integrals import Case
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import reference
+from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.longitudinal import absorption_of_colour
 from appearance.bsdf.parameters import StrandHit
 from appearance.bsdf.shading_frame import ShadingFrame
@@ -89,7 +90,7 @@ def test_parameters_mean_what_they_mean_in_the_lobes():
     si = interaction(case, 50)
     got = evaluate(bsdf, si, wo)
     for channel, sigma in enumerate((1.0, 0.5, 0.0)):
-        want = reference.evaluate(case.wi, wo, sigma_a=sigma, **case.optics)
+        want = reference.evaluate(Fibre(sigma, **case.optics), case.wi, wo)
         assert got[channel] == pytest.approx(want, rel=1e-4, abs=1e-6)
     u = mi.PCG32(50)
     bs, weight = bsdf.sample(

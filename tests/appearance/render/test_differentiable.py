@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from appearance.render.coverage import covered_pixels
-from appearance.render.differentiable import DifferentiableOlat
+from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.render.olat import render_olat
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
@@ -121,10 +121,8 @@ def test_gradients_of_materials_are_differences_of_the_same_paths(tufted, small,
         camera,
         lights,
         covered_pixels(scene, camera),
-        spp=16,
-        max_depth=5,
-        rr_depth=9,
-        guide=guide,
+        ReplaySampling(16, 5, 9),
+        guide,
     )
     objective = Objective(op)
     names = [k for k in op.parameters() if not k.startswith("lights") and "melanin" not in k]
@@ -158,7 +156,7 @@ def test_where_nothing_casts_a_shadow_lights_agree_with_differences(small, shape
     scene = build_scene(small.no_hair, small.plane(), hair=HAIR, skin=(0.5, 0.4, 0.3))
     camera = small.camera((0.0, -0.3, 0.6), size=8)
     light = Light("l", np.array([0.2, -0.1, 0.4]), np.array([8.0, 4.0, 2.0]), **SHAPES[shape])
-    op = DifferentiableOlat(scene, camera, [light], np.arange(64), spp=64, max_depth=2)
+    op = DifferentiableOlat(scene, camera, [light], np.arange(64), ReplaySampling(64, 2))
     objective = Objective(op)
     found = objective.gradient("lights.position", "lights.turn", "lights.intensity")
     for name, gradient in found.items():
@@ -188,7 +186,7 @@ def test_a_shadow_edge_that_moves_is_left_out(small):
     # looks under the wall, at the place where its edge's shadow falls
     camera = Camera.look_at("c", 24, 24, (-0.1, 0.001, 0.2), (0, 0, 0), 20)
     light = Light("l", np.array([0.0, 0.0, height]), np.full(3, 8.0))
-    op = DifferentiableOlat(scene, camera, [light], np.arange(576), spp=256, max_depth=1)
+    op = DifferentiableOlat(scene, camera, [light], np.arange(576), ReplaySampling(256, 1))
     objective = Objective(op)
     objective.weight = np.full_like(objective.weight, 1 / 576)
     objective.tensor = type(objective.tensor)(objective.weight.astype(np.float32))
@@ -213,16 +211,16 @@ def test_the_picture_is_that_of_the_olat_renderer(tufted, small):
     scene, camera = tufted
     pixels = covered_pixels(scene, camera)
     lights = small.lights()
-    options = {"spp": 2048, "max_depth": 6}
-    ours = numbers(DifferentiableOlat(scene, camera, lights, pixels, **options).radiance({}))
-    olat = render_olat(scene, camera, lights, pixels=pixels, thrift=0, **options)
+    op = DifferentiableOlat(scene, camera, lights, pixels, ReplaySampling(2048, 6))
+    ours = numbers(op.radiance({}))
+    olat = render_olat(scene, camera, lights, pixels=pixels, thrift=0, spp=2048, max_depth=6)
     assert ours.shape == olat.shape
     np.testing.assert_allclose(ours.mean(1), olat.mean(1), rtol=0.02)
 
 
 def test_seeds_decide_the_picture_and_the_paths_of_the_gradient(tufted, small):
     scene, camera = tufted
-    op = DifferentiableOlat(scene, camera, small.lights(), [66, 67, 78], spp=4, max_depth=4)
+    op = DifferentiableOlat(scene, camera, small.lights(), [66, 67, 78], ReplaySampling(4, 4))
     a, b, c = (numbers(op.radiance({}, seed=s)).tobytes() for s in (1, 1, 2))
     assert a == b != c
     found = [Objective(op, seed=s).gradient("skin")["skin"] for s in (1, 1, 2)]
@@ -233,7 +231,7 @@ def test_seeds_decide_the_picture_and_the_paths_of_the_gradient(tufted, small):
 def test_a_loss_flows_on_through_other_operations(tufted, small):
     """Parameters of parameters, and a loss that is not linear; nothing else gets a gradient."""
     scene, camera = tufted
-    op = DifferentiableOlat(scene, camera, small.lights()[:1], [66, 67, 78], spp=16, max_depth=3)
+    op = DifferentiableOlat(scene, camera, small.lights()[:1], [66, 67, 78], ReplaySampling(16, 3))
     log_sigma = mi.Color3f(np.log([0.1, 0.2, 0.45]))
     dr.enable_grad(log_sigma)
     picture = op.radiance({"hair.sigma_a": dr.exp(log_sigma)}, seed=1, gradient_seed=1)
@@ -254,15 +252,15 @@ def test_memory_does_not_grow_with_paths_samples_or_bounces(tufted, small):
     """The gradient is one kernel over pixels, whatever is walked within it."""
     scene, camera = tufted
 
-    def widest(**how):
-        op = DifferentiableOlat(scene, camera, small.lights(), [66, 67, 78], **how)
+    def widest(sampling):
+        op = DifferentiableOlat(scene, camera, small.lights(), [66, 67, 78], sampling)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             Objective(op).gradient("hair.longitudinal_roughness", "skin")
             history = dr.kernel_history([dr.KernelType.JIT])
         return max(k["size"] for k in history)
 
-    assert widest(spp=4, max_depth=2) == widest(spp=64, max_depth=20)
+    assert widest(ReplaySampling(4, 2)) == widest(ReplaySampling(64, 20))
 
 
 def test_what_cannot_be_is_refused(tufted, small):
@@ -281,7 +279,7 @@ def test_gradients_are_those_of_the_truth_in_the_mean(tufted, small):
     """Free paths, finite differences of whole renderings: within their standard errors."""
     scene, camera = tufted
     pixels = covered_pixels(scene, camera)
-    op = DifferentiableOlat(scene, camera, small.lights(), pixels, spp=2048, max_depth=4)
+    op = DifferentiableOlat(scene, camera, small.lights(), pixels, ReplaySampling(2048, 4))
     names = ["hair.longitudinal_roughness", "hair.sigma_a", "hair.eta"]
     STEPS.update(dict.fromkeys(names, 0.02))
     runs = [Objective(op, seed=s) for s in range(8)]

@@ -42,7 +42,7 @@ class Case:
 
     @property
     def optics(self) -> dict[str, float]:
-        """The arguments of `reference.lobe` that are not directions."""
+        """The fields of `Fibre` but the absorption."""
         tilt = float(np.radians(self.tilt_deg))
         return {"beta_m": self.beta_m, "beta_n": self.beta_n, "eta": self.eta, "tilt": tilt}
 

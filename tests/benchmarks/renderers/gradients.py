@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from appearance.render.differentiable import DifferentiableOlat
+from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
@@ -74,7 +74,7 @@ def moved_light(scene: HairScene, places: Array, spp: int, runs: int) -> dict[st
     found: dict[str, list[float]] = {k: [] for k in _CURVES}
     for x in places:
         ops = {
-            d: DifferentiableOlat(scene, camera, [_light(x + d)], pixels, spp=spp, max_depth=4)
+            d: DifferentiableOlat(scene, camera, [_light(x + d)], pixels, ReplaySampling(spp, 4))
             for d in (-STEP, 0.0, STEP)
         }
         replayed, difference = [], []
@@ -104,7 +104,7 @@ def cost(depths: tuple[int, ...], spp: int) -> list[dict[str, float]]:
     lights = [replace(_light(x), name=str(x)) for x in (-0.3, 0.0, 0.3)]
     for depth in depths:
         op = DifferentiableOlat(
-            scene, camera, lights, np.arange(576), spp=spp, max_depth=depth, rr_depth=depth
+            scene, camera, lights, np.arange(576), ReplaySampling(spp, depth, depth)
         )
 
         def picture(op: DifferentiableOlat = op) -> None:
