@@ -79,18 +79,16 @@ def render_olat(
 
     Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`: then
     a cheap pass finds the pixels that see the subject and only those are traced. `options` are
-    those of `OlatOptions`. Same arguments, same bytes, with any number of threads. Raises `ValueError` for options out of range.
+    those of `OlatOptions`. Same arguments, same bytes, with any number of threads.
+    Raises `ValueError` for options out of range.
     """
     chosen = OlatOptions(**options)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    some = np.zeros((len(lights), len(index), 3), np.float32)
+    size = camera.height * camera.width if pixels is None else len(index)
+    out = np.zeros((len(lights), size, 3), np.float32)
     for part, radiance in _tiles(scene, camera, lights, index, chosen, seed):
-        some[:, part] = radiance
-    if pixels is not None:
-        return some
-    image = np.zeros((len(lights), camera.height * camera.width, 3), np.float32)
-    image[:, index] = some
-    return image.reshape(len(lights), camera.height, camera.width, 3)
+        out[:, index[part] if pixels is None else part] = radiance
+    return out if pixels is not None else out.reshape(-1, camera.height, camera.width, 3)
 
 
 def _tiles(
