@@ -128,7 +128,7 @@ def test_devices_are_asked_one_by_one(manager, world):
     assert devices["lights"]["estop_pressed"] is True
     assert devices["lights"]["count"] == 200
     assert devices["trigger"]["state"] == "unreachable"
-    assert "expected a line within" in devices["trigger"]["error"]
+    assert "identifying: expected an identity" in devices["trigger"]["error"]
     assert devices["projectors"]["names"] == ["left", "right"]
     assert devices["cameras"]["cam_2"]["gain"] == 10000.0
 
