@@ -199,7 +199,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             if name == "imported":
                 results[name] = run_imported(out / name, cycles_folder(None), progress=progress)
             else:
-                here = patch(name, side=48, cameras=12, spp=1) if args.quick else patch(name)
+                here = patch(name, side=64, cameras=12, spp=1) if args.quick else patch(name)
                 thinner = name == "sintel"
                 results[name] = run_patch(
                     out / name, here, args.cache, thinner=thinner, progress=progress

@@ -34,7 +34,7 @@ class Patch:
 
 def rig_text(target: tuple[float, float, float], side: int = SIDE, cameras: int = CAMERAS) -> str:
     """A rig file: cameras on the upper hemisphere, a light beside each, and half as many more."""
-    optics = Optics(target, math.degrees(2 * math.atan(side * PITCH / 2 / DISTANCE)))
+    optics = Optics(target, math.degrees(2 * math.atan(SIDE * PITCH / 2 / DISTANCE)))
     devices = [
         optics.device("cameras", k, [p + t for p, t in zip(place, target, strict=True)])
         + f"width = {side}\nheight = {side}"
@@ -54,4 +54,4 @@ def patch(name: str, *, side: int = SIDE, cameras: int = CAMERAS, spp: int = SPP
     target = TARGETS[name]
     rig = rig_text(target, side, cameras)
     capture = SimulatedCapture(f"patch-{name}", rig, subject, head, 0.0, spp)
-    return Patch(capture, Ball(target, side * PITCH / 2))
+    return Patch(capture, Ball(target, SIDE * PITCH / 2))
