@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reconstruction import Camera, Capture, CaptureError, Light
 from reconstruction.arrays import Bools, Floats, Ints
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from .capture.folder import Step as Step
 from .capture.import_folder import import_folder as import_folder
 from .capture.verify import verify as verify
 from .capture.writer import CaptureWriter as CaptureWriter
+from .files.exr import read_exr as read_exr
+from .files.exr import write_exr as write_exr
 from .files.strands import StrandFileError as StrandFileError
 from .files.strands import read_strands as read_strands
 from .files.strands import write_strands as write_strands
@@ -22,4 +24,7 @@ from .options import BadOptions as BadOptions
 from .options import parse_options as parse_options
 from .pipeline import reconstruct as reconstruct
 from .reconstruct_options import ReconstructOptions as ReconstructOptions
+from .report.report import Progress as Progress
 from .report.report import Report as Report
+from .report.report import Stage as Stage
+from .report.report import silent as silent

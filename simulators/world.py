@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction import Rig
 from reconstruction.arrays import Array
-from reconstruction.geometry.rig import Rig
 from simulators.frames.frames import Snapshot
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps

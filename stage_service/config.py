@@ -22,7 +22,8 @@ from pydantic import (
     model_validator,
 )
 
-from reconstruction.geometry.rig import Rig, RigError
+from reconstruction import Rig
+from reconstruction.geometry.rig import RigError
 
 SHORTEST_S, LONGEST_S = 1e-6, 10.0
 """Exposures that the trigger box makes."""

@@ -13,10 +13,7 @@ from typing import Any, TypeVar
 import cv2
 from pydantic import ValidationError
 
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.mesh import read_obj
-from reconstruction.geometry.rig import Rig
-from reconstruction.model import Model
+from reconstruction import Capture, Model, Rig, read_obj
 from stage_service.acquisition.capture_status import CaptureStatus
 from stage_service.acquisition.captures import CaptureManager, UnknownCapture
 from stage_service.acquisition.control import Caller, Control

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from waiting import machine_slack, slowed
 
-from reconstruction.geometry.rig import Rig
+from reconstruction import Rig
 from simulators.frames.frames import FrameMaker
 from simulators.frames.responses import Response
 from simulators.frames.sensor import Sensor

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.capture.folder import Capture, FrameRecord, Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.geometry.rig import Rig
+from reconstruction import Capture, CaptureWriter, Rig, Step
+from reconstruction.capture.folder import FrameRecord
 from simulators.frames.frames import FrameMaker, Snapshot
 from simulators.frames.responses import Responder
 from simulators.frames.sensor import Sensor

@@ -13,12 +13,10 @@ from numpy.typing import ArrayLike
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
+from reconstruction import Mesh, Model, Strands
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 from reconstruction.head.scalp_map import ScalpMap, sphere_center
-from reconstruction.model import Model
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from appearance.inverse_rendering.unknowns import LightDeviations
-from reconstruction.geometry.lights import Light
-from reconstruction.model import Model
+from reconstruction import Light, Model
 
 FILE = "lights.json"
 

@@ -22,8 +22,8 @@ from appearance.inverse_rendering.batches import Batch, Comparison
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Problem
 from appearance.inverse_rendering.unknowns import Raw
+from reconstruction import Progress, silent
 from reconstruction.arrays import Array
-from reconstruction.report.report import Progress, silent
 
 Number = tuple[str, int]
 """A name in `Raw` and the index of a channel there; of "gain", that of a light."""

@@ -12,9 +12,8 @@ from appearance.observations import HeldOut, Observed, observe
 from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
+from reconstruction import Capture, Model
 from reconstruction.arrays import Array, Bools, Floats
-from reconstruction.capture.folder import Capture
-from reconstruction.model import Model
 
 MAGNIFIED = 4.0
 """Factor on the differences of displayed values in error maps."""

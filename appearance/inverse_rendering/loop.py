@@ -21,8 +21,8 @@ from appearance.inverse_rendering.initial_absorption import initial_absorption
 from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
 from appearance.inverse_rendering.problem import Objective, Problem, ValidationSet
 from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode
+from reconstruction import Progress, silent
 from reconstruction.arrays import Array
-from reconstruction.report.report import Progress, silent
 
 Shape = tuple[int, int, int]
 

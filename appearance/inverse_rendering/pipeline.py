@@ -20,12 +20,9 @@ from appearance.render.bounces import bounce_limit
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
+from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, Strands, silent
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model, ModelError
-from reconstruction.report.report import Progress, Series, Stage, silent
+from reconstruction.report.report import Series
 
 JUDGED_IMAGES = 6
 """Held-out images that are judged, at most."""

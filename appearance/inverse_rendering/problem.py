@@ -20,9 +20,9 @@ from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
+from reconstruction import Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Ints
-from reconstruction.geometry.lights import Light
 
 ValidationSet = Sequence[tuple[Patch, Array]]
 """Patches, and the share `(k, P, 3)` of its weight that each value keeps."""

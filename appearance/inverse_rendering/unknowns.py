@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf.maps import HairMaps
+from reconstruction import Light
 from reconstruction.arrays import Array, Ints
-from reconstruction.geometry.lights import Light
 
 Raw = dict[str, Array]
 """Unconstrained numbers by name. Of lights: "position" offsets in metres, "turn" axis-angles in

@@ -27,11 +27,8 @@ from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
+from reconstruction import Capture, Light, Model, ModelError, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Bools
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.lights import Light
-from reconstruction.model import Model, ModelError
-from reconstruction.report.report import Progress, Stage, silent
 
 METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
 COLUMNS = ("captured", "ours", "diffuse", "three_nearest")

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from appearance.bsdf.maps import HairMaps
 from appearance.model.fitted_model import FittedModel
+from reconstruction import Strands
 from reconstruction.arrays import Array, Ints
-from reconstruction.geometry.strands import Strands
 
 
 def wisp_of(strands: ArrayLike, root_uv: Array, cells: tuple[int, int], soft: float = 0.0) -> Array:

@@ -18,12 +18,9 @@ from appearance.bsdf.maps import HairMaps
 from appearance.model.fitted_model import FittedModel
 from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_scene import SCALE
+from reconstruction import Camera, Mesh, Strands, write_exr, write_obj
 from reconstruction.arrays import Array, Floats
-from reconstruction.files.exr import write_exr
 from reconstruction.files.strands.usd import open_curves, write_usd
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh, write_obj
-from reconstruction.geometry.strands import Strands
 
 
 def export_maps(maps: HairMaps, folder: Path) -> list[Path]:

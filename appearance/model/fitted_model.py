@@ -16,14 +16,8 @@ from appearance.render.mixed import Environment, render_mixed
 from appearance.render.tracing import SAMPLING, Sampling
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
+from reconstruction import Camera, Capture, Light, Mesh, Model, ModelError, Rig, Strands
 from reconstruction.arrays import Array, Floats
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model, ModelError
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,8 @@ from appearance.model.fitted_model import FittedModel
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.smoothed import SHOWN, environment_smoothed
+from reconstruction import Camera, Model, Strands, write_exr
 from reconstruction.arrays import Floats
-from reconstruction.files.exr import write_exr
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model
 
 PROCEDURAL = {"studio": studio, "sky": sky}
 

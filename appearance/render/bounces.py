@@ -14,8 +14,8 @@ from appearance.render.paths import Surface
 from appearance.render.tracing import PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque_index
+from reconstruction import Camera
 from reconstruction.arrays import Array, Ints
-from reconstruction.geometry.cameras import Camera
 
 _LONGEST = 256
 _STREAM = 1 << 29

@@ -8,8 +8,8 @@ import numpy as np
 
 from appearance.render.paths import Surface, wave
 from appearance.scene.hair_scene import HairScene
+from reconstruction import Camera
 from reconstruction.arrays import Floats, Ints
-from reconstruction.geometry.cameras import Camera
 
 
 def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, Floats]:

@@ -29,10 +29,9 @@ from appearance.render.paths import Surface, Wave, continue_path, each_sample, p
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque_index
+from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 
 _GRADIENT_STREAM = 1 << 29
 _UNITS = {"lights.position": SCALE, "lights.intensity": SCALE**2, "lights.turn": 1.0}

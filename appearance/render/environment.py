@@ -20,9 +20,9 @@ from appearance.render.paths import Surface, camera_rays
 from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
+from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Floats
-from reconstruction.geometry.cameras import Camera
 
 
 def render_environment(

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from reconstruction import read_exr
 from reconstruction.arrays import AnyFloats, Array, Floats
-from reconstruction.files.exr import read_exr
 
 
 def load_environment(path: str | Path) -> Floats:

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 from appearance.bsdf.corrective import rodrigues
 from appearance.scene.hair_scene import SCALE, light_arrays
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
+from reconstruction import Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import POLAR_FRAMES, LightProfile
-from reconstruction.geometry.lights import Light
 
 
 @dataclass(frozen=True)

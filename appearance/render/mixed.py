@@ -20,10 +20,9 @@ from appearance.render.paths import Surface
 from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
+from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 
 _PILOT = 256  # pixels whose light from each light is estimated first
 _SPREAD = 0.1  # share of the choices that all lights have alike

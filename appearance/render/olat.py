@@ -18,9 +18,8 @@ from appearance.render.paths import PointSource, Surface, light_from, pixel_indi
 from appearance.render.tracing import LANE_BYTES, PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque_index
+from reconstruction import Camera, Light
 from reconstruction.arrays import Floats, Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
+from reconstruction import Camera
 from reconstruction.arrays import Ints
-from reconstruction.geometry.cameras import Camera, undistorted
+from reconstruction.geometry.cameras import undistorted
 
 
 def camera_rays(camera: Camera, u: Any, v: Any) -> Any:

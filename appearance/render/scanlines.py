@@ -17,9 +17,8 @@ from appearance.render.paths import PointSource, Surface, light_from, pixel_indi
 from appearance.render.tracing import LANE_BYTES, PathLimits, PathPlan, Paths, follow
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
+from reconstruction import Camera, Projector
 from reconstruction.arrays import Floats, Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.projectors import Projector
 
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31

@@ -20,9 +20,8 @@ from appearance.render.environment import render_environment
 from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
+from reconstruction import Camera, Light
 from reconstruction.arrays import AnyFloats, Array, Floats
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 
 SIGMA = 1.5
 """Pixels that indirect light is averaged over."""

@@ -12,9 +12,9 @@ import numpy as np
 
 from appearance.render.paths import Surface, jittered
 from appearance.scene.opaque import opaque, opaque_index
+from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
-from reconstruction.geometry.cameras import Camera
 
 LANE_BYTES = 512
 """What a path in flight takes, about."""

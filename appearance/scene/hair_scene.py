@@ -21,10 +21,9 @@ from numpy.typing import ArrayLike
 from appearance.scene.backend import ensure_backend
 from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
+from reconstruction import Mesh, Strands
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 
 SCALE = 100.0
 """Scene units per metre."""

@@ -32,10 +32,9 @@ from appearance.sun_fit.roughness_and_colour import (
     match_roughness,
 )
 from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
+from reconstruction import Capture, Model, Progress, Report, Stage, silent
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import Capture
-from reconstruction.model import Model
-from reconstruction.report.report import Progress, Report, Series, Stage, silent
+from reconstruction.report.report import Series
 
 MAX_DEPTH = 16
 BETA_N = 0.2

@@ -7,7 +7,7 @@ from typing import Any
 
 from appearance.metrics.scores import Exposure
 from appearance.scene.hair_appearance import HairAppearance
-from reconstruction.model import Model, ModelError
+from reconstruction import Model, ModelError
 
 
 @dataclass(frozen=True)

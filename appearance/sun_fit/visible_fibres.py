@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Bools, Floats
-from reconstruction.geometry.cameras import Camera
 
 
 @dataclass(frozen=True, eq=False)

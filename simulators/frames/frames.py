@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruction import Rig
 from reconstruction.arrays import Array, Floats
-from reconstruction.geometry.rig import Rig
 from simulators.frames.responses import Responder, Response
 from simulators.frames.sensor import Sensor
 from simulators.peers.projector_controller import Show

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.scene.backend import ensure_backend
+from reconstruction import Camera, Rig
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.rig import Rig
 from simulators.subject.drift import Drift
 from simulators.subject.subject import Subject
 
@@ -109,7 +108,7 @@ class MitsubaResponder:
 
     def lights(self, camera: str) -> Response:
         """See `Responder.lights`."""
-        from appearance.render.olat import render_olat
+        from appearance import render_olat
 
         seen, pixels = self._view(camera, 0)
         images = render_olat(
@@ -125,7 +124,7 @@ class MitsubaResponder:
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lights_together`; `power (L,)`. A vertex asks a sample of them."""
-        from appearance.render.olat import render_olat
+        from appearance import render_olat
 
         seen, pixels = self._view(camera, pose)
         rotation, translation = self._drift.pose(pose)
@@ -149,7 +148,7 @@ class MitsubaResponder:
 
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:
         """See `Responder.sweep`."""
-        from appearance.render.scanlines import render_scanlines
+        from appearance import render_scanlines
 
         seen, pixels = self._view(camera, pose)
         rotation, translation = self._drift.pose(pose)
@@ -166,7 +165,7 @@ class MitsubaResponder:
 
     def _built(self) -> Any:
         if self._scene is None:
-            from appearance.scene.hair_scene import build_scene
+            from appearance import build_scene
 
             s = self._subject
             self._scene = build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from reconstruction.geometry.projectors import Projector
+from reconstruction import Projector
 from simulators.peers.serial_peer import BAD_ARGUMENT, NOT_NOW, UNKNOWN, WATCHDOG_MS, Refusal, whole
 
 FULL = 65535

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction import Mesh, Strands
 from reconstruction.arrays import Array, Ints
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 from simulators.subject.head import HeadField
 
 # A human head: 100,000 fibres of 40 µm. Fewer, thicker strands keep its coverage.

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.special import erfinv
 
+from reconstruction import Camera, Light, Rig
 from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.boards import Board
-from reconstruction.geometry.cameras import Camera, facing
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.cameras import facing
 from simulators.frames.responses import Response
 
 LAMP_RADIUS = 4e-3  # metres: what a mirror shows of a lamp that is called a point

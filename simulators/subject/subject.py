@@ -10,13 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from appearance.scene.hair_appearance import HairAppearance
+from appearance import HairAppearance
+from reconstruction import Camera, Mesh, Rig, Strands, read_obj, read_strands
 from reconstruction.arrays import Array
-from reconstruction.files.strands import READABLE, read_strands
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
+from reconstruction.files.strands import READABLE
 from reconstruction.head.generic import generic_head
 from simulators.subject.grooms import GROOMS, covering_radius, grow
 from simulators.subject.head import hair_field

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from reconstruction.files.strands import write_strands
-from reconstruction.geometry.mesh import write_obj
+from reconstruction import write_obj, write_strands
 from simulators.subject.drift import Drift
 from simulators.subject.props import Prop
 from simulators.subject.subject import Subject

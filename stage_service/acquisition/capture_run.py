@@ -5,8 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from reconstruction.capture.folder import Capture, Step
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter, Step
 from stage_service.acquisition.capture_status import CaptureStatus, read_status
 from stage_service.acquisition.flash_watch import FlashWatch
 from stage_service.acquisition.sequencer import Sequencer

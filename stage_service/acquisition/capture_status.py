@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from reconstruction.capture.folder import Capture
+from reconstruction import Capture
 from stage_service.acquisition.states import Outcome, State
 
 

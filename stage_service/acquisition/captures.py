@@ -11,11 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.writer import CaptureWriter, utc_now
+from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import RESERVE
-from reconstruction.geometry.mesh import Mesh
 from stage_service.acquisition.capture_run import CaptureRun, plan_of
 from stage_service.acquisition.capture_status import CaptureStatus, read_status
 from stage_service.acquisition.latch import Latch

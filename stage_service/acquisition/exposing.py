@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.acquisition.timings import Timings
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError

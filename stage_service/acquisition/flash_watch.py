@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.devices.errors import SafetyRefusal
 from stage_service.plan.flash import FASTEST_HZ, SLOW_HZ, SLOWEST_HZ, Trains
 

@@ -7,8 +7,8 @@ import queue
 import threading
 from dataclasses import dataclass, replace
 
-from reconstruction.capture.folder import FrameRecord, Step
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import CaptureWriter, Step
+from reconstruction.capture.folder import FrameRecord
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
 THREADS = (os.cpu_count() or 1) + 2

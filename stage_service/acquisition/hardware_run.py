@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import accumulate, groupby
 from typing import Literal
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Camera, Frame
 from stage_service.devices.device_set import DeviceSet

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from reconstruction import Capture, MissingFrame, Step
 from reconstruction.arrays import Floats
-from reconstruction.capture.folder import Capture, MissingFrame, Step
 from stage_service.devices.errors import IndexShift
 
 LEAST_CONTRAST = 8.0

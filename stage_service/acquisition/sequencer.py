@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from reconstruction.capture.folder import Capture, Step
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter, Step
 from stage_service.acquisition.accounting import FrameAccount, PulseAccount
 from stage_service.acquisition.exposing import Exposing, Pulse
 from stage_service.acquisition.frame_queue import FrameWriter, Shot

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from appearance.metrics.scores import srgb
-from reconstruction.files.exr import read_exr
+from reconstruction import read_exr
 
 
 def png_preview(path: Path, percentile: float = 99.5) -> bytes:

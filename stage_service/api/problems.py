@@ -14,7 +14,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
-from reconstruction.capture.folder import CaptureError, MissingFrame
+from reconstruction import CaptureError, MissingFrame
 from reconstruction.capture.writer import JournalInUse
 from stage_service.acquisition.captures import Busy, UnknownCapture
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe

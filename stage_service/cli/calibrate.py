@@ -68,10 +68,9 @@ def _board(args: argparse.Namespace) -> Any:
 
 def run_rig(args: argparse.Namespace, output: Output) -> int:
     """Calibrate a stage."""
+    from reconstruction import Capture, Rig
     from reconstruction.calibration.rig_comparison import compare_rigs
     from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
-    from reconstruction.capture.folder import Capture
-    from reconstruction.geometry.rig import Rig
     from stage_service.config import load_rig_file
 
     if args.out.suffix != ".json":

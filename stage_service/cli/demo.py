@@ -22,7 +22,7 @@ from stage_service.cli.support import (
 from stage_service.cli.support.processes import add_subject, exit_on_sigterm
 
 if TYPE_CHECKING:
-    from reconstruction.geometry.rig import Rig
+    from reconstruction import Rig
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
 
@@ -54,8 +54,8 @@ def add(commands: Commands) -> None:
 
 def run_demo(args: argparse.Namespace, output: Output) -> int:
     """Run the demo."""
+    from reconstruction import Rig
     from reconstruction.array_backend import chosen_variant
-    from reconstruction.geometry.rig import Rig
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
     from stage_service.cli.support.tables import figures_table

@@ -49,8 +49,8 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
     """Fit a head."""
     import numpy as np
 
+    from reconstruction import read_obj, write_obj
     from reconstruction.files.points import read_points
-    from reconstruction.geometry.mesh import read_obj, write_obj
     from reconstruction.head.fit import HeadHints, fit_head
     from reconstruction.head.generic import generic_head
     from reconstruction.head.template import template
@@ -80,7 +80,7 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
 
 def run_mark(args: argparse.Namespace, output: Output) -> int:
     """Make a template."""
-    from reconstruction.geometry.mesh import read_obj, write_obj
+    from reconstruction import read_obj, write_obj
     from reconstruction.head.template import template
 
     _require_obj(args.out)

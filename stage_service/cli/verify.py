@@ -32,7 +32,7 @@ def add(commands: Commands) -> None:
 
 def run_verify(args: argparse.Namespace, output: Output) -> int:
     """Verify a capture."""
-    from reconstruction.capture.verify import verify
+    from reconstruction import verify
 
     with progress_bar("verify") as progress:
         problems = verify(args.capture, progress)
@@ -43,7 +43,7 @@ def run_verify(args: argparse.Namespace, output: Output) -> int:
 
 def run_import(args: argparse.Namespace, output: Output) -> int:
     """Import a folder."""
-    from reconstruction.capture.import_folder import import_folder
+    from reconstruction import import_folder
 
     with progress_bar("import") as progress:
         capture = import_folder(args.folder, args.out, progress)

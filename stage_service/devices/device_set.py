@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Self
 
-from reconstruction.geometry.cameras import Camera as Geometry
+from reconstruction import Camera as Geometry
 from reconstruction.geometry.rig import RigError
 from stage_service.config import (
     BaslerConfig,

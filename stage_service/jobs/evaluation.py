@@ -7,10 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model
-from reconstruction.report.report import Progress, silent
+from reconstruction import Capture, Model, Progress, Strands, silent
 
 
 def evaluate_geometry(
@@ -28,10 +25,10 @@ def evaluate_geometry(
     same two. The true strands stand where the subject stood during the OLAT pass. The baselines get
     the masks that the reconstruction had: those of the cameras that are not held out.
     """
+    from reconstruction import read_strands
     from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
-    from reconstruction.files.strands import read_strands
 
     true = read_strands(truth)
     cameras, head = capture.rig.cameras, model.head(capture)
@@ -60,8 +57,8 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
+    from appearance import HairAppearance
     from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
-    from appearance.scene.hair_appearance import HairAppearance
     from appearance.sun_fit.fitted_appearance import FittedAppearance
 
     def figures(hair: HairAppearance, skin: Sequence[float]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from reconstruction.model import Model
+from reconstruction import Model
 from stage_service.jobs.records import JobProgress
 
 EVERY_S = 0.2

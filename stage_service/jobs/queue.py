@@ -11,7 +11,7 @@ from typing import Any
 
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, WorkflowStatus
 
-from reconstruction.model import Model
+from reconstruction import Model
 from stage_service.jobs.progress import read_progress
 from stage_service.jobs.records import Job, JobError, JobOutcome, JobState, PipelineRequest
 

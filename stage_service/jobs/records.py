@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from appearance.inverse_rendering.options import InverseRenderingRequest
+from appearance import InverseRenderingRequest
 from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
+from reconstruction import ReconstructOptions
 from reconstruction.methods import Method
-from reconstruction.reconstruct_options import ReconstructOptions
 from stage_service.jobs.pipelines import PIPELINES
 
 JobState = Literal["queued", "running", "done"]

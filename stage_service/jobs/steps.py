@@ -12,13 +12,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reconstruction.capture.folder import Capture
-from reconstruction.model import Model
-from reconstruction.report.report import Progress
+from reconstruction import Capture, Model, Progress
 from stage_service.jobs.records import JobOptions
 
 if TYPE_CHECKING:
-    from appearance.observations import HeldOut
+    from appearance import HeldOut
 
 Figures = dict[str, Any]
 
@@ -45,7 +43,7 @@ def compress(context: StepContext) -> Figures:
 
 def reconstruct(context: StepContext) -> Figures:
     """Strands from the capture: `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`."""
-    from reconstruction.pipeline import reconstruct as run
+    from reconstruction import reconstruct as run
 
     asked = context.options
     options = replace(asked.reconstruct, held_out=asked.held_out_cameras, seed=asked.seed)
@@ -58,7 +56,7 @@ def reconstruct(context: StepContext) -> Figures:
 
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
-    from appearance.sun_fit.fit import fit as run
+    from appearance import fit as run
 
     run(
         Capture(context.capture),
@@ -76,7 +74,7 @@ def inverse_rendering(context: StepContext) -> Figures:
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
-    from appearance.inverse_rendering.pipeline import fit_maps as run
+    from appearance import fit_maps as run
 
     asked = context.options
     found = run(
@@ -92,7 +90,7 @@ def inverse_rendering(context: StepContext) -> Figures:
 
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
-    from appearance.model.assess import assess as run
+    from appearance import assess as run
 
     return run(
         Capture(context.capture),
@@ -153,7 +151,7 @@ def results(context: StepContext) -> Figures:
 
 
 def _held_out(options: JobOptions) -> HeldOut:
-    from appearance.observations import HeldOut
+    from appearance import HeldOut
 
     return HeldOut(options.held_out_cameras, options.held_out_lights)
 

@@ -18,8 +18,7 @@ from typing import Any
 from dbos import DBOS, DBOSPortableJSONSerializer
 from dbos import error as dbos_error
 
-from reconstruction.model import Model
-from reconstruction.options import parse_options
+from reconstruction import Model, parse_options
 from stage_service.jobs.pipelines import PIPELINES, STEPS_VERSION
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, WorkerStopping
 from stage_service.jobs.queue import APP, QUEUE, WORKFLOW, JobQueue, database_url

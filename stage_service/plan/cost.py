@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from reconstruction.capture.folder import Step
-from reconstruction.geometry.rig import Rig
+from reconstruction import Rig, Step
 from stage_service.plan.flash import FlashRate
 
 EXR_HEADER_BYTES = 700

@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.plan.timeline import Lit
 
 SLOWEST_HZ, FASTEST_HZ = 3.0, 30.0

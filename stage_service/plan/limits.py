@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
-from reconstruction.geometry.rig import Rig
+from reconstruction import Rig
 from stage_service.config import LightBankConfig, SafetyLimits
 from stage_service.plan.stepping import Run
 from stage_service.plan.timeline import Lit

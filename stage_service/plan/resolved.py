@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.config import LONGEST_S, SHORTEST_S, RigFile
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import LeftOutWork, PlanCost, dose_of, folder_bytes

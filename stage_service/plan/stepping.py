@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Literal
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.config import DevicesConfig, RigFile
 
 Stepping = Literal["software", "hardware"]

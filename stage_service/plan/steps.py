@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from reconstruction.capture.folder import Step
-from reconstruction.geometry.projectors import Projector
+from reconstruction import Projector, Step
 from stage_service.config import Exposures, Levels, RigFile
 from stage_service.plan.capture_plan import CapturePlan, Rows
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.config import RigFile
 from stage_service.plan.stepping import LATENCY_S, UPLOAD_S, Run, period_s
 

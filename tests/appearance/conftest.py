@@ -7,10 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
+from reconstruction import Camera, Light, Mesh, Strands
 
 
 def plane(half: float = 0.5) -> Mesh:

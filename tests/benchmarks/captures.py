@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from reconstruction import Progress, silent
 from reconstruction.capture.compression import compress
-from reconstruction.report.report import Progress, silent
 from stage_service.cli.support import FAILED, CommandError
 from stage_service.cli.support.children import Children, SimulatedRig, own_command
 from stage_service.cli.support.client import ServiceClient

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reconstruction.report.report import Progress
+from reconstruction import Progress
 from stage_service.cli.support import rig_path
 
 DATA = "HAIRSTAGE_DATA"

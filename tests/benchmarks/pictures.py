@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.results import new_figure
+from reconstruction import Camera, Capture, Strands
 from reconstruction.arrays import Floats
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.strands import Strands
 from reconstruction.light_planes import PointCloud
 
 _SLAB = 1.5e-3  # metres to each side of a slice

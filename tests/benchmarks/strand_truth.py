@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from reconstruction import Capture, Model, Strands, read_strands
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import Capture
 from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.model import Model
 
 STEP = 5e-4
 """Metres between the points at which strands are cut at a ball's surface."""

@@ -12,11 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import HairScene, build_scene
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.strands import Strands
+from appearance import HairAppearance, HairScene, build_scene
+from reconstruction import Mesh, Strands, read_obj, read_strands
 from reconstruction.tangents.line_evidence import half_sphere
 from stage_service.cli.support import FAILED, CommandError
 from stage_service.cli.support.children import SimulatedRig

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from waiting import slowed
 
-from reconstruction.geometry.projectors import Projector
+from reconstruction import Projector
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.projector_controller import ProjectorController
 from simulators.peers.serial_peer import SerialPeer

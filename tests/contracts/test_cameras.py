@@ -11,7 +11,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from reconstruction.geometry.cameras import Camera as Geometry
+from reconstruction import Camera as Geometry
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.interface import Camera

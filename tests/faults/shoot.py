@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
 from stage_service.devices.device_set import DeviceSet

@@ -8,8 +8,7 @@ import pytest
 
 import simulators.world
 import stage_service.devices.cameras.link
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import CaptureWriter, verify
 from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.devices.device_set import DeviceSet

@@ -12,9 +12,7 @@ from typing import Any
 import pytest
 from waiting import until
 
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter, verify
 from simulators.peers.devices import DEVICES_FILE
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file

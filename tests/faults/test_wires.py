@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 from waiting import until
 
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter, verify
 from simulators.peers.faults import Fault
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.devices.device_set import DeviceSet

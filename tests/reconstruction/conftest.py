@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction.capture.folder import Capture
-from reconstruction.files.exr import write_exr
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
+from reconstruction import Camera, Capture, Light, Projector, Rig, write_exr
 
 RADIUS = 0.1
 SIZE, ROWS = 64, 40

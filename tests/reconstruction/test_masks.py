@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.mesh import Mesh
+from reconstruction import Camera, Capture, Light, Mesh
+from reconstruction.geometry.lights import dome_positions
 from reconstruction.images.hair_features import light_contrast, line_strength, otsu, tell_apart
 from reconstruction.images.silhouettes import NoSilhouette, background_noise, silhouette
 from reconstruction.light_planes import PointCloud, triangulate

@@ -8,12 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.geometry.mesh import Mesh, write_obj
-from reconstruction.geometry.strands import Strands
+from reconstruction import (
+    Capture,
+    CaptureError,
+    Mesh,
+    Model,
+    ModelError,
+    Report,
+    Strands,
+    write_obj,
+)
 from reconstruction.light_planes import PointCloud
-from reconstruction.model import Model, ModelError
-from reconstruction.report.report import Report
 
 TRIANGLE = Mesh(np.eye(3), np.array([[0, 1, 2]]))
 LARGER = Mesh(2 * np.eye(3), np.array([[0, 1, 2]]))

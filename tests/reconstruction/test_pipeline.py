@@ -12,17 +12,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.mesh import Mesh, write_obj
-from reconstruction.geometry.strands import Strands
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    Light,
+    Mesh,
+    Model,
+    ReconstructOptions,
+    Report,
+    Strands,
+    read_strands,
+    reconstruct,
+    write_obj,
+)
+from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_planes import PointCloud
-from reconstruction.model import Model
-from reconstruction.pipeline import reconstruct
-from reconstruction.reconstruct_options import MeasureOptions, ReconstructOptions
-from reconstruction.report.report import Report
+from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.tangents.estimate import light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09

@@ -8,8 +8,7 @@ import sys
 
 import pytest
 
-from reconstruction.options import BadOptions, parse_options
-from reconstruction.reconstruct_options import ReconstructOptions
+from reconstruction import BadOptions, ReconstructOptions, parse_options
 
 
 def test_nested_json_fills_in_the_defaults() -> None:

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from reconstruction import Report, Stage, silent
 from reconstruction.report.plots import plot_geometry, plot_report
-from reconstruction.report.report import LeftOut, Report, Series, Stage, silent
+from reconstruction.report.report import LeftOut, Series
 
 
 @pytest.fixture

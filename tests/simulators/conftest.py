@@ -15,10 +15,8 @@ import serial
 from pymodbus.client import ModbusTcpClient
 from waiting import machine_slack
 
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
+from reconstruction import Camera, Light, Projector, Rig
+from reconstruction.geometry.lights import dome_positions
 from simulators.frames.frames import FrameMaker
 from simulators.frames.responses import Response
 from simulators.frames.sensor import Sensor

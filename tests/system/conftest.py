@@ -21,10 +21,7 @@ import numpy as np
 import pytest
 from waiting import machine_slack, until
 
-from reconstruction.files.strands import write_strands
-from reconstruction.geometry.mesh import Mesh, write_obj
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
+from reconstruction import Mesh, Rig, Strands, write_obj, write_strands
 
 T = TypeVar("T")
 LIGHTS, CAMERAS, ROWS = 24, 3, 16

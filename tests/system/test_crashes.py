@@ -7,7 +7,7 @@ from pathlib import Path
 
 from waiting import until
 
-from reconstruction.capture.folder import Capture
+from reconstruction import Capture
 
 
 def test_a_job_outlives_its_worker(stage):

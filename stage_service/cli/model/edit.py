@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from stage_service.cli.support import BadArgument, Commands, Output, add_command
 
 if TYPE_CHECKING:
+    from appearance import FittedModel
     from appearance.bsdf.maps import HairMaps
-    from appearance.model.fitted_model import FittedModel
     from reconstruction.arrays import Array
 
 WISP_CELLS = 32
@@ -69,11 +69,9 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace, output: Output) -> int:
     """Edit a model."""
+    from appearance import FittedModel
     from appearance.model.edit import cut, restyled, roughened
-    from appearance.model.fitted_model import FittedModel
-    from reconstruction.capture.folder import Capture
-    from reconstruction.files.strands import read_strands
-    from reconstruction.model import Model
+    from reconstruction import Capture, Model, read_strands
 
     names = ("strands", "cut", "recolour", "pigment", "roughen")
     edits = {n: getattr(args, n) for n in names if getattr(args, n) is not None}

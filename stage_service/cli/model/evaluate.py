@@ -62,10 +62,8 @@ def add(commands: Commands) -> None:
 
 def run_geometry(args: argparse.Namespace, output: Output) -> int:
     """Compare strands."""
-    from reconstruction.capture.folder import Capture
+    from reconstruction import Capture, read_obj, read_strands
     from reconstruction.evaluation.assessment import assess_strands
-    from reconstruction.files.strands import read_strands
-    from reconstruction.geometry.mesh import read_obj
     from stage_service.cli.support.tables import assessment_text
 
     pred, true = read_strands(args.pred), read_strands(args.true)

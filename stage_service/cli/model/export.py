@@ -32,13 +32,11 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace, output: Output) -> int:
     """Export a model."""
+    from appearance import FittedModel
     from appearance.model.export import export_maps, export_mitsuba, export_usd
-    from appearance.model.fitted_model import FittedModel
     from appearance.model.relight import three_quarter_view
-    from reconstruction.capture.folder import Capture
+    from reconstruction import Capture, Model, write_strands
     from reconstruction.files.durable import writing
-    from reconstruction.files.strands import write_strands
-    from reconstruction.model import Model
 
     out: Path = args.out
     if args.to in SUFFIXES and out.suffix not in SUFFIXES[args.to]:

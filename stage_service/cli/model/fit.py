@@ -42,8 +42,7 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace, output: Output) -> int:
     """Fit the appearance."""
-    from reconstruction.model import Model
-    from reconstruction.options import parse_options
+    from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from appearance.metrics.scores import Exposure, psnr, srgb, ssim
+from appearance import Exposure, psnr, ssim
+from appearance.metrics.scores import srgb
+from reconstruction import read_exr
 from reconstruction.arrays import Array, Bools
-from reconstruction.files.exr import read_exr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 

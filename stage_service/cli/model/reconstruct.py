@@ -34,9 +34,7 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace, output: Output) -> int:
     """Reconstruct strands."""
-    from reconstruction.capture.folder import Capture
-    from reconstruction.model import Model
-    from reconstruction.options import parse_options
+    from reconstruction import Capture, Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, reconstruct
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from stage_service.cli.support import Commands, Output, add_command, progress_bar
 
 if TYPE_CHECKING:
+    from reconstruction import Progress
     from reconstruction.arrays import Floats
-    from reconstruction.report.report import Progress
 
 SIZE = 512
 """Pixels across, where no camera of a rig says."""
@@ -58,13 +58,10 @@ def run(args: argparse.Namespace, output: Output) -> int:
 
 def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Render what was asked for; returns what was written."""
-    from appearance.model.fitted_model import FittedModel
+    from appearance import Environment, FittedModel, Sampling
     from appearance.model.relight import environment_map, three_quarter_view
-    from appearance.render.mixed import Environment
-    from appearance.render.tracing import Sampling
-    from reconstruction.capture.folder import Capture
+    from reconstruction import Capture, Model
     from reconstruction.files.durable import writing
-    from reconstruction.model import Model
 
     start = time.perf_counter()
     if args.out is not None and args.out.suffix not in (".png", ".exr"):
@@ -97,9 +94,10 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _write(out: Path, image: Floats) -> None:
+    from appearance import Exposure
     from appearance.metrics.pictures import write_png
-    from appearance.metrics.scores import Exposure, srgb
-    from reconstruction.files.exr import write_exr
+    from appearance.metrics.scores import srgb
+    from reconstruction import write_exr
 
     if out.suffix == ".exr":
         write_exr(out, image)

@@ -51,7 +51,7 @@ def add(commands: Commands) -> None:
 def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
     """Cost a plan; with a rig file, without a service or a device."""
     if args.rig is not None:
-        from reconstruction.options import parse_options
+        from reconstruction import parse_options
         from stage_service.config import load_rig_file
         from stage_service.plan.capture_plan import CapturePlan
         from stage_service.plan.resolved import resolve

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import httpx
 
-from reconstruction.report.report import Progress
+from reconstruction import Progress
 from stage_service.cli.support.commands import BAD_INPUT, FAILED, UNREACHABLE, CommandError
 
 DEFAULT_URL = "http://127.0.0.1:8331"

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from reconstruction.report.report import Progress
+from reconstruction import Progress
 
 LINE_EVERY_S = 10.0
 """Where progress goes to a log, a line so often."""

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from reconstruction.geometry.cameras import Camera as CameraGeometry
+from reconstruction import Camera as CameraGeometry
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras import pixel_formats
 from stage_service.devices.cameras.block_counter import BlockCounter

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction.geometry.cameras import Camera as CameraGeometry
+from reconstruction import Camera as CameraGeometry
 from stage_service.config import LinkCamerasConfig
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import (

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.bsdf.integrals import Case
 from scipy.spatial.transform import Rotation
 
+from appearance import HairAppearance, build_scene
 from appearance.bsdf import reference
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.longitudinal import absorption_of_colour
@@ -18,9 +19,8 @@ from appearance.bsdf.parameters import StrandHit
 from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import strand_parameters
 from appearance.scene.curves import spline_control_points
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import SCALE, build_scene
-from reconstruction.geometry.strands import Strands
+from appearance.scene.hair_scene import SCALE
+from reconstruction import Strands
 
 HAIR = HairAppearance((0.2, 0.4, 0.8), 0.3, 0.3)
 

@@ -7,16 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Problem
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
+from reconstruction import Camera, Light
 
 TRUTH = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 SKIN = np.full(3, 0.3)

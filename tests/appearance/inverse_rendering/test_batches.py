@@ -7,8 +7,7 @@ import pytest
 
 from appearance.inverse_rendering.batches import Batch, Comparison, Pairs
 from appearance.observations import Observed
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
+from reconstruction import Camera, Light
 
 PIXELS = 50
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from appearance import HairAppearance, InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Batch
 from appearance.inverse_rendering.loop import run
-from appearance.inverse_rendering.options import Effort, InverseRenderingOptions
+from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Objective, Problem
 from appearance.inverse_rendering.unknowns import LightDeviations
-from appearance.scene.hair_appearance import HairAppearance
 
 START = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
 FEW = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=5)

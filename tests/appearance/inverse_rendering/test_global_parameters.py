@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from appearance import HairAppearance
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Pairs
 from appearance.inverse_rendering.global_parameters import Evidence, solve_global_parameters
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Problem
 from appearance.inverse_rendering.unknowns import LightDeviations, decode
-from appearance.scene.hair_appearance import HairAppearance
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
 EFFORT = Effort(pixels=100, spp=64, max_depth=6)

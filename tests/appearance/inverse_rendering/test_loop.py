@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from appearance import HairAppearance, InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.loop import Monitor, run
-from appearance.inverse_rendering.options import InverseRenderingOptions
-from appearance.scene.hair_appearance import HairAppearance
-from reconstruction.options import BadOptions, parse_options
+from reconstruction import BadOptions, parse_options
 
 START = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.35))
 

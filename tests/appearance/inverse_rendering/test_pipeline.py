@@ -9,18 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from appearance import Exposure, HairAppearance, HeldOut, InverseRenderingRequest, fit_maps
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.options import InverseRenderingRequest
-from appearance.inverse_rendering.pipeline import fit_maps
-from appearance.metrics.scores import Exposure
-from appearance.observations import HeldOut
-from appearance.scene.hair_appearance import HairAppearance
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction.capture.folder import Capture, Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.geometry.rig import Rig
-from reconstruction.model import Model
-from reconstruction.options import BadOptions, parse_options
+from reconstruction import BadOptions, Capture, CaptureWriter, Model, Rig, Step, parse_options
 
 REQUEST = parse_options(
     InverseRenderingRequest,

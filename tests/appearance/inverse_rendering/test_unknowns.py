@@ -7,15 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from appearance import HairAppearance
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import losses
 from appearance.inverse_rendering.unknowns import LightDeviations, decode, encode, hair_values
 from appearance.metrics.scores import srgb
 from appearance.scene.backend import ensure_backend
-from appearance.scene.hair_appearance import HairAppearance
+from reconstruction import Light, Model, ModelError
 from reconstruction.geometry.cameras import facing
-from reconstruction.geometry.lights import Light
-from reconstruction.model import Model, ModelError
 
 NONE = np.zeros(2, np.int64)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from appearance import scores
 from appearance.metrics.lpips import VARIABLE
-from appearance.metrics.scores import scores, scores_unavailable
+from appearance.metrics.scores import scores_unavailable
 
 
 def _field(number: int, value: int | bytes | str) -> bytes:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from appearance.metrics.scores import Exposure, psnr, relative_error, srgb, ssim, ssim_map
+from appearance import Exposure, psnr, ssim
+from appearance.metrics.scores import relative_error, srgb, ssim_map
 
 
 @pytest.fixture

@@ -6,28 +6,27 @@ import cv2
 import numpy as np
 import pytest
 
+from appearance import Exposure, HairAppearance, HeldOut, Sampling, assess, build_scene, render_olat
 from appearance.metrics.pictures import comparison_picture
-from appearance.metrics.scores import Exposure
-from appearance.model.assess import assess, judge, three_nearest
+from appearance.model.assess import judge, three_nearest
 from appearance.model.options import AssessOptions
 from appearance.model.relight import environment_map, three_quarter_view
-from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
 from appearance.render.smoothed import olat_smoothed, smoothed
-from appearance.render.tracing import Sampling
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction.capture.folder import Capture, Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.files.exr import read_exr
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model
-from reconstruction.report.report import Stage
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureWriter,
+    Light,
+    Model,
+    Rig,
+    Stage,
+    Step,
+    Strands,
+    read_exr,
+)
+from reconstruction.geometry.lights import dome_positions
 
 TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.2, 0.2)
 HELD_OUT = HeldOut(("cam_2",), ("l4", "l7"))

@@ -10,24 +10,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from appearance import (
+    Exposure,
+    FittedModel,
+    HairAppearance,
+    Sampling,
+    render_environment,
+    render_olat,
+)
 from appearance.bsdf.maps import HairMaps
 from appearance.bsdf.parameters import StrandHit
 from appearance.inverse_rendering.found_lights import save_lights
 from appearance.inverse_rendering.unknowns import LightDeviations
-from appearance.metrics.scores import Exposure
 from appearance.model.edit import cut, recoloured, restyled, wisp_of
 from appearance.model.export import at_points, export_maps, export_mitsuba, export_usd
-from appearance.model.fitted_model import FittedModel
-from appearance.render.environment import render_environment
-from appearance.render.olat import render_olat
-from appearance.render.tracing import Sampling
-from appearance.scene.hair_appearance import HairAppearance
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction.files.exr import read_exr
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.rig import Rig
-from reconstruction.model import Model
+from reconstruction import Camera, Model, Rig, read_exr, read_strands
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 CAMERA = Camera.look_at("c", 16, 16, (0, -0.5, 0.1), (0, 0, 0.0), 12)

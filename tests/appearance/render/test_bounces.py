@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
+from appearance import HairAppearance, build_scene, render_olat
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction import Camera, Light
+from reconstruction.geometry.lights import dome_positions
 
 BLACK, BLOND, WHITE = (
     HairAppearance(sigma_a, 0.3, 0.3)

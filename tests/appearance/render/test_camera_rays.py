@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from appearance import HairAppearance, build_scene
 from appearance.render.coverage import coverage
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh
+from reconstruction import Camera, Mesh
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 BARREL = (-0.3, 0.12, 2e-3, -1.5e-3, -0.02)

@@ -9,16 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from appearance import DifferentiableOlat, HairAppearance, build_scene, render_olat
 from appearance.render.coverage import covered_pixels
-from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
-from appearance.render.olat import render_olat
+from appearance.render.differentiable import ReplaySampling
 from appearance.scene.backend import ensure_backend
-from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.geometry.cameras import Camera, facing
+from appearance.scene.hair_appearance import DiffuseHair
+from reconstruction import Camera, Light, Mesh
+from reconstruction.geometry.cameras import facing
 from reconstruction.geometry.light_profiles import LightProfile
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 NO_EDGES = ("lights.position", "lights.turn")

@@ -4,13 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from appearance.render.environment import render_environment
+from appearance import HairAppearance, Sampling, build_scene, render_environment
 from appearance.render.environment_maps import load_environment, sky, studio
-from appearance.render.tracing import Sampling
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.files.exr import write_exr
-from reconstruction.geometry.cameras import Camera
+from reconstruction import Camera, write_exr
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 ALBEDO = (0.5, 0.25, 0.8)

@@ -7,19 +7,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from appearance.render.environment import render_environment
+from appearance import (
+    Environment,
+    HairAppearance,
+    Sampling,
+    build_scene,
+    render_environment,
+    render_mixed,
+    render_olat,
+)
 from appearance.render.environment_maps import studio
 from appearance.render.lights import LightBank
-from appearance.render.mixed import Environment, render_mixed
-from appearance.render.olat import render_olat
-from appearance.render.tracing import Sampling
 from appearance.scene.backend import ensure_backend
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import SCALE, build_scene
-from reconstruction.geometry.cameras import Camera, facing
+from appearance.scene.hair_scene import SCALE
+from reconstruction import Camera, Light, Mesh
+from reconstruction.geometry.cameras import facing
 from reconstruction.geometry.light_profiles import LightProfile
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 BEAM = LightProfile(

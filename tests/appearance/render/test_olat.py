@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 from benchmarks.renderers.path_reference import PathReference
 
+from appearance import HairAppearance, build_scene, render_olat
 from appearance.render.coverage import covered_pixels
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.files.exr import read_exr
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.strands import Strands
+from appearance.scene.hair_appearance import DiffuseHair
+from reconstruction import Camera, Light, Strands, read_exr
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 

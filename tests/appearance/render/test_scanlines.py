@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from appearance.render.olat import render_olat
-from appearance.render.scanlines import render_scanlines
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.projectors import Projector
+from appearance import HairAppearance, build_scene, render_olat, render_scanlines
+from reconstruction import Camera, Light, Projector
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 ALBEDO = np.array([0.35, 0.25, 0.2])

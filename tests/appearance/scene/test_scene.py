@@ -5,14 +5,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from appearance import HairAppearance, build_scene, render_olat
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
 from appearance.scene.curves import spline_control_points
-from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
-from appearance.scene.hair_scene import SCALE, _guarded, build_scene
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.strands import Strands
+from appearance.scene.hair_appearance import DiffuseHair
+from appearance.scene.hair_scene import SCALE, _guarded
+from reconstruction import Camera, Light, Strands
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 

@@ -5,25 +5,27 @@ import json
 import numpy as np
 import pytest
 
+from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, render_olat
 from appearance.bsdf.longitudinal import variance_of_roughness
-from appearance.metrics.scores import Exposure
-from appearance.observations import HeldOut, chosen, observe
+from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from appearance.sun_fit.fit import fit
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.options import FitOptions
-from reconstruction.capture.folder import Capture, CaptureError, Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.files.strands import write_strands
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model, ModelError
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    CaptureWriter,
+    Light,
+    Mesh,
+    Model,
+    ModelError,
+    Rig,
+    Step,
+    Strands,
+    write_strands,
+)
+from reconstruction.geometry.lights import dome_positions
 
 TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.25, 0.2)
 SKIN = (0.4, 0.3, 0.2)

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
-from appearance.scene.hair_scene import build_scene
+from appearance.scene.hair_appearance import DiffuseHair
 from appearance.sun_fit.mirror_samples import (
     LobeBins,
     MirrorSamples,
@@ -27,9 +26,8 @@ from appearance.sun_fit.roughness_and_colour import (
     next_colour,
 )
 from appearance.sun_fit.visible_fibres import visible_fibres
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.strands import Strands
+from reconstruction import Camera, Light, Strands
+from reconstruction.geometry.lights import dome_positions
 
 
 def synthetic_bins(v, floor=0.0, spread=0.0, seed=0):

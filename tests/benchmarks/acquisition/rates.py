@@ -21,8 +21,7 @@ from typing import Any
 from benchmarks.acquisition.writing import measure
 from benchmarks.command import Benchmark
 from benchmarks.results import save
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.report.report import Progress, silent
+from reconstruction import CaptureWriter, Progress, silent
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.cli.support.children import Children
 from stage_service.config import RigFile, load_rig_file

@@ -11,10 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction.capture.folder import Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.rig import Rig
+from reconstruction import Camera, CaptureWriter, Rig, Step
 from stage_service.acquisition.frame_queue import FrameWriter, Shot
 from stage_service.acquisition.sequencer import QUEUED_STEPS
 from stage_service.devices.cameras.interface import CameraInfo, Frame

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from appearance import InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.loop import Monitor, run
-from appearance.inverse_rendering.options import Effort, InverseRenderingOptions
+from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Problem
 from appearance.observations import Observed
 from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
@@ -27,8 +28,8 @@ from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
+from reconstruction import Progress, silent
 from reconstruction.arrays import Array
-from reconstruction.report.report import Progress, silent
 
 OPTIONS = InverseRenderingOptions(
     steps=30,

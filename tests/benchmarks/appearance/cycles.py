@@ -10,24 +10,26 @@ from typing import Any
 
 import numpy as np
 
+from appearance import (
+    Exposure,
+    HairAppearance,
+    HairScene,
+    InverseRenderingOptions,
+    build_scene,
+    psnr,
+    render_olat,
+)
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.loop import Monitor, run
-from appearance.inverse_rendering.options import Effort, InverseRenderingOptions
+from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Problem
-from appearance.metrics.scores import Exposure, psnr
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.options import FitOptions
 from benchmarks.appearance.hair_inverse import hair_inverse
 from benchmarks.subjects import Subject, cycles_subject
+from reconstruction import Camera, Capture, Progress, Stage, import_folder, silent
 from reconstruction.arrays import AnyFloats
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.import_folder import import_folder
-from reconstruction.geometry.cameras import Camera
-from reconstruction.report.report import Progress, Stage, silent
 
 HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from appearance import HairAppearance, HairScene
 from appearance.observations import Observed
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.fit import BETA_N, SunFit
 from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import Pixels
+from reconstruction import Progress, Stage, silent
 from reconstruction.arrays import Array
-from reconstruction.report.report import Progress, Stage, silent
 
 GUESS = 0.3
 """Longitudinal roughness where the pictures show no highlight to read it from."""

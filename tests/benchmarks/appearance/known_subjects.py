@@ -11,19 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from appearance import Exposure, HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, root_normals, scalp_coordinates
 from appearance.bsdf.strand_coordinates import transported
-from appearance.metrics.scores import Exposure
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
 from benchmarks.subjects import Subject
+from reconstruction import Camera, Light, Strands
 from reconstruction.arrays import Array, Floats
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.lights import dome_positions
 
 SUBJECTS = ("a", "b", "c")
 TANGENT_NOISE_DEG = 5.0

@@ -9,21 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from appearance import InverseRenderingOptions, render_olat, scores
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
-from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
+from appearance.inverse_rendering.options import Variant
 from appearance.inverse_rendering.problem import Problem
 from appearance.inverse_rendering.unknowns import LightDeviations
-from appearance.metrics.scores import mean_scores, scores, scores_unavailable
+from appearance.metrics.scores import mean_scores, scores_unavailable
 from appearance.observations import Observed
-from appearance.render.olat import render_olat
 from appearance.sun_fit.options import FitOptions
 from benchmarks.appearance.hair_inverse import hair_inverse
 from benchmarks.appearance.known_subjects import Captured
 from benchmarks.command import within
+from reconstruction import Light, Progress, Stage, silent
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.geometry.lights import Light
-from reconstruction.report.report import Progress, Stage, silent
 
 GROUPS = ("train views", "held-out views")
 TRUTH = "truth, fresh numbers"

@@ -23,9 +23,9 @@ from benchmarks.bsdf import pictures
 from benchmarks.bsdf.integrals import Case, array_types, fibre, sphere, uniforms
 from benchmarks.command import Benchmark
 from benchmarks.results import markdown, save
+from reconstruction import Progress
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
-from reconstruction.report.report import Progress
 
 SAMPLES = 200_000
 CASES = [

@@ -11,12 +11,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from appearance import HairAppearance, build_scene
 from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import srgb
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import SCALE, build_scene
+from appearance.scene.hair_scene import SCALE
+from reconstruction import Strands
 from reconstruction.arrays import Array
-from reconstruction.geometry.strands import Strands
 
 ROUGHNESS = (0.05, 0.15, 0.3, 0.6)
 ABSORPTION = (0.02, 0.1, 0.4, 2.0)

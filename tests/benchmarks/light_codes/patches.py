@@ -24,22 +24,28 @@ from benchmarks.light_codes.study import compare_filters, study_depths
 from benchmarks.pictures import picture_strands
 from benchmarks.results import save
 from benchmarks.strand_truth import STEP, StrandTruth
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.capture.import_folder import import_folder
+from reconstruction import (
+    Capture,
+    CaptureError,
+    Model,
+    Progress,
+    ReconstructOptions,
+    Report,
+    Strands,
+    import_folder,
+    read_strands,
+    reconstruct,
+    silent,
+)
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.files.strands import read_strands
 from reconstruction.geometry.mesh_queries import mesh_depth
-from reconstruction.geometry.strands import Strands
 from reconstruction.images.orientation import texture
 from reconstruction.light_codes.measure_segments import build_views
 from reconstruction.masks import MaskedCapture, hair_masks
 from reconstruction.methods import Method
-from reconstruction.model import Model
-from reconstruction.pipeline import reconstruct
-from reconstruction.reconstruct_options import ReconstructOptions
 from reconstruction.report.plots import plot_geometry, plot_report
-from reconstruction.report.report import Progress, Report, Series, silent
+from reconstruction.report.report import Series
 from stage_service.cli.support.tables import geometry_table
 
 METHODS: tuple[Method, ...] = ("lmvs", "photometric", "fused")

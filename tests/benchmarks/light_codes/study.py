@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from reconstruction import Strands
 from reconstruction.arrays import Array, Bools, Floats
-from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.orientation import filters, responses
 from reconstruction.light_codes.code_views import View

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from reconstruction import Capture
 from reconstruction.arrays import AnyFloats, Array
-from reconstruction.capture.folder import Capture
 from reconstruction.light_planes.motion import Motion
 
 PAPER_PIXELS = 1300

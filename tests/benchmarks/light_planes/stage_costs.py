@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction.capture.folder import Capture
+from reconstruction import Capture
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots

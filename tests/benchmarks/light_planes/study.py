@@ -14,8 +14,17 @@ from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangu
 from benchmarks.pictures import picture_model, picture_motion
 from benchmarks.results import save
 from benchmarks.strand_truth import StrandTruth
+from reconstruction import (
+    Capture,
+    Model,
+    Progress,
+    ReconstructOptions,
+    Report,
+    Stage,
+    reconstruct,
+    silent,
+)
 from reconstruction.arrays import AnyFloats
-from reconstruction.capture.folder import Capture
 from reconstruction.growth.field import field_system, solve_field
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.head.scalp import find_scalp, sample_roots
@@ -26,11 +35,8 @@ from reconstruction.light_planes import (
     triangulate,
 )
 from reconstruction.masks import HairMask, MaskedCapture
-from reconstruction.model import Model
-from reconstruction.pipeline import reconstruct
-from reconstruction.reconstruct_options import MotionOptions, ReconstructOptions
+from reconstruction.reconstruct_options import MotionOptions
 from reconstruction.report.plots import plot_report
-from reconstruction.report.report import Progress, Report, Stage, silent
 from reconstruction.tangents.estimate import measure_tangents
 
 PAPER = {

@@ -20,12 +20,16 @@ from benchmarks.captures import Optics, SimulatedCapture, levels, rig_file
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, within
 from benchmarks.light_planes.study import PAPER, SubjectCaptures, study
 from benchmarks.results import save
-from reconstruction.files.strands import read_strands, write_strands
-from reconstruction.geometry.mesh import write_obj
-from reconstruction.geometry.strands import Strands
+from reconstruction import (
+    Progress,
+    ReconstructOptions,
+    Strands,
+    read_strands,
+    write_obj,
+    write_strands,
+)
 from reconstruction.head.fit import HeadHints, fit_head
-from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions, ReconstructOptions
-from reconstruction.report.report import Progress
+from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
 
 CAMERAS, PROJECTORS = 8, 3
 WIDTH, HEIGHT, ROWS, LIGHTS = 320, 400, 256, 120

@@ -11,20 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from appearance import Exposure, HairScene, render_olat
 from appearance.metrics.pictures import Row, comparison_picture
-from appearance.metrics.scores import Exposure
-from appearance.render.olat import render_olat
-from appearance.scene.hair_scene import HairScene
 from benchmarks.command import CAPTURE, Benchmark, cycles_folder
 from benchmarks.renderers.path_reference import PathReference
 from benchmarks.results import markdown, save
 from benchmarks.subjects import cycles_subject
+from reconstruction import Camera, Capture, Light, Progress, import_folder, silent
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.import_folder import import_folder
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.report.report import Progress, silent
 
 CYCLES, OURS, STOCK = "Cycles", "ours", "Mitsuba"
 PAIRS = ((OURS, CYCLES), (STOCK, CYCLES), (OURS, STOCK))

@@ -11,17 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance import HairScene, render_olat
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
 from appearance.render.paths import Surface, stream, wave
-from appearance.scene.hair_scene import HairScene
 from benchmarks.results import Panel
 from benchmarks.subjects import Subject
+from reconstruction import Camera, Light, Strands
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.strands import Strands
 
 
 @dataclass(frozen=True)

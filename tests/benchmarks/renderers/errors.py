@@ -15,20 +15,17 @@ from typing import Any
 
 import numpy as np
 
+from appearance import render_olat
 from appearance.render.bounces import bounce_limit
-from appearance.render.olat import render_olat
 from benchmarks.command import SUBJECT, Benchmark
 from benchmarks.renderers.cost import Effort, View, growth, growth_panels, hair_pixels
 from benchmarks.renderers.path_reference import PathReference
 from benchmarks.renderers.scanlines import measure_scanlines
 from benchmarks.results import Panel, draw_panels, save
 from benchmarks.subjects import Subject, simulated
+from reconstruction import Camera, Light, Progress, Projector, Rig, silent
 from reconstruction.arrays import Floats
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
-from reconstruction.report.report import Progress, silent
+from reconstruction.geometry.lights import dome_positions
 
 _JUDGED = 12  # lights whose error is measured
 _STYLES = {"mitsuba path": "k.-", "ours": "C0o-"}

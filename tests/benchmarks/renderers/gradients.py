@@ -15,18 +15,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
+from appearance import DifferentiableOlat, HairAppearance, HairScene, build_scene
+from appearance.render.differentiable import ReplaySampling
 from appearance.scene.backend import ensure_backend
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import HairScene, build_scene
 from benchmarks.command import Benchmark
 from benchmarks.results import Panel, draw_panels, save
+from reconstruction import Camera, Light, Mesh, Progress, Strands
 from reconstruction.arrays import Array
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
-from reconstruction.report.report import Progress
 
 STEP = 0.01
 """Metres that the light is moved by, either way, for a finite difference."""

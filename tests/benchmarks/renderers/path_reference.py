@@ -9,12 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance import HairScene
 from appearance.render.paths import passes, wave
-from appearance.scene.hair_scene import HairScene, light_arrays
+from appearance.scene.hair_scene import light_arrays
+from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Floats, Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
 
 _LANES = 1 << 20
 

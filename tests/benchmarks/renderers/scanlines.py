@@ -10,14 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance import HairScene, render_scanlines
 from appearance.render.bounces import bounce_limit
 from appearance.render.paths import wave
-from appearance.render.scanlines import render_scanlines
-from appearance.scene.hair_scene import SCALE, HairScene
+from appearance.scene.hair_scene import SCALE
+from reconstruction import Camera, Projector
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Floats, Ints
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.projectors import Projector
 
 _FINE = 2  # texels of Mitsuba's projector per row
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.renderers.agreement import Renderings, agreement, compare
 
-from reconstruction.geometry.cameras import Camera
+from reconstruction import Camera
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from benchmarks.renderers.cost import with_count
 from benchmarks.renderers.errors import QUICK, relative_mse, run
 from benchmarks.subjects import Subject
 
-from appearance.scene.hair_appearance import HairAppearance
+from appearance import HairAppearance
 
 
 def test_the_references_own_noise_is_subtracted():

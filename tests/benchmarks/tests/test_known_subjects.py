@@ -9,9 +9,9 @@ from benchmarks.appearance.known_subjects import bent, dyed, known_subject
 from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.subjects import Subject
 
+from appearance import HairAppearance
 from appearance.bsdf.maps import scalp_coordinates
-from appearance.scene.hair_appearance import HairAppearance
-from reconstruction.geometry.strands import Strands
+from reconstruction import Strands
 
 HAIR = HairAppearance((0.1, 0.2, 0.4), 0.28, 0.3)
 SKIN = (0.3, 0.3, 0.3)

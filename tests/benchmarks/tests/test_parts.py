@@ -12,7 +12,7 @@ import pytest
 from benchmarks.light_planes.motion_errors import PAPER_PIXELS, motion_errors, true_motion
 from benchmarks.light_planes.stage_costs import Growth, measure_growth, regridded
 
-from reconstruction.capture.folder import Capture
+from reconstruction import Capture
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.light_planes import Motion
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import LightBankConfig
 from stage_service.devices.device_set import DeviceSet

@@ -12,12 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from shooting import shoot
 
+from reconstruction import Camera, Capture, Light, Projector, Rig, Step
 from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.capture.folder import Capture, Step
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
 from simulators.frames.sensor import Sensor
 from simulators.subject.props import Prop, PropResponder, SphereProp, board_pose
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from reconstruction import Capture, Rig
 from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.solve import TargetCaptures, calibrate
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.rig import Rig
 from stage_service.cli import main
 from stage_service.config import load_rig_file
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from reconstruction import Camera, Rig
 from reconstruction.calibration.boards import Board, Sighting
 from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.rig_comparison import compare_rigs
 from reconstruction.calibration.solve_cameras import calibrate_cameras
-from reconstruction.geometry.cameras import Camera, facing
-from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.cameras import facing
 from simulators.subject.props import BoardProp, board_pose
 
 Sightings = dict[str, dict[str, Sighting]]

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reconstruction import Capture, Rig
 from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.shading import Shading, refine_centres, shaded_light
 from reconstruction.calibration.solve_lights import Glint, mirrored_lights
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of
 from reconstruction.calibration.spheres import find_highlight, mirrored
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.rig import Rig
 from simulators.subject.props import SphereProp, reflection
 
 PLACES = ((0.0, 0.01, 0.02), (0.03, -0.05, -0.03))

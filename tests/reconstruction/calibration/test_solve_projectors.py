@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reconstruction import Capture, Projector, Rig
 from reconstruction.calibration.boards import Board
 from reconstruction.calibration.calibration_error import CalibrationError
 from reconstruction.calibration.solve_cameras import CameraSolution
@@ -16,9 +17,6 @@ from reconstruction.calibration.solve_projectors import (
     projector_intensities,
     rows_on_board,
 )
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.rigid_motion import Rigid
 from simulators.subject.props import board_pose
 

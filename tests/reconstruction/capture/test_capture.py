@@ -7,11 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture, CaptureError, MissingFrame, Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.rig import Rig
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    CaptureWriter,
+    Light,
+    MissingFrame,
+    Rig,
+    Step,
+)
 
 RIG = Rig(
     "one",

@@ -13,15 +13,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    CaptureWriter,
+    Light,
+    Mesh,
+    MissingFrame,
+    Rig,
+    Step,
+    verify,
+)
 from reconstruction.capture.compression import compress
-from reconstruction.capture.folder import Capture, CaptureError, MissingFrame, Step
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import DiskFull
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.rig import Rig
 
 RIG = Rig(
     "two",

@@ -11,10 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.capture.import_folder import ImportProblem, import_folder
-from reconstruction.capture.verify import verify
-from reconstruction.files.exr import read_exr, write_exr
+from reconstruction import Capture, CaptureError, import_folder, read_exr, verify, write_exr
+from reconstruction.capture.import_folder import ImportProblem
 
 CAMERAS = ("cam_00", "left")
 LIGHTS = ("light_00", "light_07")

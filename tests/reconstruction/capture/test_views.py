@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.geometry.cameras import Camera
+from reconstruction import Camera, Capture, CaptureError
 from reconstruction.geometry.lens import Lens
 from reconstruction.images.silhouettes import silhouette
 from reconstruction.light_planes import solve_motion, triangulate

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from reconstruction import Mesh, Strands
 from reconstruction.evaluation import oriented_points
 from reconstruction.evaluation import regions as hair_regions
 from reconstruction.evaluation.assessment import assess_strands, input_warnings, root_figures
@@ -17,8 +18,6 @@ from reconstruction.evaluation.connectivity import length_figures
 from reconstruction.evaluation.error_pictures import draw_errors
 from reconstruction.evaluation.oriented_points import OrientedPoints
 from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 
 
 def lines(starts: NDArray[np.floating], ends: NDArray[np.floating]) -> Strands:

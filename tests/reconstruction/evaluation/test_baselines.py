@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from reconstruction import Camera, Mesh, Strands
 from reconstruction.evaluation.baselines import (
     SPACING,
     baseline_hull,
@@ -12,11 +13,8 @@ from reconstruction.evaluation.baselines import (
     hull_vertical,
 )
 from reconstruction.evaluation.matching import compare_strands
-from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import dome_positions
-from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import mesh_silhouette
-from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.visual_hull import trim_edges, visual_hull
 

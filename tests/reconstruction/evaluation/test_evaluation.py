@@ -8,13 +8,11 @@ import sys
 import numpy as np
 import pytest
 
+from reconstruction import Camera, Mesh, Strands
 from reconstruction.evaluation import oriented_points
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.oriented_points import OrientedPoints
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.strands import Strands
 
 NAMES = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 

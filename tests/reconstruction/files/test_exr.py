@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from reconstruction import read_exr, write_exr
 from reconstruction.files.durable import PAGE
-from reconstruction.files.exr import UncompressedExr, read_exr, write_exr
+from reconstruction.files.exr import UncompressedExr
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)

@@ -14,14 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from reconstruction.files.strands import (
-    READABLE,
-    WRITABLE,
-    StrandFileError,
-    read_strands,
-    write_strands,
-)
-from reconstruction.geometry.strands import Strands
+from reconstruction import StrandFileError, Strands, read_strands, write_strands
+from reconstruction.files.strands import READABLE, WRITABLE
 
 BOTH_WAYS = [suffix for suffix in WRITABLE if suffix in READABLE]
 

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reconstruction import Rig
 from reconstruction.geometry.ies import IesError, read_ies
 from reconstruction.geometry.light_profiles import LightProfile
-from reconstruction.geometry.rig import Rig, RigError
+from reconstruction.geometry.rig import RigError
 
 VERTICAL = (0.0, 30.0, 60.0, 90.0)
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.rig import Rig, RigError
+from reconstruction import Camera, Rig
+from reconstruction.geometry.rig import RigError
 
 BARREL = (-0.28, 0.11, 1e-3, -7e-4, -0.02)
 

@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig, RigError
+from reconstruction import Camera, Light, Projector, Rig
+from reconstruction.geometry.lights import dome_positions
+from reconstruction.geometry.rig import RigError
 
 SMALL = """
 name = "small"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from reconstruction.geometry.strands import Strands
+from reconstruction import Strands
 
 metres = st.floats(-1, 1, width=32)
 

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.mesh import Mesh
+from reconstruction import Camera, Mesh
 from reconstruction.geometry.mesh_queries import depth_map, inside_mesh, mesh_depth, surface_samples
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import gather, principal, solve_field, to_tensors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from benchmarks.light_planes.growth_study import METHODS, compare_growth
 
-from reconstruction.geometry.mesh import Mesh
+from reconstruction import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field, to_tensors
 from reconstruction.growth.from_roots import (

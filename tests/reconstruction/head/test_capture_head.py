@@ -9,12 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.geometry.cameras import Camera
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    Mesh,
+    Model,
+    Stage,
+    Strands,
+    read_obj,
+    write_obj,
+)
 from reconstruction.geometry.closest_point import ClosestPoint
-from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.mesh_queries import surface_samples
-from reconstruction.geometry.strands import Strands
 from reconstruction.head.capture_head import (
     FEWEST_SKIN,
     digitised_points,
@@ -29,8 +36,6 @@ from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask, MaskedCapture
-from reconstruction.model import Model
-from reconstruction.report.report import Stage
 
 SCALE, SHIFT = 1.06, np.array([0.01, -0.005, 0.02])
 

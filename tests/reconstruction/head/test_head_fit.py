@@ -14,8 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from reconstruction import Mesh, read_obj
 from reconstruction.geometry.closest_point import ClosestPoint, closest_on_triangles
-from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head, mark_scalp
 from reconstruction.head.generic import generic_head

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reconstruction.geometry.mesh import Mesh
+from reconstruction import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.scalp import NoScalp, find_scalp, sample_roots
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reconstruction.geometry.mesh import Mesh
+from reconstruction import Mesh
 from reconstruction.head.generic import generic_head
 from reconstruction.head.scalp import find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap

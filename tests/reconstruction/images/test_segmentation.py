@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction.capture.folder import Capture
+from reconstruction import Capture
 from reconstruction.images.segmentation import Network, NetworkError
 from reconstruction.images.silhouettes import silhouette
 from reconstruction.masks import hair_masks

@@ -13,13 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from reconstruction import Camera, Capture, Light, Rig, Strands, write_exr
 from reconstruction.array_backend import array_types
-from reconstruction.capture.folder import Capture
-from reconstruction.files.exr import write_exr
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_codes.code_views import View, light_beside, line_vectors
 from reconstruction.light_codes.codes import code_map
 

@@ -12,19 +12,18 @@ import pytest
 from benchmarks.light_codes.patches import part_of
 from benchmarks.strand_truth import Ball
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.evaluation.matching import compare_strands
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.strands import Strands
-from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.model import Model
-from reconstruction.pipeline import reconstruct
-from reconstruction.reconstruct_options import (
-    LightCodeOptions,
-    LogGaborBank,
+from reconstruction import (
+    Capture,
+    CaptureError,
+    Model,
     ReconstructOptions,
-    SearchOptions,
+    Strands,
+    read_strands,
+    reconstruct,
 )
+from reconstruction.evaluation.matching import compare_strands
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank, SearchOptions
 
 QUICK = ReconstructOptions(
     light_codes=LightCodeOptions(

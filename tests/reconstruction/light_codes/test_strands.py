@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reconstruction import Report, Strands
 from reconstruction.evaluation.matching import compare_strands
-from reconstruction.geometry.strands import Strands, smoothed
+from reconstruction.geometry.strands import smoothed
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.measure_segments import connect_segments
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import count_supports, thinned_lines, to_segments
-from reconstruction.report.report import Report
 
 
 def arc(count: int, turn: float = 1.5, radius: float = 0.02) -> Any:

@@ -15,21 +15,28 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.files.strands import read_strands
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.mesh import Mesh, write_obj
-from reconstruction.geometry.projectors import Projector
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    Light,
+    Mesh,
+    Model,
+    Projector,
+    ReconstructOptions,
+    Report,
+    Stage,
+    read_strands,
+    reconstruct,
+    write_obj,
+)
+from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import NoScalp
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, triangulate
-from reconstruction.model import Model
-from reconstruction.pipeline import reconstruct
-from reconstruction.reconstruct_options import MeasureOptions, ReconstructOptions
-from reconstruction.report.report import Report, Stage
+from reconstruction.reconstruct_options import MeasureOptions
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(6, 1.2, 0.0))]

@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.projectors import Projector
+from reconstruction import Camera, Capture, Projector, Stage
 from reconstruction.light_planes import Motion, solve_motion, triangulate
 from reconstruction.light_planes.registration import Template, gradients, sample, spline
 from reconstruction.reconstruct_options import MotionOptions
-from reconstruction.report.report import Stage
 
 CORNERS = np.array(np.meshgrid([-0.07, 0.07], [-0.07, 0.07], [-0.07, 0.07])).reshape(3, -1).T
 

@@ -9,10 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
+from reconstruction import Camera, Capture, CaptureError, Projector, Rig, Stage
 from reconstruction.light_planes import (
     Motion,
     PointCloud,
@@ -24,7 +21,6 @@ from reconstruction.light_planes.consensus import flatten, supported
 from reconstruction.light_planes.peaks import REACH, fit_stripes
 from reconstruction.light_planes.plane_conditioning import condition, ray_plane_angles, row_pitch
 from reconstruction.light_planes.triangulation import fuse
-from reconstruction.report.report import Stage
 
 Shoot = Callable[..., Capture]
 RADIUS = 0.1

@@ -8,9 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction import Camera, Capture, Light
+from reconstruction.geometry.lights import dome_positions
 from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.tangents.estimate import measure_tangents

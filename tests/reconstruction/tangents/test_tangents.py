@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
+from reconstruction import Camera, Light
+from reconstruction.geometry.lights import dome_positions
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
     Tangents,

@@ -8,11 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reconstruction import Camera, Light, Projector, Rig
 from reconstruction.calibration.boards import Board
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light
-from reconstruction.geometry.projectors import Projector
-from reconstruction.geometry.rig import Rig
 from simulators.__main__ import main
 from simulators.subject.props import BoardProp, PropResponder, SphereProp, board_pose, named_prop
 

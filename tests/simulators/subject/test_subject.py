@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from reconstruction.files.strands import write_strands
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
+from reconstruction import Rig, Strands, write_strands
 from reconstruction.head.generic import generic_head, skin_distance
 from simulators.subject.subject import SubjectError, check_fits, load_subject, make_subject
 

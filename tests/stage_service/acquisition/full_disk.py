@@ -11,12 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction import Camera, CaptureWriter, Rig, Step, verify
 from reconstruction.capture.compression import compress
-from reconstruction.capture.folder import Step
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.rig import Rig
 from stage_service.acquisition.frame_queue import FrameWriter, Shot
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import CaptureError
-from reconstruction.capture.verify import verify
+from reconstruction import CaptureError, verify
 from reconstruction.geometry.rig import RigError
 from stage_service.acquisition.captures import Busy, CaptureManager, UnknownCapture
 from stage_service.acquisition.states import WrongState

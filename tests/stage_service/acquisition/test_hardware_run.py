@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from pjlink_projector import PjLinkServer, SimulatedProjector
 
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter, verify
 from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import blackout
 from stage_service.acquisition.sequencer import CannotPause, Sequencer

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Capture
-from reconstruction.capture.verify import verify
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import Capture, CaptureWriter, verify
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet

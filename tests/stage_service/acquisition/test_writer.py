@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from waiting import until
 
-from reconstruction.capture.folder import Step
-from reconstruction.capture.writer import CaptureWriter
+from reconstruction import CaptureWriter, Step
 from stage_service.acquisition.frame_queue import FrameWriter, Shot
 from stage_service.config import RigFile
 from stage_service.devices.cameras.interface import CameraInfo, Frame

@@ -15,9 +15,7 @@ import pytest
 import uvicorn
 from waiting import until
 
-from reconstruction.capture.folder import Step
-from reconstruction.files.exr import read_exr
-from reconstruction.model import Model
+from reconstruction import Model, Step, read_exr
 from stage_service.api.app import LOOPBACK, create_app
 from stage_service.api.problems import KINDS, Problem, errors_page
 from stage_service.config import RigFile

@@ -16,7 +16,7 @@ import httpx
 import pytest
 import uvicorn
 
-from reconstruction.capture.verify import verify
+from reconstruction import verify
 from stage_service.api.app import create_app
 from stage_service.cli import main
 from stage_service.config import RigFile, SafetyLimits

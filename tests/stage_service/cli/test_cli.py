@@ -17,12 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.capture.folder import Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.files.exr import write_exr
-from reconstruction.files.strands import write_strands
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
+from reconstruction import CaptureWriter, Rig, Step, Strands, write_exr, write_strands
 from stage_service.cli import build_parser, main
 from stage_service.cli.support import CommandError, rig_path
 from stage_service.cli.support.children import Children

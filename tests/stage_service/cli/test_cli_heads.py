@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reconstruction import Mesh, read_obj, write_obj
 from reconstruction.geometry.closest_point import ClosestPoint
-from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.head.generic import generic_head
 from stage_service.cli import main

@@ -8,21 +8,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from appearance import FittedModel, HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.model.fitted_model import FittedModel
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat
-from appearance.scene.hair_appearance import HairAppearance
-from appearance.scene.hair_scene import build_scene
-from reconstruction.capture.folder import Capture, Step
-from reconstruction.capture.writer import CaptureWriter
-from reconstruction.files.exr import read_exr
-from reconstruction.files.strands import read_strands, write_strands
-from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lights import Light, dome_positions
-from reconstruction.geometry.rig import Rig
-from reconstruction.geometry.strands import Strands
-from reconstruction.model import Model
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureWriter,
+    Light,
+    Model,
+    Rig,
+    Step,
+    Strands,
+    read_exr,
+    read_strands,
+    write_strands,
+)
+from reconstruction.geometry.lights import dome_positions
 from stage_service.cli import main
 
 HAIR = HairAppearance((0.1, 0.1, 0.1), 0.25, 0.2)

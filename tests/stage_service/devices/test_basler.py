@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 from waiting import until
 
-from reconstruction.geometry.cameras import Camera as CameraGeometry
+from reconstruction import Camera as CameraGeometry
 from simulators.frames.sensor import Sensor
 from stage_service.acquisition.accounting import FrameAccount
 from stage_service.config import BaslerConfig

@@ -6,10 +6,9 @@ import json
 
 import pytest
 
-from appearance.metrics.scores import Exposure
-from appearance.scene.hair_appearance import HairAppearance
+from appearance import Exposure, HairAppearance
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction.model import Model
+from reconstruction import Model
 from stage_service.jobs.evaluation import evaluate_appearance
 
 

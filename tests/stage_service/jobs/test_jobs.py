@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from waiting import until
 
-from reconstruction.model import Model
+from reconstruction import Model
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, read_progress
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest

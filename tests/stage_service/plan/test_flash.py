@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from reconstruction.capture.folder import Step
+from reconstruction import Step
 from stage_service.acquisition.flash_watch import FlashWatch
 from stage_service.config import RigFile, SafetyLimits, load_rig_file
 from stage_service.devices.errors import SafetyRefusal

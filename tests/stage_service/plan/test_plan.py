@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from reconstruction.geometry.rig import Rig
+from reconstruction import Rig
 from stage_service.config import RigFile, load_rig_file
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError, resolve
@@ -63,7 +63,7 @@ def test_a_full_stage_is_costed_in_under_a_second(stage331):
 
 
 def test_bytes_are_those_of_the_files(demo, tmp_path):
-    from reconstruction.capture.writer import CaptureWriter
+    from reconstruction import CaptureWriter
 
     plan = CapturePlan(lights=("light_007",), projectors=(), sentinels=False)
     writer = CaptureWriter.create(tmp_path / "c", demo.rig, {"steps": resolve(plan, demo).steps})
