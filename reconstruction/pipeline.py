@@ -46,11 +46,8 @@ from reconstruction.tangents.estimate import Measured, measure_tangents
 HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
-LEAST_CONFIDENCE = 0.1
-"""Of a measured tangent to count."""
-
-SPACING = 2e-3
-"""Metres between a strand's points as it is written."""
+LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
+SPACING = 2e-3  # metres between a strand's points as it is written
 
 
 def reconstruct(
@@ -210,10 +207,7 @@ class _Stages:
         return MaskedCapture(capture, masks)
 
     def lines(
-        self,
-        masked: MaskedCapture,
-        head: FittedHead | None,
-        method: Literal["photometric", "lmvs"],
+        self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
     ) -> tuple[list[AnyFloats], Segments]:
         """Polylines `(N, 3)` from line stereo, and the segments that they come from."""
         polylines, segments = line_strands(
@@ -227,10 +221,7 @@ class _Stages:
         return list(polylines), segments
 
     def seen_strands(
-        self,
-        masked: MaskedCapture,
-        head: FittedHead | None,
-        method: Literal["photometric", "lmvs"],
+        self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
     ) -> None:
         """Strands from line stereo alone: only what is seen, none of them rooted."""
         polylines, _ = self.lines(masked, head, method)

@@ -216,13 +216,7 @@ class CaptureWriter:
         return buffer
 
     def record_missing(
-        self,
-        step: Step,
-        camera: str,
-        *,
-        reason: str,
-        pulse: int | None = None,
-        attempt: int = 0,
+        self, step: Step, camera: str, *, reason: str, pulse: int | None = None, attempt: int = 0
     ) -> FrameRecord:
         """Journal that a frame did not come and why; a later `write_frame` of it still counts."""
         self._check(step, camera)

@@ -140,10 +140,7 @@ LEAST_COHERENCE = 0.5
 
 
 def gather(
-    grid: VoxelGrid,
-    points: AnyFloats,
-    directions: AnyFloats,
-    weights: AnyFloats,
+    grid: VoxelGrid, points: AnyFloats, directions: AnyFloats, weights: AnyFloats
 ) -> tuple[Ints, Array, Array]:
     """Data per voxel: numbers `(D,)` of the voxels hit, mean tensors `(D, 6)`, weights `(D,)`.
 
@@ -230,10 +227,7 @@ class FieldSystem:
 
 
 def field_system(
-    grid: VoxelGrid,
-    points: AnyFloats,
-    directions: AnyFloats,
-    weights: AnyFloats | None = None,
+    grid: VoxelGrid, points: AnyFloats, directions: AnyFloats, weights: AnyFloats | None = None
 ) -> FieldSystem:
     """The linear system of `solve_field`, which says what the arguments are and what it raises."""
     count = int(grid.inside.sum())

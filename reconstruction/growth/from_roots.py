@@ -14,11 +14,8 @@ from reconstruction.growth.field import OrientationField
 
 Method = Literal["euler", "midpoint", "rk4"]
 
-_LIFT = 12e-3
-"""Metres that a root is lifted by, at most, to where there is hair."""
-
-_SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3
-"""Metres: shorter strands are not kept."""
+_LIFT = 12e-3  # metres that a root is lifted by, at most, to where there is hair
+_SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3  # metres: shorter strands are not kept
 
 _ROUNDS = 120
 
@@ -53,10 +50,7 @@ class TracedPaths:
 
 
 def trace(
-    field: OrientationField,
-    starts: AnyFloats,
-    along: AnyFloats,
-    tracing: Tracing = Tracing(),
+    field: OrientationField, starts: AnyFloats, along: AnyFloats, tracing: Tracing = Tracing()
 ) -> TracedPaths:
     """Follow the field from `starts (N, 3)`, setting out on the side of `along (N, 3)`.
 

@@ -17,8 +17,7 @@ from reconstruction.light_planes import PointCloud
 from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 
-_BARE = 2e-3
-"""Metres behind the head's surface up to which a pixel of skin rules hair out."""
+_BARE = 2e-3  # metres behind the head's surface up to which a pixel of skin rules hair out
 
 
 def build_envelope(

@@ -136,11 +136,7 @@ def conjugate_gradient_steps(
 
 
 def conjugate_gradients(
-    A: sparse.csr_array,
-    b: Array,
-    start: Array,
-    tolerance: float = 1e-6,
-    limit: int = 500,
+    A: sparse.csr_array, b: Array, start: Array, tolerance: float = 1e-6, limit: int = 500
 ) -> tuple[Array, Series]:
     """Solve `A x = b` for all columns of `b (M, K)` at once; A symmetric positive definite.
 

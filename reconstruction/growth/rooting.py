@@ -13,8 +13,7 @@ from reconstruction.head.scalp import Scalp
 _STRIDE = 4
 """Every fourth point of a strand stands for it in the search: the growth's step is short."""
 
-_RISE = 1e-3
-"""Metres between the points of a way from the scalp."""
+_RISE = 1e-3  # metres between the points of a way from the scalp
 
 _NEAR, _HIGHEST = 8e-3, 40e-3
 """Metres above the scalp: up to where an end is led down at once, and up to where at all."""
@@ -118,10 +117,7 @@ def _ends(paths: list[Floats]) -> Array:
 
 
 def _join_round(
-    strands: list[Floats],
-    loose: list[Floats],
-    reach: float,
-    below: _Below,
+    strands: list[Floats], loose: list[Floats], reach: float, below: _Below
 ) -> tuple[list[Floats], list[Floats]]:
     """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
     points = np.concatenate(strands)

@@ -132,11 +132,7 @@ def surface_strands(
 
 
 def _spend(
-    cloud: LineCloud,
-    lines: Measured,
-    paths: list[Array],
-    spent: Bools,
-    options: SurfaceOptions,
+    cloud: LineCloud, lines: Measured, paths: list[Array], spent: Bools, options: SurfaceOptions
 ) -> None:
     """Mark the lines that `paths` pass along."""
     points = np.concatenate(paths)

@@ -61,8 +61,7 @@ def asked_bits(a: CodeMap, b: CodeMap) -> Words:
     return a.varying | b.varying
 
 
-LEAST_LIT = 0.1
-"""Of the median pixel's brightest light: what a shadow lets through is below."""
+LEAST_LIT = 0.1  # of the median pixel's brightest light: what a shadow lets through is below
 
 LEAST_REACHED = 0.02
 """Of what a light brings to the brightest twentieth of the hair.

@@ -16,10 +16,7 @@ from reconstruction.images.visual_hull import visual_hull
 
 
 def hair_volume(
-    cameras: Sequence[Camera],
-    subject: Mapping[str, Bools],
-    head: Mesh | None,
-    spacing: float,
+    cameras: Sequence[Camera], subject: Mapping[str, Bools], head: Mesh | None, spacing: float
 ) -> VoxelGrid:
     """Voxels that can hold hair: in the hull of the masks `(H, W)` of the subject, off the head.
 

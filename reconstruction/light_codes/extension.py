@@ -9,17 +9,10 @@ import numpy as np
 from reconstruction.arrays import Array, Ints
 from reconstruction.light_codes.code_views import View
 
-STEP = 5e-4
-"""Metres."""
-
-ANGLE_DEG = 5.0
-"""Within which a view's line agrees with a strand."""
-
-LONGEST = 0.05
-"""Metres that grow at most from either tip."""
-
-LEAST_CONFIDENCE = 0.05
-"""Of a view's line for it to have a say."""
+STEP = 5e-4  # metres
+ANGLE_DEG = 5.0  # within which a view's line agrees with a strand
+LONGEST = 0.05  # metres that grow at most from either tip
+LEAST_CONFIDENCE = 0.05  # of a view's line for it to have a say
 
 
 def fewest_views(count: int) -> int:

@@ -17,19 +17,13 @@ from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.from_capture import views_of
 from reconstruction.light_codes.lmvs import LmvsSearch
 from reconstruction.light_codes.search import DepthSearch
-from reconstruction.light_codes.segments import (
-    Segments,
-    count_supports,
-    thinned_lines,
-    to_segments,
-)
+from reconstruction.light_codes.segments import Segments, count_supports, thinned_lines, to_segments
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import LightCodeOptions
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
 
-VOLUME_GRID = 4e-3
-"""Metres: the voxels in which depths are bounded."""
+VOLUME_GRID = 4e-3  # metres: the voxels in which depths are bounded
 
 SUPPORT_DISTANCE, SUPPORT_ANGLE_DEG = 1.5e-3, 15.0
 """Metres and degrees within which two views found a segment alike."""
@@ -112,11 +106,7 @@ def measure_segments(
     with report.stage("segments") as stage:
         segments = to_segments(views, maps)
         segments = count_supports(
-            views,
-            maps,
-            segments,
-            distance=SUPPORT_DISTANCE,
-            angle_deg=SUPPORT_ANGLE_DEG,
+            views, maps, segments, distance=SUPPORT_DISTANCE, angle_deg=SUPPORT_ANGLE_DEG
         )
         supports = np.bincount(segments.supports, minlength=len(views) + 1)
         least = min(options.least_views, len(views))

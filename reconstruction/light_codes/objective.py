@@ -46,13 +46,7 @@ class Pixels:
     """
 
     def __init__(
-        self,
-        origin: Any,
-        ray: Any,
-        code: list[Any],
-        view: Any,
-        neighbours: Any,
-        visible: Any,
+        self, origin: Any, ray: Any, code: list[Any], view: Any, neighbours: Any, visible: Any
     ) -> None:
         self.origin, self.ray, self.code, self.view = origin, ray, code, view
         self.neighbours, self.visible = neighbours, visible

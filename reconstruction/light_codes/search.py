@@ -25,11 +25,8 @@ little from one strand to the next: its best 24 depths of 160 held the best in 8
 SAMPLES, LENGTH = 25, 5e-3
 """Points of a segment that are compared in the second stage, and metres from its end to its end."""
 
-LEAST_CONFIDENCE = 0.1
-"""Of a pixel's line for it to be a reference."""
-
-LEAST_SPREAD = 0.05
-"""Segments whose planes spread less are dropped as nearly parallel."""
+LEAST_CONFIDENCE = 0.1  # of a pixel's line for it to be a reference
+LEAST_SPREAD = 0.05  # segments whose planes spread less are dropped as nearly parallel
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +177,7 @@ class _Depths:
     """
 
     def __init__(
-        self,
-        device: DeviceViews,
-        pixels: Pixels,
-        near: Any,
-        step: Any,
-        samples: int,
-        apart: float,
+        self, device: DeviceViews, pixels: Pixels, near: Any, step: Any, samples: int, apart: float
     ) -> None:
         self.device, self.types, self.pixels = device, device.types, pixels
         self.near, self.step = near, step

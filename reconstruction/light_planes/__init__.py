@@ -3,11 +3,7 @@
 from reconstruction.light_planes.motion import Motion
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.light_planes.tracking import solve_motion
-from reconstruction.light_planes.triangulation import (
-    TriangulateOptions,
-    sweep_peaks,
-    triangulate,
-)
+from reconstruction.light_planes.triangulation import TriangulateOptions, sweep_peaks, triangulate
 
 __all__ = [
     "Motion",

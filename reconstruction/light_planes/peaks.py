@@ -28,11 +28,8 @@ bright maxima (95th percentile)."""
 DIRECT_SHARE = 0.15
 """Of all the light that the sweep brings to the pixel: indirect light comes from every row."""
 
-CORRELATION = 0.9
-"""Of a stripe with the projector's line profile."""
-
-PER_PIXEL = 2
-"""Maxima that are kept: hair lets a ray hit several fibres."""
+CORRELATION = 0.9  # of a stripe with the projector's line profile
+PER_PIXEL = 2  # maxima that are kept: hair lets a ray hit several fibres
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,7 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools
 
-BLUR = 1.0
-"""Pixels of the Gaussian that keeps pictures from aliasing."""
+BLUR = 1.0  # pixels of the Gaussian that keeps pictures from aliasing
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,9 +56,7 @@ def _in_words(direction: Array) -> str:
 
 
 def gauss_newton(
-    system: Callable[[Pose], tuple[Array, Array]],
-    iterations: int,
-    start: Pose | None = None,
+    system: Callable[[Pose], tuple[Array, Array]], iterations: int, start: Pose | None = None
 ) -> tuple[Pose, Determination]:
     """Minimise Huber's loss over rigid motions; directions that are not determined stay put.
 

@@ -29,28 +29,16 @@ from reconstruction.light_planes.registration import (
     smooth,
     spline,
 )
-from reconstruction.light_planes.rigid_fit import (
-    Determination,
-    Pose,
-    flow,
-    gauss_newton,
-    numeric,
-)
+from reconstruction.light_planes.rigid_fit import Determination, Pose, flow, gauss_newton, numeric
 from reconstruction.reconstruct_options import MotionOptions
 from reconstruction.report.report import Progress, Stage, silent
 
-SIGMA = 1.5
-"""Pixels of the Gaussian under which pictures are compared."""
-
-ALIKE = 0.6
-"""Likeness under which a tracking frame does not show what the reference shows."""
+SIGMA = 1.5  # pixels of the Gaussian under which pictures are compared
+ALIKE = 0.6  # likeness under which a tracking frame does not show what the reference shows
 
 
-STILL_PX = 0.03
-"""Motions under this, or within the noise of all cameras together, are none."""
-
-MOST_POINTS = 12000
-"""Points of a camera that take part."""
+STILL_PX = 0.03  # motions under this, or within the noise of all cameras together, are none
+MOST_POINTS = 12000  # points of a camera that take part
 
 STILL: Pose = (np.eye(3), np.zeros(3))
 
@@ -223,9 +211,7 @@ def from_registrations(
 
 
 def align(
-    views: list[_TrackedView],
-    images: dict[str, Array],
-    start: Pose,
+    views: list[_TrackedView], images: dict[str, Array], start: Pose
 ) -> tuple[Pose, Determination]:
     """The motion under which every camera's picture at the moved points equals its reference.
 

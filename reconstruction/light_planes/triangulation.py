@@ -18,17 +18,10 @@ from reconstruction.light_planes.plane_conditioning import row_pitch
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Progress, Stage, silent
 
-MIN_ANGLE_DEG = 10.0
-"""Rays that meet their plane flatter are not used."""
-
-MAX_DEVIATION = 2.5e-3
-"""Metres: the largest standard deviation along the ray."""
-
-HULL_MARGIN = 1.0
-"""Pixels that a point may project outside a silhouette."""
-
-NEIGHBOURS, ISOLATION = 8, 1.6
-"""See `consensus.supported`."""
+MIN_ANGLE_DEG = 10.0  # rays that meet their plane flatter are not used
+MAX_DEVIATION = 2.5e-3  # metres: the largest standard deviation along the ray
+HULL_MARGIN = 1.0  # pixels that a point may project outside a silhouette
+NEIGHBOURS, ISOLATION = 8, 1.6  # see `consensus.supported`
 
 RADIUS, ROUGHNESS = 2.5e-3, 3e-4
 """Metres: a neighbourhood's size, and how far fibres lie off its plane (`consensus.flatten`)."""

@@ -26,8 +26,7 @@ from reconstruction.tangents.line_evidence import (
 from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
 from reconstruction.tangents.tangent_conditioning import condition_lines
 
-CANDIDATES = 500
-"""Directions that are scored at each point."""
+CANDIDATES = 500  # directions that are scored at each point
 
 
 @dataclass(frozen=True, eq=False)

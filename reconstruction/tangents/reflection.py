@@ -19,8 +19,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.tangents.line_evidence import Tangents
 
-FEWEST_LIGHTS = 60
-"""Under about one light for each 15 degrees the highlight falls between them."""
+FEWEST_LIGHTS = 60  # under about one light for each 15 degrees the highlight falls between them
 
 _SUMS, _AZIMUTHS, _TILTS, _FACINGS = 9, 4, 2, 8
 _LARGEST_SUM = 1.4
