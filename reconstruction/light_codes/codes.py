@@ -56,11 +56,6 @@ def match(a: Words, b: Words, asked: Words) -> Floats:
     return share.astype(np.float32)
 
 
-def asked_bits(a: CodeMap, b: CodeMap) -> Words:
-    """The lights `(W,)` that a pair of views is compared by: those that vary in either of them."""
-    return a.varying | b.varying
-
-
 LEAST_LIT = 0.1  # of the median pixel's brightest light: what a shadow lets through is below
 
 LEAST_REACHED = 0.02

@@ -29,6 +29,13 @@ class Seen:
     equal: Any
     there: Any
 
+    def cosine2(self, step: Any) -> Any:
+        """Squared cosine on the image between the line and a `projection` of a direction."""
+        ux, uy = step.x - self.x * step.z, step.y - self.y * step.z
+        own = self.lx * self.lx + self.ly * self.ly
+        same = ux * self.lx + uy * self.ly
+        return same * same / dr.maximum((ux * ux + uy * uy) * own, 1e-20)
+
 
 class DeviceViews:
     """Projections `(V, 12)`, lines and code words of all views, end to end in flat arrays."""

@@ -7,18 +7,148 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.arrays import Array
+from reconstruction.arrays import AnyFloats, Array
+from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
-from reconstruction.light_codes.measure_segments import connect_segments, measure_segments
-from reconstruction.light_codes.segments import Segments
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
+from reconstruction.light_codes.code_views import View, views_of
+from reconstruction.light_codes.depth_range import depth_range, hair_volume
+from reconstruction.light_codes.extension import extend, fewest_views
+from reconstruction.light_codes.lmvs import LmvsSearch
+from reconstruction.light_codes.search import DepthSearch
+from reconstruction.light_codes.segments import Segments, count_supports, thinned_lines, to_segments
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import LightCodeOptions
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.tangents.estimate import Measured
 
+VOLUME_GRID = 4e-3  # metres: the voxels in which depths are bounded
+
+SUPPORT_DISTANCE, SUPPORT_ANGLE_DEG = 1.5e-3, 15.0
+"""Metres and degrees within which two views found a segment alike."""
+
+CROWD = 3e-4
+"""Metres: lines are averaged in cells of this size before strands are traced through them."""
+
 SEGMENT_WEIGHT = 4.0
 """Of a segment's confidence, in an orientation field that it shares with measured tangents."""
+
+TRACING = SurfaceOptions(apart=6e-4, step=0.7, shortest=5.0, smooth=2.0)
+
+
+def build_views(
+    masked: MaskedCapture,
+    head: Mesh | None,
+    report: Report,
+    *,
+    options: LightCodeOptions = LightCodeOptions(),
+    progress: Progress = silent,
+) -> tuple[list[View], VoxelGrid]:
+    """The views, and the volume that holds the hair; adds the stage `lightcodes` to the report."""
+    capture, masks, cameras = masked.capture, masked.masks, masked.cameras
+    hair = {c.name: masks[c.name].hair for c in cameras}
+    subject = {c.name: masks[c.name].subject for c in cameras}
+    if not any(m.any() for m in hair.values()):
+        raise CaptureError(f"{capture.path}: no camera's mask holds hair: check the masks")
+    with report.stage("lightcodes") as stage:
+        try:
+            volume = hair_volume(cameras, subject, head, VOLUME_GRID)
+        except ValueError as error:
+            raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
+        if not volume.inside.any():
+            raise CaptureError(
+                f"{capture.path}: no volume is seen by enough cameras: check masks, head.obj and "
+                "poses"
+            )
+        center = volume.centers().mean(axis=0)
+        views = views_of(capture, hair, center, options.bank, stage, progress)
+    return views, volume
+
+
+def measure_segments(
+    masked: MaskedCapture,
+    head: Mesh | None,
+    report: Report,
+    *,
+    method: Literal["photometric", "lmvs"] = "photometric",
+    options: LightCodeOptions = LightCodeOptions(),
+    progress: Progress = silent,
+) -> tuple[list[View], Segments]:
+    """The views, and the segments that `least_views` of them (all, if there are fewer) agree on.
+
+    Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
+    there are no two views of hair, or no segment is left.
+    """
+    views, volume = build_views(masked, head, report, options=options, progress=progress)
+    center = volume.centers().mean(axis=0)
+    with report.stage("depth") as stage:
+        search = (
+            DepthSearch(views, center, options.search)
+            if method == "photometric"
+            else LmvsSearch(views, center, options.search)
+        )
+        maps = []
+        for k, view in enumerate(views):
+            progress("searching depths", k / len(views))
+            near, far = depth_range(view.camera, volume, options.deepest)
+            maps.append(search.run(k, near, far))
+        found = {v.camera.name: len(m.x) for v, m in zip(views, maps, strict=True)}
+        spreads = np.concatenate([m.spread for m in maps])
+        misfits = np.concatenate([m.misfit for m in maps])
+        agreements = np.concatenate([m.agreement for m in maps])
+        seen = np.concatenate([m.seen_by for m in maps])
+        stage.figures.update(
+            segments=found,
+            reference_pixels={v.camera.name: int(v.mask.sum()) for v in views},
+            visible_neighbours=float(seen.mean()) if len(seen) else 0.0,
+            agreement=_percentiles(agreements),
+            spread=_percentiles(spreads),
+            misfit=_percentiles(misfits),
+        )
+    with report.stage("segments") as stage:
+        segments = to_segments(views, maps)
+        segments = count_supports(
+            views, maps, segments, distance=SUPPORT_DISTANCE, angle_deg=SUPPORT_ANGLE_DEG
+        )
+        supports = np.bincount(segments.supports, minlength=len(views) + 1)
+        least = min(options.least_views, len(views))
+        kept = segments.subset(segments.supports >= least)
+        stage.figures.update(
+            found=len(segments),
+            kept=len(kept),
+            views_in_agreement={str(k): int(n) for k, n in enumerate(supports) if n},
+        )
+        if not len(kept):
+            raise CaptureError(
+                f"{masked.capture.path}: no segment of {len(segments)} is found alike in "
+                f"{least} of {len(views)} views: more cameras with overlapping "
+                "views, sharper or finer pictures, or a lower least_views may help"
+            )
+    return views, kept
+
+
+def connect_segments(views: list[View], segments: Segments, report: Report) -> list[Array]:
+    """Polylines `(N, 3)` through the segments, with what grows from their tips."""
+    with report.stage("connection") as stage:
+        # of the segments that ten views agree on, three times as many are right as of those of four
+        weights = (segments.confidence * segments.supports) ** 2
+        points, directions, weights = thinned_lines(
+            segments.points, segments.directions, weights, CROWD
+        )
+        usual = np.median(weights[weights > 0]) if (weights > 0).any() else 1.0
+        lines = Measured(points, directions, np.minimum(weights / usual, 1.0))
+        found = [p.astype(float) for p in surface_strands(lines, TRACING)]
+        grown = extend(views, found)
+        stage.figures.update(
+            lines=len(points),
+            strands=len(found),
+            metres=_metres(found),
+            metres_extended=_metres(grown),
+            views_to_extend=fewest_views(len(views)),
+        )
+    return grown
 
 
 def line_strands(
@@ -60,3 +190,13 @@ def _roots_first(polylines: list[Array], head: Mesh | None) -> list[Array]:
         samples, _, _ = surface_samples(head, 2e-3)
         far = cKDTree(samples).query(ends)[0]
     return [p if a <= b else p[::-1] for p, (a, b) in zip(polylines, far, strict=True)]
+
+
+def _metres(polylines: list[Array]) -> float:
+    return float(sum(np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in polylines))
+
+
+def _percentiles(values: AnyFloats) -> dict[str, float]:
+    if not len(values):
+        return {}
+    return {f"p{q}": float(np.percentile(values, q)) for q in (10, 50, 90)}

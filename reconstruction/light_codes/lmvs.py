@@ -17,7 +17,7 @@ from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.light_codes.device_views import DeviceViews
 from reconstruction.light_codes.objective import Pixels, line_through
-from reconstruction.light_codes.search import LENGTH, SAMPLES, DepthSearch
+from reconstruction.light_codes.search import LENGTH, SAMPLES, DepthSearch, fetched
 
 FAN = np.radians(np.linspace(-50, 50, 5))
 """Inclinations towards the camera at which a line is tried at every depth."""
@@ -59,15 +59,8 @@ class LmvsSearch(DepthSearch):
                 dr.eval(cost, depth, tilt)
             move, turn = 0.5 * move, 0.5 * turn
         line = line_through(self.device, pixels, pixels.at(depth))
-        direction = along(tilt)
-        dr.eval(depth, direction, cost, line.spread, line.misfit)
-        return (
-            depth.numpy(),
-            direction.numpy().T.copy(),
-            1 - cost.numpy() / np.float32(np.pi / 2),
-            line.spread.numpy(),
-            line.misfit.numpy(),
-        )
+        depth, direction, cost, spread, misfit = fetched(depth, along(tilt), cost, line)
+        return depth, direction, 1 - cost / np.float32(np.pi / 2), spread, misfit
 
     def _in_plane(self, view: int, x: Ints, y: Ints) -> Any:
         """A function from inclinations to unit directions in the plane of each pixel's line."""

@@ -101,17 +101,13 @@ def _weighed_line(views: DeviceViews, pixels: Pixels, point: Any, along: Any, tr
         line = t.Array3f(-seen.ly, seen.lx, seen.x * seen.ly - seen.y * seen.lx)
         normal = views.across(view, line)
         square = dr.squared_norm(normal)
-        own = seen.lx * seen.lx + seen.ly * seen.ly
         weight = dr.select(
             seen.there & (square > 0),
             power(seen.equal, LINE_MATCH_POWER) / dr.maximum(square, 1e-30),
             0,
         )
         if trust > 0:
-            step = views.projection(view, along, 0)
-            ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
-            same = ux * seen.lx + uy * seen.ly
-            cosine2 = same * same / dr.maximum((ux * ux + uy * uy) * own, 1e-20)
+            cosine2 = seen.cosine2(views.projection(view, along, 0))
             weight *= power(cosine2, trust // 2)
         xx += weight * normal.x * normal.x
         yy += weight * normal.y * normal.y
@@ -178,11 +174,7 @@ def agreement(views: DeviceViews, pixels: Pixels, point: Any, along: Any, sample
         s = t.UInt32(0)
         while s < samples:
             seen = views.look(frame, asked, pixels.code, h, sees)
-            ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
-            own = seen.lx * seen.lx + seen.ly * seen.ly
-            same = ux * seen.lx + uy * seen.ly
-            square = same * same / dr.maximum((ux * ux + uy * uy) * own, 1e-20)
-            share = power(square, ANGLE_POWER // 2) * power(seen.equal, MATCH_POWER)
+            share = power(seen.cosine2(step), ANGLE_POWER // 2) * power(seen.equal, MATCH_POWER)
             total += dr.select(seen.there, share, 0)
             h += step
             s += 1

@@ -15,7 +15,7 @@ from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.light_codes.code_views import View, nearest_views
 from reconstruction.light_codes.codes import unpack
 from reconstruction.light_codes.device_views import DeviceViews
-from reconstruction.light_codes.objective import Pixels, agreement, line_through
+from reconstruction.light_codes.objective import Line, Pixels, agreement, line_through
 from reconstruction.reconstruct_options import SearchOptions
 
 FEW_SAMPLES = 3
@@ -107,16 +107,15 @@ class DepthSearch:
         asked = own.mask & (own.confidence >= LEAST_CONFIDENCE) & (far > near)
         y, x = np.nonzero(asked)
         if not len(x) or not self.neighbours[view]:
-            return _nothing()
+            none, no = np.zeros(0, np.int64), np.zeros(0, np.float32)
+            return DepthMap(none, none, no, np.zeros((0, 3), np.float32), no, no, no, none)
         pixels, seen_by = self.pixels(view, y, x)
         start = near[y, x].astype(np.float32)
         counts = np.ceil((far[y, x] - start) / options.step).astype(np.uint32) + 1
         found = self.search(pixels, x, y, start, counts, view)
-        depth, direction, agree, spread, misfit = found
+        _, _, agree, spread, _ = found
         keep = (seen_by > 0) & (spread >= LEAST_SPREAD) & (agree > 0)
-        return DepthMap(
-            *(a[keep] for a in (x, y, depth, direction, agree, spread, misfit, seen_by))
-        )
+        return DepthMap(*(a[keep] for a in (x, y, *found, seen_by)))
 
     def search(
         self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
@@ -125,49 +124,37 @@ class DepthSearch:
 
         Lane i tries `counts[i]` depths from `start[i]` on.
         """
-        return _search(self.device, pixels, self.options, start, counts)
+        t, options = self.types, self.options
+        near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
+        step = dr.opaque(t.Float, options.step)
+        fine = _Depths(self.device, pixels, near, step, SAMPLES, LENGTH / (SAMPLES - 1))
+        if options.candidates:
+            every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
+            apart = LENGTH / FEW_SAMPLES
+            wide = _Depths(self.device, pixels, near, every * step, FEW_SAMPLES, apart)
+            steps = best_of_all(wide, coarse, options.candidates)[1]
+            between = range(1 - every, every)
+            steps = [
+                t.UInt32(dr.maximum(t.Int32(k * every) + j, 0)) for k in steps for j in between
+            ]
+            score, best = best_of(fine, steps)
+        else:
+            (score,), (best,) = best_of_all(fine, number, 1)
+        dr.eval(score, best)
+        depth = near + step * t.Float(best)
+        before, after = fine.worth(depth - step)[0], fine.worth(depth + step)[0]
+        bend = before - 2 * score + after
+        shift = dr.select(bend < 0, 0.5 * (before - after) / dr.minimum(bend, -1e-12), 0)
+        depth += step * dr.clip(shift, -0.5, 0.5)
+        agree, line = fine.worth(depth)
+        return fetched(depth, line.direction, agree, line)
 
 
-def _nothing() -> DepthMap:
-    none, no = np.zeros(0, np.int64), np.zeros(0, np.float32)
-    return DepthMap(none, none, no, np.zeros((0, 3), np.float32), no, no, no, none)
-
-
-def _search(
-    device: DeviceViews,
-    pixels: Pixels,
-    options: SearchOptions,
-    start: Floats,
-    counts: NDArray[np.uint32],
-) -> tuple[Any, ...]:
-    t = device.types
-    near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
-    step = dr.opaque(t.Float, options.step)
-    fine = _Depths(device, pixels, near, step, SAMPLES, LENGTH / (SAMPLES - 1))
-    if options.candidates:
-        every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
-        wide = _Depths(device, pixels, near, every * step, FEW_SAMPLES, LENGTH / FEW_SAMPLES)
-        steps = best_coarse(wide, coarse, options.candidates)
-        between = range(1 - every, every)
-        steps = [t.UInt32(dr.maximum(t.Int32(k * every) + j, 0)) for k in steps for j in between]
-        score, best = best_of(fine, steps)
-    else:
-        score, best = best_of_all(fine, number)
-    dr.eval(score, best)
-    depth = near + step * t.Float(best)
-    before, after = fine.worth(depth - step)[0], fine.worth(depth + step)[0]
-    bend = before - 2 * score + after
-    shift = dr.select(bend < 0, 0.5 * (before - after) / dr.minimum(bend, -1e-12), 0)
-    depth += step * dr.clip(shift, -0.5, 0.5)
-    agree, line = fine.worth(depth)
-    dr.eval(depth, agree, line.direction, line.spread, line.misfit)
-    return (
-        depth.numpy(),
-        line.direction.numpy().T.copy(),
-        agree.numpy(),
-        line.spread.numpy(),
-        line.misfit.numpy(),
-    )
+def fetched(depth: Any, direction: Any, agreement: Any, line: Line) -> tuple[Any, ...]:
+    """What `DepthSearch.search` returns, as NumPy's arrays."""
+    dr.eval(depth, direction, agreement, line.spread, line.misfit)
+    spread, misfit = line.spread.numpy(), line.misfit.numpy()
+    return depth.numpy(), direction.numpy().T.copy(), agreement.numpy(), spread, misfit
 
 
 class _Depths:
@@ -197,23 +184,8 @@ class _Depths:
 
 
 @dr.syntax
-def best_of_all(depths: _Depths, number: Any) -> tuple[Any, Any]:
-    """The best agreement over all depths below `number`, and its number: brute force."""
-    t = depths.types
-    score, best = t.Float(-1), t.UInt32(0)
-    k = t.UInt32(0)
-    while k < number:
-        here = depths.worth_of(k)
-        better = here > score
-        score = dr.select(better, here, score)
-        best = dr.select(better, k, best)
-        k += 1
-    return score, best
-
-
-@dr.syntax
-def best_coarse(depths: _Depths, number: Any, count: int) -> list[Any]:
-    """Numbers of the `count` best depths below `number`: an array for each rank."""
+def best_of_all(depths: _Depths, number: Any, count: int) -> tuple[list[Any], list[Any]]:
+    """The `count` best depths below `number`: agreements and numbers, an array for each rank."""
     t = depths.types
     scores = [t.Float(-1) for _ in range(count)]
     steps = [t.UInt32(0) for _ in range(count)]
@@ -229,7 +201,7 @@ def best_coarse(depths: _Depths, number: Any, count: int) -> list[Any]:
             here = dr.select(better, old_score, here)
             moved = dr.select(better, old_step, moved)
         k += 1
-    return steps
+    return scores, steps
 
 
 def best_of(depths: _Depths, steps: list[Any]) -> tuple[Any, Any]:

@@ -41,7 +41,7 @@ from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.orientation import texture
-from reconstruction.light_codes.measure_segments import build_views
+from reconstruction.light_codes.line_strands import build_views
 from reconstruction.masks import MaskedCapture, hair_masks
 from reconstruction.methods import Method
 from reconstruction.report.plots import plot_geometry, plot_report

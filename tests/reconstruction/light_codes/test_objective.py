@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruction.array_backend import array_types
-from reconstruction.light_codes.codes import asked_bits, match
+from reconstruction.light_codes.codes import match
 from reconstruction.light_codes.objective import (
     ANGLE_POWER,
     LINE_MATCH_POWER,
@@ -46,7 +46,8 @@ def looked_up(search: DepthSearch, view: int, k: int, code: Any, points: Array) 
     on &= (at[:, 0] < other.camera.width) & (at[:, 1] < other.camera.height)
     at[~on] = 0
     line = np.where(on[:, None], other.lines[at[:, 1], at[:, 0]], 0)
-    equal = match(other.codes.words[at[:, 1], at[:, 0]], code, asked_bits(own.codes, other.codes))
+    asked = own.codes.varying | other.codes.varying
+    equal = match(other.codes.words[at[:, 1], at[:, 0]], code, asked)
     return xy, line, np.where(line.any(axis=1), equal, 0)
 
 

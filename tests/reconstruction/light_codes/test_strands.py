@@ -11,7 +11,7 @@ from reconstruction import Report, Strands
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.strands import smoothed
 from reconstruction.light_codes.extension import extend, fewest_views
-from reconstruction.light_codes.measure_segments import connect_segments
+from reconstruction.light_codes.line_strands import connect_segments
 from reconstruction.light_codes.search import DepthSearch
 from reconstruction.light_codes.segments import count_supports, thinned_lines, to_segments
 
