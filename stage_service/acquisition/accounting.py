@@ -32,13 +32,9 @@ class PulseAccount:
         """Take the box's count after that many pulses. Raises `IndexShift`."""
         expected = self.count + pulses
         if count != expected:
-            raise IndexShift(
-                self.device,
-                "counting pulses",
-                expected=f"pulse {expected}",
-                received=f"pulse {count}",
-                todo="Somebody else fires the cameras, or the box restarted: start again.",
-            )
+            received = f"pulse {count}"
+            todo = "Somebody else fires the cameras, or the box restarted: start again."
+            raise IndexShift(self.device, "counting pulses", f"pulse {expected}", received, todo)
         self.count = count
 
 
@@ -168,22 +164,16 @@ class FrameAccount:
         self.last = block_id
 
     def _stray(self, received: str) -> IndexShift:
-        return IndexShift(
-            self.device,
-            "matching frames to pulses",
-            expected="no frame beside those of our pulses",
-            received=received,
-            todo="The camera was triggered by something else: frames since the last check may "
-            "belong to other steps. Check the trigger cable and start again.",
+        expected = "no frame beside those of our pulses"
+        todo = (
+            "The camera was triggered by something else: frames since the last check may "
+            "belong to other steps. Check the trigger cable and start again."
         )
+        return IndexShift(self.device, "matching frames to pulses", expected, received, todo)
 
     def _shift(self, expected: str, block_id: int, todo: str) -> IndexShift:
         return IndexShift(
-            self.device,
-            "matching frames to pulses",
-            expected=expected,
-            received=f"block id {block_id}",
-            todo=todo,
+            self.device, "matching frames to pulses", expected, f"block id {block_id}", todo
         )
 
 

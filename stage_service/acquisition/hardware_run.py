@@ -124,12 +124,11 @@ class HardwareRun:
         lights, beams = self._devices.lights, self._devices.projectors
         lit, shown = (self._gates(gate, len(self._steps)) for gate in "LP")
         if lit and lights.capabilities.reads_back and lights.status().watchdog_tripped:
+            expected = "a watchdog that was fed"
+            received = "a tripped one: frames of this run may be dark"
+            todo = "Check the load of the host and the link; raise watchdog_s."
             raise DeviceError(
-                lights.name,
-                "looking after a hardware-stepped run",
-                expected="a watchdog that was fed",
-                received="a tripped one: frames of this run may be dark",
-                todo="Check the load of the host and the link; raise watchdog_s.",
+                lights.name, "looking after a hardware-stepped run", expected, received, todo
             )
         stepped: list[tuple[str, LightBank | ProjectorController]] = [("L", lights)] if lit else []
         if shown and beams is not None:

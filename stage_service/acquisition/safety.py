@@ -114,13 +114,9 @@ def check_interlocks(devices: DeviceSet) -> None:
             (status.interlock_open, "interlock open"),
         ):
             if seen:
-                raise SafetyRefusal(
-                    "stage",
-                    "arming",
-                    expected="interlock closed and emergency stop released",
-                    received=f"{name}: {text}",
-                    todo="Clear it at the stage; the service never does.",
-                )
+                expected = "interlock closed and emergency stop released"
+                todo = "Clear it at the stage; the service never does."
+                raise SafetyRefusal("stage", "arming", expected, f"{name}: {text}", todo)
 
 
 def off_on_exit(close: Callable[[], None]) -> Callable[[], None]:

@@ -93,12 +93,10 @@ class DeviceSet:
         for projector in self.powers:
             state = projector.power()
             if state is not Power.ON:
+                received = state.name.lower().replace("_", " ")
+                todo = "Switch it on, and wait until its lamp has warmed up."
                 raise DeviceError(
-                    projector.name,
-                    "looking before a sweep",
-                    expected="power on",
-                    received=state.name.lower().replace("_", " "),
-                    todo="Switch it on, and wait until its lamp has warmed up.",
+                    projector.name, "looking before a sweep", "power on", received, todo
                 )
 
     def close(self) -> None:

@@ -14,7 +14,6 @@ class DeviceError(RuntimeError):
         self,
         device: str,
         operation: str,
-        *,
         expected: str,
         received: str,
         todo: str,

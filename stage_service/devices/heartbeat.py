@@ -14,7 +14,6 @@ class Fed(Protocol):
 
     def heartbeat(self) -> None:
         """Tell the watchdog that somebody is there."""
-        ...
 
 
 class Heartbeat:

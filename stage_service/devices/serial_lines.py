@@ -88,22 +88,13 @@ class SerialLines:
             if error is None:
                 self.close()  # the true reply may still be on its way
         if error is not None and int(error[1]) == REFUSED_BY_SAFETY:
-            raise SafetyRefusal(
-                self.name,
-                doing,
-                expected=f"an answer to {request!r}",
-                received=f"a refusal: {error[2] or line}",
-                deadline_s=self.config.timeout_s,
-                todo="Close the interlock and release the emergency stop at the stage.",
-            )
-        raise DeviceError(
-            self.name,
-            doing,
-            expected=f"an answer to {request!r} like {reply!r}",
-            received=repr(line),
-            deadline_s=self.config.timeout_s,
-            todo="Check that the device follows docs/wire.md and that nobody else uses the port.",
-        )
+            expected = f"an answer to {request!r}"
+            received = f"a refusal: {error[2] or line}"
+            todo = "Close the interlock and release the emergency stop at the stage."
+            raise SafetyRefusal(self.name, doing, expected, received, todo, self.config.timeout_s)
+        expected = f"an answer to {request!r} like {reply!r}"
+        todo = "Check that the device follows docs/wire.md and that nobody else uses the port."
+        raise DeviceError(self.name, doing, expected, repr(line), todo, self.config.timeout_s)
 
     def _identify(self) -> re.Match[str]:
         # "?" ends what a device may hold of a request that was cut off; the two make no request.
@@ -116,13 +107,10 @@ class SerialLines:
             except DeviceTimeout as error:
                 if not seen:
                     raise
+                expected = f"an identity like {self._identity.pattern!r}"
+                todo = "This is another device: check the ports in the rig file."
                 raise DeviceError(
-                    self.name,
-                    "identifying",
-                    expected=f"an identity like {self._identity.pattern!r}",
-                    received=repr(seen[-1]),
-                    deadline_s=self.config.timeout_s,
-                    todo="This is another device: check the ports in the rig file.",
+                    self.name, "identifying", expected, repr(seen[-1]), todo, self.config.timeout_s
                 ) from error
             match = self._identity.fullmatch(line)
             if match is not None:
@@ -151,25 +139,16 @@ class SerialLines:
             raise self._lost(doing, error) from error
         if not data.endswith(b"\n"):
             self.close()
-            raise DeviceTimeout(
-                self.name,
-                doing,
-                expected="a line",
-                received=repr(data.decode("ascii", "backslashreplace")) if data else "nothing",
-                deadline_s=self.config.timeout_s,
-                todo="Check power and cable; the port is reopened at the next request.",
-            )
+            received = repr(data.decode("ascii", "backslashreplace")) if data else "nothing"
+            todo = "Check power and cable; the port is reopened at the next request."
+            raise DeviceTimeout(self.name, doing, "a line", received, todo, self.config.timeout_s)
         return data.decode("ascii", "backslashreplace").strip("\r\n")
 
     def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
         self.close()
+        todo = "The device was unplugged or its port closed: plug it in and start again."
         return DeviceUnreachable(
-            self.name,
-            doing,
-            expected="an open serial port",
-            received=str(error),
-            deadline_s=self.config.timeout_s,
-            todo="The device was unplugged or its port closed: plug it in and start again.",
+            self.name, doing, "an open serial port", str(error), todo, self.config.timeout_s
         )
 
 

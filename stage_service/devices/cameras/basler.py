@@ -19,12 +19,7 @@ from stage_service.devices.cameras import pixel_formats
 from stage_service.devices.cameras.block_counter import BlockCounter
 from stage_service.devices.cameras.genicam_nodes import Nodes
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
-from stage_service.devices.errors import (
-    Cancelled,
-    DeviceError,
-    DeviceTimeout,
-    DeviceUnreachable,
-)
+from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
 
 SLICE_S = 0.05
 """How long a wait for a frame does not look at `cancel`."""
@@ -93,13 +88,10 @@ class BaslerCamera:
             factory = self._pylon.TlFactory.GetInstance()
             there = {d.GetSerialNumber(): d for d in factory.EnumerateDevices()}
             if self.serial not in there:
-                raise DeviceUnreachable(
-                    self.device,
-                    "connecting",
-                    expected=f"a camera with serial number {self.serial}",
-                    received=", ".join(sorted(there)) or "no camera at all",
-                    todo="Check power, cable and serials in [devices.cameras].",
-                )
+                expected = f"a camera with serial number {self.serial}"
+                received = ", ".join(sorted(there)) or "no camera at all"
+                todo = "Check power, cable and serials in [devices.cameras]."
+                raise DeviceUnreachable(self.device, "connecting", expected, received, todo)
             self._camera = self._pylon.InstantCamera(factory.CreateDevice(there[self.serial]))
             self._camera.Open()
         try:
@@ -136,14 +128,10 @@ class BaslerCamera:
                 round(self.config.timeout_s * 1e3), self._pylon.TimeoutHandling_Return
             )
         if not ready:
-            raise DeviceTimeout(
-                self.device,
-                doing,
-                expected="the camera waiting for a trigger",
-                received="a camera that is busy",
-                deadline_s=self.config.timeout_s,
-                todo="Check that nothing else triggers it, or raise timeout_s.",
-            )
+            expected = "the camera waiting for a trigger"
+            received = "a camera that is busy"
+            todo = "Check that nothing else triggers it, or raise timeout_s."
+            raise DeviceTimeout(self.device, doing, expected, received, todo, self.config.timeout_s)
         self._exposure = actual
 
     def disarm(self) -> None:
@@ -178,12 +166,9 @@ class BaslerCamera:
     def _set_up(self) -> None:
         doing = "setting up"
         if ours := sorted(OURS & self.config.features.keys()):
-            raise self._error(
-                doing,
-                "features that the driver does not set itself",
-                ", ".join(ours),
-                "Take them out of [devices.cameras.features].",
-            )
+            received = ", ".join(ours)
+            todo = "Take them out of [devices.cameras.features]."
+            raise self._error(doing, "features that the driver does not set itself", received, todo)
         with self._told(doing):
             camera, nodes, config = self._open(doing), self._nodes(), self.config
             nodes.write_if_there("UserSetSelector", "Default")
@@ -205,13 +190,12 @@ class BaslerCamera:
             size = (nodes.number("Width"), nodes.number("Height"))
         expected = (self.geometry.width, self.geometry.height)
         if size != expected:
-            raise self._error(
-                doing,
-                f"{expected[0]}x{expected[1]} pixels as in the rig file",
-                f"{size[0]}x{size[1]}",
+            wanted = f"{expected[0]}x{expected[1]} pixels as in the rig file"
+            todo = (
                 "Set OffsetX, OffsetY, Width and Height in [devices.cameras.features], or "
-                "calibrate the rig for this size.",
+                "calibrate the rig for this size."
             )
+            raise self._error(doing, wanted, f"{size[0]}x{size[1]}", todo)
         self.capabilities = replace(self.capabilities, timestamps=self._ticks_per_s > 0)
         full_scale = pixel_formats.full_scale(config.pixel_format)
         self._info = CameraInfo(*expected, full_scale, config.black, config.gain)
@@ -247,22 +231,17 @@ class BaslerCamera:
         if not result.GrabSucceeded():
             return None
         if block_id is None:
-            raise self._error(
-                doing,
-                f"a block id from {self._blocks.first}",
-                f"{result.GetBlockID()}",
-                "The camera does not number its frames: losses would go unseen.",
-            )
+            received = f"{result.GetBlockID()}"
+            todo = "The camera does not number its frames: losses would go unseen."
+            raise self._error(doing, f"a block id from {self._blocks.first}", received, todo)
         info, pixel_format = self.info, self.config.pixel_format
         kind = getattr(self._pylon, f"PixelType_{pixel_format}")
         size = (result.GetWidth(), result.GetHeight())
         if (*size, result.GetPixelType()) != (info.width, info.height, kind):
-            raise self._error(
-                doing,
-                f"{info.width}x{info.height} pixels, type {kind:#x} ({pixel_format})",
-                f"{size[0]}x{size[1]}, type {result.GetPixelType():#x}",
-                "Another program changed the camera's settings: close it and start again.",
-            )
+            expected = f"{info.width}x{info.height} pixels, type {kind:#x} ({pixel_format})"
+            received = f"{size[0]}x{size[1]}, type {result.GetPixelType():#x}"
+            todo = "Another program changed the camera's settings: close it and start again."
+            raise self._error(doing, expected, received, todo)
         chunks = Nodes(self.device, result.GetChunkDataNodeMap(), self._genicam)
         if (told := chunks.number("ChunkExposureTime")) is not None:
             self._check_exposure(told * 1e-6, exposure, doing)
@@ -273,25 +252,16 @@ class BaslerCamera:
 
     def _check_exposure(self, actual: float, asked: float, doing: str) -> None:
         if abs(actual - asked) > EXPOSURE_TOLERANCE * asked:
-            raise self._error(
-                doing,
-                f"an exposure of {asked:g} s",
-                f"{actual:g} s",
-                "The camera cannot expose so: choose an exposure that it has.",
-            )
+            todo = "The camera cannot expose so: choose an exposure that it has."
+            raise self._error(doing, f"an exposure of {asked:g} s", f"{actual:g} s", todo)
 
     def _nodes(self) -> Nodes:
         return Nodes(self.device, self._camera.GetNodeMap(), self._genicam)
 
     def _open(self, doing: str) -> Any:
         if self._camera is None:
-            raise DeviceUnreachable(
-                self.device,
-                doing,
-                expected="an open camera",
-                received="a closed one",
-                todo="Connect again; what the camera held is lost.",
-            )
+            todo = "Connect again; what the camera held is lost."
+            raise DeviceUnreachable(self.device, doing, "an open camera", "a closed one", todo)
         return self._camera
 
     @contextmanager
@@ -302,25 +272,17 @@ class BaslerCamera:
         except self._generic_exception() as error:
             if self._camera is not None and self._camera.IsCameraDeviceRemoved():
                 raise self._gone(doing) from error
-            raise self._error(
-                doing,
-                "pylon to carry it out",
-                str(error),
-                "Check power and cable, and that no other program holds the camera.",
-            ) from error
+            todo = "Check power and cable, and that no other program holds the camera."
+            raise self._error(doing, "pylon to carry it out", str(error), todo) from error
 
     def _generic_exception(self) -> type[Exception] | tuple[()]:
         return () if self._genicam is None else self._genicam.GenericException
 
     def _gone(self, doing: str) -> DeviceUnreachable:
         self.close()
-        return DeviceUnreachable(
-            self.device,
-            doing,
-            expected="the camera",
-            received="a camera that was unplugged or lost power",
-            todo="Check power and cable, and start again.",
-        )
+        received = "a camera that was unplugged or lost power"
+        todo = "Check power and cable, and start again."
+        return DeviceUnreachable(self.device, doing, "the camera", received, todo)
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
         return DeviceError(self.device, doing, expected=expected, received=received, todo=todo)
@@ -334,13 +296,9 @@ def _pypylon(device: str) -> tuple[Any, Any]:
             warnings.simplefilter("ignore")
             from pypylon import genicam, pylon
     except ImportError as error:
-        raise DeviceUnreachable(
-            device,
-            "connecting",
-            expected="the library pypylon",
-            received=str(error),
-            todo="Install it: pip install 'hairstage[basler]'.",
-        ) from error
+        expected = "the library pypylon"
+        todo = "Install it: pip install 'hairstage[basler]'."
+        raise DeviceUnreachable(device, "connecting", expected, str(error), todo) from error
     return pylon, genicam
 
 

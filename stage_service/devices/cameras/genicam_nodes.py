@@ -70,10 +70,4 @@ class Nodes:
         return "a value that the camera accepts"
 
     def _error(self, name: str, value: Value, expected: str, received: str) -> DeviceError:
-        return DeviceError(
-            self.device,
-            f"setting {name} to {value}",
-            expected=expected,
-            received=received,
-            todo=TODO,
-        )
+        return DeviceError(self.device, f"setting {name} to {value}", expected, received, TODO)

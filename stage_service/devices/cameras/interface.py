@@ -77,27 +77,21 @@ class Camera(Protocol):
     @property
     def info(self) -> CameraInfo:
         """What the camera said of itself; known after `connect`."""
-        ...
 
     def connect(self) -> None:
         """Open the link and check that the camera is the rig file's."""
-        ...
 
     def close(self) -> None:
         """Close the link."""
-        ...
 
     def arm(self, exposure: float) -> None:
         """Answer the next pulses with `exposure` seconds; frames not read are dropped."""
-        ...
 
     def disarm(self) -> None:
         """Answer no more pulses."""
-        ...
 
     def read(self, cancel: threading.Event) -> Frame | None:
         """The oldest frame not read, or None when no pulse reached the camera.
 
         Waits while the camera is busy. Raises `Cancelled` when `cancel` is set meanwhile.
         """
-        ...

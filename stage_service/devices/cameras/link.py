@@ -14,12 +14,7 @@ import numpy as np
 from reconstruction import Camera as CameraGeometry
 from stage_service.config import LinkCamerasConfig
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
-from stage_service.devices.errors import (
-    Cancelled,
-    DeviceError,
-    DeviceTimeout,
-    DeviceUnreachable,
-)
+from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
 
 BLOCK_WRAP = 65535
 LONGEST_HEADER = 1 << 20
@@ -57,13 +52,10 @@ class LinkCamera:
                 (self.config.host, self.config.port), timeout=self.config.timeout_s
             )
         except OSError as error:
+            received = str(error)
+            todo = "Check power, network, and host and port in [devices.cameras]."
             raise DeviceUnreachable(
-                self.device,
-                "connecting",
-                expected="a TCP connection",
-                received=str(error),
-                deadline_s=self.config.timeout_s,
-                todo="Check power, network, and host and port in [devices.cameras].",
+                self.device, "connecting", "a TCP connection", received, todo, self.config.timeout_s
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         answer, _ = self._ask({"op": "hello", "camera": self.name}, "saying hello")
@@ -74,19 +66,14 @@ class LinkCamera:
         )
         size = (self.geometry.width, self.geometry.height)
         if (info.width, info.height) != size:
-            raise self._error(
-                "saying hello",
-                f"{size[0]}x{size[1]} pixels as in the rig file",
-                f"{info.width}x{info.height}",
-                "Set the camera's region of interest, or calibrate the rig for this size.",
-            )
+            expected = f"{size[0]}x{size[1]} pixels as in the rig file"
+            todo = "Set the camera's region of interest, or calibrate the rig for this size."
+            raise self._error("saying hello", expected, f"{info.width}x{info.height}", todo)
         if info.gain <= 0 or info.full_scale <= info.black:
-            raise self._error(
-                "saying hello",
-                "gain above 0 and full_scale above black",
-                f"gain {info.gain}, full_scale {info.full_scale}, black {info.black}",
-                "Check the camera's configuration.",
-            )
+            expected = "gain above 0 and full_scale above black"
+            received = f"gain {info.gain}, full_scale {info.full_scale}, black {info.black}"
+            todo = "Check the camera's configuration."
+            raise self._error("saying hello", expected, received, todo)
         self._info = info
 
     def close(self) -> None:
@@ -119,20 +106,12 @@ class LinkCamera:
             if status == "empty":
                 return None
             if status != "busy":
-                raise self._error(
-                    doing,
-                    "the status frame, busy or empty",
-                    repr(status),
-                    "Check that the camera follows docs/wire.md.",
-                )
+                todo = "Check that the camera follows docs/wire.md."
+                raise self._error(doing, "the status frame, busy or empty", repr(status), todo)
             if time.monotonic() > deadline:
+                todo = "Check the camera, or raise busy_s in [devices.cameras]."
                 raise DeviceTimeout(
-                    self.device,
-                    doing,
-                    expected="a frame",
-                    received="busy all the time",
-                    deadline_s=self.config.busy_s,
-                    todo="Check the camera, or raise busy_s in [devices.cameras].",
+                    self.device, doing, "a frame", "busy all the time", todo, self.config.busy_s
                 )
             if cancel.wait(wait):
                 raise Cancelled(f"{self.device}: {doing} was given up")
@@ -142,20 +121,13 @@ class LinkCamera:
         info = self.info
         expected = info.width * info.height * 3 * 2
         if len(payload) != expected:
-            raise self._error(
-                doing,
-                f"{expected} bytes of counts",
-                f"{len(payload)}",
-                "Check the camera's pixel format: RGB, 16 bits, little-endian.",
-            )
+            todo = "Check the camera's pixel format: RGB, 16 bits, little-endian."
+            raise self._error(doing, f"{expected} bytes of counts", f"{len(payload)}", todo)
         exposure = self._number(answer, "exposure", doing)
         if self._armed is None or abs(exposure - self._armed) > 1e-3 * self._armed:
-            raise self._error(
-                doing,
-                f"an exposure of {self._armed} s as armed",
-                f"{exposure} s",
-                "A frame from before arming was in the queue, or the camera cannot expose so.",
-            )
+            received = f"{exposure} s"
+            todo = "A frame from before arming was in the queue, or the camera cannot expose so."
+            raise self._error(doing, f"an exposure of {self._armed} s as armed", received, todo)
         counts = np.frombuffer(payload, "<u2").reshape(info.height, info.width, 3)
         return Frame(
             counts.astype(np.uint16, copy=False),
@@ -168,25 +140,17 @@ class LinkCamera:
     def _number(self, answer: dict[str, Any], field: str, doing: str) -> Any:
         value = answer.get(field)
         if not isinstance(value, int | float) or isinstance(value, bool):
-            raise self._error(
-                doing,
-                f"a number {field!r}",
-                repr(value),
-                "Check that the camera follows docs/wire.md.",
-            )
+            todo = "Check that the camera follows docs/wire.md."
+            raise self._error(doing, f"a number {field!r}", repr(value), todo)
         return value
 
     def _ask(self, request: dict[str, Any], doing: str) -> tuple[dict[str, Any], bytes]:
         """One request, one answer, within `timeout_s`; on trouble the connection is closed."""
         with self._lock:
             if self._socket is None:
-                raise DeviceUnreachable(
-                    self.device,
-                    doing,
-                    expected="an open connection",
-                    received="a closed one",
-                    todo="Connect again; what the camera held is lost.",
-                )
+                received = "a closed one"
+                todo = "Connect again; what the camera held is lost."
+                raise DeviceUnreachable(self.device, doing, "an open connection", received, todo)
             deadline = time.monotonic() + self.config.timeout_s
             try:
                 data = json.dumps(request).encode()
@@ -202,39 +166,25 @@ class LinkCamera:
                 payload = self._receive(length, deadline)
             except TimeoutError as error:
                 self.close()
+                received = "nothing, or not all of it"
+                todo = "Check the camera's power and network."
                 raise DeviceTimeout(
-                    self.device,
-                    doing,
-                    expected="an answer",
-                    received="nothing, or not all of it",
-                    deadline_s=self.config.timeout_s,
-                    todo="Check the camera's power and network.",
+                    self.device, doing, "an answer", received, todo, self.config.timeout_s
                 ) from error
             except (OSError, EOFError) as error:
                 self.close()
+                received = str(error) or "a closed connection"
+                todo = "Check the camera's power and network, and start again."
                 raise DeviceUnreachable(
-                    self.device,
-                    doing,
-                    expected="an answer",
-                    received=str(error) or "a closed connection",
-                    deadline_s=self.config.timeout_s,
-                    todo="Check the camera's power and network, and start again.",
+                    self.device, doing, "an answer", received, todo, self.config.timeout_s
                 ) from error
             except (ValueError, AttributeError) as error:
                 self.close()
-                raise self._error(
-                    doing,
-                    "length-prefixed JSON",
-                    str(error),
-                    "Check the port in [devices.cameras]: this is another device.",
-                ) from error
+                todo = "Check the port in [devices.cameras]: this is another device."
+                raise self._error(doing, "length-prefixed JSON", str(error), todo) from error
         if answer.get("ok") is not True:
-            raise self._error(
-                doing,
-                "ok",
-                f"{answer.get('error', answer)}",
-                "Check that the rig file is this stage's.",
-            )
+            todo = "Check that the rig file is this stage's."
+            raise self._error(doing, "ok", f"{answer.get('error', answer)}", todo)
         return answer, payload
 
     def _receive(self, count: int, deadline: float) -> bytes:

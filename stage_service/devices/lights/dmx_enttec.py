@@ -216,14 +216,11 @@ class DmxLightBank:
 
     def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
         self.close()
+        todo = (
+            "Its lamps may still be lit. Plug the widget in and check the port in [devices.lights]."
+        )
         return DeviceUnreachable(
-            self.name,
-            doing,
-            expected="an open serial port",
-            received=str(error),
-            deadline_s=self.config.timeout_s,
-            todo="Its lamps may still be lit. Plug the widget in and check the port in "
-            "[devices.lights].",
+            self.name, doing, "an open serial port", str(error), todo, self.config.timeout_s
         )
 
 

@@ -45,48 +45,36 @@ class LightBank(Protocol):
     @property
     def count(self) -> int:
         """Number of lamps, as the rig file has it and `connect` has confirmed it."""
-        ...
 
     def connect(self) -> None:
         """Open the link and check that the right device answers."""
-        ...
 
     def close(self) -> None:
         """Close the link; the lamps stay as they are."""
-        ...
 
     def select(self, lamp: int) -> None:
         """Put exactly this lamp on, and confirm that one lamp is lit where the link can."""
-        ...
 
     def all_on(self) -> None:
         """Put every lamp on, and confirm it where the link can."""
-        ...
 
     def off(self) -> None:
         """Put every lamp off and leave a sequence; confirm it where the link can."""
-        ...
 
     def set_level(self, level: float) -> None:
         """Set the level of every lamp, 0 to 1; does nothing where it is set already."""
-        ...
 
     def set_watchdog(self, seconds: float) -> None:
         """Set after how long without a heartbeat the lamps go off."""
-        ...
 
     def heartbeat(self) -> None:
         """Tell the watchdog that somebody is there."""
-        ...
 
     def status(self) -> LightStatus:
         """Read the status back."""
-        ...
 
     def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
         """Upload (what, level) per step, verify and arm it: all dark until the gate opens."""
-        ...
 
     def position(self) -> int:
         """How many steps of the armed sequence are over."""
-        ...

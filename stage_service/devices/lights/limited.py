@@ -186,39 +186,30 @@ class LimitedLightBank:
     def _too_long(self, lamp: int, now: float, doing: str) -> SafetyRefusal:
         limits, on = self._limits, now - self._since.get(lamp, now)
         if on >= limits.max_on_s:
-            return self._error(
-                doing,
-                f"at most {limits.max_on_s:g} s (max_on_s in [safety])",
-                f"lit for {on:.3g} s",
-                "It was put off. Shorten the exposure; a device that answers late keeps it lit.",
-            )
-        return self._error(
-            doing,
+            expected = f"at most {limits.max_on_s:g} s (max_on_s in [safety])"
+            todo = "It was put off. Shorten the exposure; a device that answers late keeps it lit."
+            return self._error(doing, expected, f"lit for {on:.3g} s", todo)
+        expected = (
             f"at most {limits.max_duty * limits.duty_window_s:.3g} s of {limits.duty_window_s:g} s "
-            "(max_duty in [safety])",
-            f"lit for {self._used(lamp, now):.3g} s",
-            "Let the lamp cool, then continue; a lower rate_hz gives it time.",
+            "(max_duty in [safety])"
         )
+        todo = "Let the lamp cool, then continue; a lower rate_hz gives it time."
+        return self._error(doing, expected, f"lit for {self._used(lamp, now):.3g} s", todo)
 
     def _check_lamps(self, lamps: int, doing: str) -> None:
         most = self._limits.max_lamps
         if most is not None and lamps > most:
-            raise self._error(
-                doing,
-                f"at most {most} lamps lit (max_lamps in [safety])",
-                f"{lamps} asked for",
-                "Leave the sentinels out of the plan (sentinels = false).",
-            )
+            expected = f"at most {most} lamps lit (max_lamps in [safety])"
+            todo = "Leave the sentinels out of the plan (sentinels = false)."
+            raise self._error(doing, expected, f"{lamps} asked for", todo)
 
     def _check_power(self, lamps: int, level: float, doing: str) -> None:
         most, power = self._limits.max_power_w, lamps * level * self._limits.lamp_power_w
         if most is not None and power > most:
-            raise self._error(
-                doing,
-                f"at most {most:g} W (max_power_w in [safety])",
-                f"{lamps} lamps at level {level:g}, {power:.4g} W",
-                "Lower the level in the plan.",
-            )
+            expected = f"at most {most:g} W (max_power_w in [safety])"
+            received = f"{lamps} lamps at level {level:g}, {power:.4g} W"
+            todo = "Lower the level in the plan."
+            raise self._error(doing, expected, received, todo)
 
     def _raise_refusal(self) -> None:
         if self._refusal is not None:

@@ -30,21 +30,12 @@ def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool
 def refuse_lost_level(name: str, doing: str, level: float, steps: int) -> None:
     """Raise `DeviceError` for a level above 0 that a bank of `steps` levels above 0 makes 0."""
     if level > 0 and round(level * steps) == 0:
-        raise DeviceError(
-            name,
-            doing,
-            expected=f"0, or more than {0.5 / steps:.3g}: it has {steps} levels above 0",
-            received=f"{level:g}",
-            todo="Use a shorter exposure at a higher level.",
-        )
+        expected = f"0, or more than {0.5 / steps:.3g}: it has {steps} levels above 0"
+        todo = "Use a shorter exposure at a higher level."
+        raise DeviceError(name, doing, expected, f"{level:g}", todo)
 
 
 def cannot(name: str, doing: str, lacks: str) -> DeviceError:
     """The error of a call that the capabilities exclude."""
-    return DeviceError(
-        name,
-        doing,
-        expected=lacks,
-        received="a light bank without",
-        todo="Ask its capabilities first; [devices.lights] describes the bank.",
-    )
+    todo = "Ask its capabilities first; [devices.lights] describes the bank."
+    return DeviceError(name, doing, lacks, "a light bank without", todo)

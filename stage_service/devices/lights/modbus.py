@@ -10,13 +10,13 @@ from pymodbus import ModbusException
 
 from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
+from stage_service.devices.lights import modbus_answers
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
 from stage_service.devices.lights.limits import (
     cannot,
     refuse_lost_level,
     refuse_unverified_blackout,
 )
-from stage_service.devices.lights.modbus_answers import CODES, expected, received, unusable
 from stage_service.devices.lights.modbus_links import ModbusLink, open_link
 
 ALL_ON, ALL_OFF = 65535, 0
@@ -166,12 +166,10 @@ class ModbusLightBank:
                 got = self._read("read_holding_registers", table + start, len(wanted), doing)
                 if got != wanted:
                     at = next(i for i, (a, b) in enumerate(zip(wanted, got, strict=True)) if a != b)
-                    raise self._error(
-                        f"{doing}: reading the table back",
-                        f"{wanted[at]} at register {table + start + at}",
-                        f"{got[at]}",
-                        "Load it again; if it stays, the bank's table or its map is wrong.",
-                    )
+                    expected = f"{wanted[at]} at register {table + start + at}"
+                    received = f"{got[at]}"
+                    todo = "Load it again; if it stays, the bank's table or its map is wrong."
+                    raise self._error(f"{doing}: reading the table back", expected, received, todo)
             self._armed = None
             self._write([len(entries)], sequence, f"{doing}: arming it")
             self._armed = len(entries)
@@ -183,12 +181,8 @@ class ModbusLightBank:
         doing = "reading the position in the sequence"
         position = self._input(self._required(self._map.position, doing, "a position"), doing)
         if self._armed is not None and position > self._armed:
-            raise self._error(
-                doing,
-                f"at most {self._armed} steps, as armed",
-                f"{position}",
-                "The gate closed more often than the sequence has steps: check the gate's wire.",
-            )
+            todo = "The gate closed more often than the sequence has steps: check the gate's wire."
+            raise self._error(doing, f"at most {self._armed} steps, as armed", f"{position}", todo)
         return position
 
     def _entry(self, what: Lit, level: float) -> tuple[int, int]:
@@ -237,14 +231,13 @@ class ModbusLightBank:
             )
             if seen
         ]
-        raise self._error(
-            doing,
-            f"{lit} lamps lit",
-            f"{status.lit} lit" + "".join(f", {c}" for c in causes),
+        received = f"{status.lit} lit" + "".join(f", {c}" for c in causes)
+        todo = (
             "Clear the cause at the stage."
             if causes
-            else "Check the lamp drivers' supply, and that nobody else writes to the bank.",
+            else "Check the lamp drivers' supply, and that nobody else writes to the bank."
         )
+        raise self._error(doing, f"{lit} lamps lit", received, todo)
 
     def _write(self, values: list[int], first: int, doing: str) -> None:
         """Write registers from `first` on, in chunks."""
@@ -298,21 +291,15 @@ class ModbusLightBank:
             address, wanted = r.signature
             got = self._exchange(doing, "read_input_registers", address, 1).registers[0]
             if got != wanted:
-                raise self._error(
-                    doing,
-                    f"input register {address} to be {wanted:#06x}",
-                    f"{got:#06x}",
-                    "Check port and unit in [devices.lights]: this is another device.",
-                )
+                expected = f"input register {address} to be {wanted:#06x}"
+                todo = "Check port and unit in [devices.lights]: this is another device."
+                raise self._error(doing, expected, f"{got:#06x}", todo)
         if r.count is not None:
             lamps = self._exchange(doing, "read_input_registers", r.count, 1).registers[0]
             if lamps != self._lamps:
-                raise self._error(
-                    doing,
-                    f"{self._lamps} lamps as in the rig file",
-                    f"{lamps}",
-                    "Use the rig file of this stage.",
-                )
+                received = f"{lamps}"
+                todo = "Use the rig file of this stage."
+                raise self._error(doing, f"{self._lamps} lamps as in the rig file", received, todo)
         if r.sequence is not None:
             answer = self._exchange(doing, "read_holding_registers", r.sequence, 1)
             self._armed = answer.registers[0]
@@ -328,60 +315,42 @@ class ModbusLightBank:
                 self._out_of_step = False
         except OSError as error:
             self.close()
+            todo = "Check power, cable, and the address in [devices.lights]."
             raise DeviceUnreachable(
-                self.name,
-                doing,
-                expected="a connection",
-                received=f"none ({error})",
-                deadline_s=self.config.timeout_s,
-                todo="Check power, cable, and the address in [devices.lights].",
+                self.name, doing, "a connection", f"none ({error})", todo, self.config.timeout_s
             ) from error
 
     def _exchange(self, doing: str, method: str, address: int, payload: Any) -> Any:
         """One request: `payload` is the count of a read, else the value or values to write."""
         link: Any = self._link
-        count = payload if method.startswith("read") else None
+        more = {"count": payload} if method.startswith("read") else {}
+        values = () if more else (payload,)
         try:
-            ask = getattr(link, method)
-            more = {"device_id": self.config.unit}
-            answer = (
-                ask(address, payload, **more)
-                if count is None
-                else ask(address, count=count, **more)
-            )
+            answer = getattr(link, method)(address, *values, device_id=self.config.unit, **more)
         except (ModbusException, OSError) as error:
             self.close()
             lost = isinstance(error, OSError)
-            raise (DeviceUnreachable if lost else DeviceTimeout)(
-                self.name,
-                doing,
-                expected="an answer",
-                received=f"none ({error})" if lost else unusable(link.received),
-                deadline_s=self.config.timeout_s,
-                todo="Check power and cable of the bank; its watchdog puts the lamps off."
-                if self.capabilities.dead_man
-                else "Check power and cable of the bank; its lamps may still be lit.",
-            ) from error
-        wanted, got = expected(method, address, payload), received(answer)
-        if answer.function_code == CODES[method] | 0x80:
+            kind = DeviceUnreachable if lost else DeviceTimeout
+            got = f"none ({error})" if lost else modbus_answers.unusable(link.received)
+            dark = self.capabilities.dead_man
+            left = "its watchdog puts the lamps off" if dark else "its lamps may still be lit"
+            todo = f"Check power and cable of the bank; {left}."
+            raise kind(self.name, doing, "an answer", got, todo, self.config.timeout_s) from error
+        wanted = modbus_answers.expected(method, address, payload)
+        got = modbus_answers.received(answer)
+        if answer.function_code == modbus_answers.CODES[method] | 0x80:
             code = answer.exception_code
-            raise self._error(
-                doing,
-                "an answer",
-                f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'see its manual')})",
-                "Check the registers in [devices.lights]; 4 also says that a sequence is armed.",
-            )
+            received = f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'see its manual')})"
+            todo = "Check the registers in [devices.lights]; 4 also says that a sequence is armed."
+            raise self._error(doing, "an answer", received, todo)
         if got != wanted:
             self.close()
             self._out_of_step = True
-            raise _OutOfStep(
-                self.name,
-                doing,
-                expected=f"the answer {wanted}",
-                received=f"{got}",
-                todo="Answers were out of step; the next request opens the link anew. If it "
-                "happens again, look for a second master.",
+            todo = (
+                "Answers were out of step; the next request opens the link anew. If it "
+                "happens again, look for a second master."
             )
+            raise _OutOfStep(self.name, doing, f"the answer {wanted}", f"{got}", todo)
         return answer
 
     def _required(self, address: int | None, doing: str, what: str) -> int:

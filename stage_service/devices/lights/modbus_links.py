@@ -26,15 +26,12 @@ class ModbusLink(Protocol):
 
     def connect(self) -> bool:
         """Open; raises `OSError`."""
-        ...
 
     def close(self) -> None:
         """Close."""
-        ...
 
     def drain(self, quiet_s: float) -> None:
         """Drop what comes until nothing has come for `quiet_s`; raises `OSError`."""
-        ...
 
 
 def open_link(config: ModbusTcpConfig | ModbusRtuConfig) -> ModbusLink:

@@ -98,31 +98,20 @@ class PjLinkProjector:
                 link.sendall(f"{digest}%1{command}\r".encode("ascii"))
                 line = _line(link, deadline)
         except _Incomplete as cut:
+            received = f"{cut}, and the connection was closed"
+            todo = "The projector takes few connections at once: see who else uses it."
             raise DeviceUnreachable(
-                self.name,
-                doing,
-                expected="an answer that ends in CR",
-                received=f"{cut}, and the connection was closed",
-                deadline_s=self.timeout_s,
-                todo="The projector takes few connections at once: see who else uses it.",
+                self.name, doing, "an answer that ends in CR", received, todo, self.timeout_s
             ) from cut
         except TimeoutError as error:
+            todo = "Check the projector's network standby setting, cable and address."
             raise DeviceTimeout(
-                self.name,
-                doing,
-                expected="an answer",
-                received=str(error),
-                deadline_s=self.timeout_s,
-                todo="Check the projector's network standby setting, cable and address.",
+                self.name, doing, "an answer", str(error), todo, self.timeout_s
             ) from error
         except OSError as error:
+            todo = "Check address, network and that PJLink is enabled in the projector."
             raise DeviceUnreachable(
-                self.name,
-                doing,
-                expected="a connection",
-                received=str(error),
-                deadline_s=self.timeout_s,
-                todo="Check address, network and that PJLink is enabled in the projector.",
+                self.name, doing, "a connection", str(error), todo, self.timeout_s
             ) from error
         if re.fullmatch("PJLINK ERRA", line, re.IGNORECASE):
             self._not_authenticated("ERRA: the password is wrong", doing)
@@ -136,14 +125,8 @@ class PjLinkProjector:
             else (repr(line), "Check that this is a PJLink port and nothing stands in between.")
         )
         kind = ProjectorBusy if error_match and error_match[1] == "3" else DeviceError
-        raise kind(
-            self.name,
-            doing,
-            expected=f"an answer like %1{command[:4]}={answer}",
-            received=received,
-            deadline_s=self.timeout_s,
-            todo=todo,
-        )
+        expected = f"an answer like %1{command[:4]}={answer}"
+        raise kind(self.name, doing, expected, received, todo, self.timeout_s)
 
     def _digest(self, greeting: str, doing: str) -> str:
         """What goes in front of the first command: nothing, or the MD5 digest."""
@@ -151,14 +134,9 @@ class PjLinkProjector:
         if match is None:
             if re.fullmatch("PJLINK ERRA", greeting, re.IGNORECASE):
                 self._not_authenticated("ERRA", doing)
-            raise DeviceError(
-                self.name,
-                doing,
-                expected="a greeting like PJLINK 0 or PJLINK 1 and 8 hexadecimal digits",
-                received=repr(greeting),
-                deadline_s=self.timeout_s,
-                todo="This is another service: check host and port.",
-            )
+            expected = "a greeting like PJLINK 0 or PJLINK 1 and 8 hexadecimal digits"
+            todo = "This is another service: check host and port."
+            raise DeviceError(self.name, doing, expected, repr(greeting), todo, self.timeout_s)
         if match[1] is None:
             return ""
         password = self._password(doing)
@@ -174,23 +152,13 @@ class PjLinkProjector:
         try:
             return self.password.read_text().strip()
         except (OSError, ValueError) as error:
-            raise DeviceError(
-                self.name,
-                doing,
-                expected="the file with its password",
-                received=str(error),
-                todo="Put the password there, or correct password_file in the rig file.",
-            ) from error
+            expected = "the file with its password"
+            todo = "Put the password there, or correct password_file in the rig file."
+            raise DeviceError(self.name, doing, expected, str(error), todo) from error
 
     def _not_authenticated(self, received: str, doing: str) -> NoReturn:
-        raise DeviceError(
-            self.name,
-            doing,
-            expected="the right password",
-            received=received,
-            deadline_s=self.timeout_s,
-            todo="Set the projector's PJLink password where the rig file says.",
-        )
+        todo = "Set the projector's PJLink password where the rig file says."
+        raise DeviceError(self.name, doing, "the right password", received, todo, self.timeout_s)
 
 
 class _Incomplete(Exception):

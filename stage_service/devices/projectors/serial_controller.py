@@ -38,13 +38,10 @@ class SerialProjectorController:
         self._names = tuple(n for n in identity[2].split(",") if n)
         absent = [n for n in self._expected if n not in self._names]
         if absent:
-            raise DeviceError(
-                self.name,
-                "identifying",
-                expected=f"the projectors {', '.join(self._expected)}",
-                received=", ".join(self._names) or "none",
-                todo="Use the rig file of this stage.",
-            )
+            expected = f"the projectors {', '.join(self._expected)}"
+            received = ", ".join(self._names) or "none"
+            todo = "Use the rig file of this stage."
+            raise DeviceError(self.name, "identifying", expected, received, todo)
 
     def close(self) -> None:
         """Close the port; the projectors stay as they are."""
@@ -73,13 +70,10 @@ class SerialProjectorController:
         the controller armed."""
         entries = [_text(run) for run in _runs(patterns)]
         if not 1 <= len(entries) <= self.capabilities.table:
-            raise DeviceError(
-                self.name,
-                "uploading a sequence",
-                expected=f"1 to {self.capabilities.table} entries, which the controller holds",
-                received=f"{len(entries)} entries",
-                todo="Shoot in shorter runs, or step by software.",
-            )
+            expected = f"1 to {self.capabilities.table} entries, which the controller holds"
+            received = f"{len(entries)} entries"
+            todo = "Shoot in shorter runs, or step by software."
+            raise DeviceError(self.name, "uploading a sequence", expected, received, todo)
         count = len(entries)
         self._lines.ask(f"SEQ {count}", f"OK SEQ {count}", "beginning a sequence")
         for i, entry in enumerate(entries):
@@ -94,15 +88,13 @@ class SerialProjectorController:
         match = self._lines.ask("SEQ?", r"SEQ (armed|idle|watchdog) (\d+)", doing)
         if match[1] != "armed":
             tripped = match[1] == "watchdog"
-            raise DeviceError(
-                self.name,
-                doing,
-                expected="an armed sequence",
-                received=f"{match[1]}, after {match[2]} patterns",
-                todo="It got no request for the watchdog time and put the projectors dark."
+            received = f"{match[1]}, after {match[2]} patterns"
+            todo = (
+                "It got no request for the watchdog time and put the projectors dark."
                 if tripped
-                else "Load the sequence first; line, all_on and off leave it.",
+                else "Load the sequence first; line, all_on and off leave it."
             )
+            raise DeviceError(self.name, doing, "an armed sequence", received, todo)
         return int(match[2])
 
     def set_watchdog(self, seconds: float) -> None:

@@ -58,49 +58,38 @@ class TriggerBox(Protocol):
     @property
     def table_rows(self) -> int:
         """Rows of its table, 0 where it has none; known after `connect`."""
-        ...
 
     def connect(self) -> None:
         """Open the link and check that the right device answers."""
-        ...
 
     def close(self) -> None:
         """Close the link."""
-        ...
 
     def pulse(self, exposure_s: float) -> int:
         """Fire once; returns the count, this pulse included. Never repeated on its own: a pulse
         whose answer is lost may have fired."""
-        ...
 
     def count(self) -> int:
         """Pulses since `reset` or power-up."""
-        ...
 
     def reset(self) -> None:
         """Set the count to 0."""
-        ...
 
     def status(self) -> TriggerStatus:
         """Read the safety inputs."""
-        ...
 
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
         """Upload a table, verify its checksum, and arm it; it stops by itself when nobody asks
         for `watchdog_s` seconds. Raises `ValueError` for times out of range; `DeviceError` where
         the box has no table, or too short a one. Neighbours alike share a row of the table."""
-        ...
 
     def go(self) -> None:
         """Run the armed table from its first step. Never repeated on its own: the table of a lost
         answer may run; `stop` ends it."""
-        ...
 
     def progress(self) -> TableProgress:
         """Where the table is; feeds the box's watchdog."""
-        ...
 
     def stop(self) -> int:
         """Close the gates at once and leave the table; returns the steps that were done. May be
         repeated."""
-        ...

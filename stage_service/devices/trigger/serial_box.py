@@ -69,21 +69,14 @@ class SerialTriggerBox:
         """Upload, compare checksum and number of steps with our own, and leave the box armed."""
         texts = [self._text(row) for row in _joined(rows)]
         if self._table_rows == 0:
-            raise DeviceError(
-                self.name,
-                "uploading a table",
-                expected="a box that runs tables",
-                received="one without (version 1, or 0 rows)",
-                todo="Set hardware_stepping = false in [devices], or update the box's firmware.",
-            )
+            expected = "a box that runs tables"
+            received = "one without (version 1, or 0 rows)"
+            todo = "Set hardware_stepping = false in [devices], or update the box's firmware."
+            raise DeviceError(self.name, "uploading a table", expected, received, todo)
         if not 1 <= len(texts) <= self._table_rows:
-            raise DeviceError(
-                self.name,
-                "uploading a table",
-                expected=f"1 to {self._table_rows} rows, which the box holds",
-                received=f"{len(texts)} rows",
-                todo="Shoot in shorter runs, or step by software.",
-            )
+            expected = f"1 to {self._table_rows} rows, which the box holds"
+            todo = "Shoot in shorter runs, or step by software."
+            raise DeviceError(self.name, "uploading a table", expected, f"{len(texts)} rows", todo)
         watchdog = f"WATCHDOG {milliseconds(self.name, watchdog_s)}"
         self._lines.ask(watchdog, f"OK {watchdog}", "setting the watchdog")
         self._lines.ask(f"TABLE {len(texts)}", f"OK TABLE {len(texts)}", "beginning a table")
