@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from stage_service.cli.support import FAILED, CommandError, Commands, Output
+from stage_service.cli.support.commands import FAILED, CommandError, Commands, Output
 
 BENCHMARKS = {
     "acquisition": "steps and bytes a second beside what wires and disk allow",

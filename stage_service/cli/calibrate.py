@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     BadArgument,
     Commands,
     Output,
@@ -20,16 +20,7 @@ from stage_service.cli.support import (
 def add(commands: Commands) -> None:
     """Add the commands."""
     group = add_group(commands, "calibrate", "calibrate a stage")
-    rig = add_command(
-        group,
-        "rig",
-        run_rig,
-        "a rig file from captures of a board and of spheres",
-        "Calibrate cameras (and, where the captures hold sweeps, projectors) from captures of a "
-        "ChArUco board, one a pose, and lights from captures of a mirror or diffuse sphere, one a "
-        "place. Writes a rig file with the nominal one's device tables, and beside it "
-        "NAME.report.json: what is known how well, and what no capture determined.",
-    )
+    rig = add_command(group, "rig", run_rig)
     rig.add_argument("boards", type=Path, nargs="+", metavar="CAPTURE", help="board, one a pose")
     rig.add_argument("--rig", type=Path, help="the nominal rig file (default: the first capture's)")
     rig.add_argument("--out", type=Path, required=True, help="rig file to write (.json)")
@@ -45,7 +36,7 @@ def add(commands: Commands) -> None:
     rig.add_argument("--truth", type=Path, help="a rig file to compare with")
     _board_options(rig)
 
-    board = add_command(group, "board", run_board, "the board as a picture to print")
+    board = add_command(group, "board", run_board)
     board.add_argument("out", type=Path, help=".png")
     board.add_argument("--dpi", type=float, default=300.0)
     _board_options(board)
@@ -66,8 +57,14 @@ def _board(args: argparse.Namespace) -> Any:
     return Board(args.columns, args.rows, square, marker, args.dictionary)
 
 
-def run_rig(args: argparse.Namespace, output: Output) -> int:
-    """Calibrate a stage."""
+def run_rig(args: argparse.Namespace, output: Output) -> None:
+    """A rig file from captures of a board and of spheres.
+
+    Calibrate cameras (and, where the captures hold sweeps, projectors) from captures of a ChArUco
+    board, one a pose, and lights from captures of a mirror or diffuse sphere, one a place. Writes a
+    rig file with the nominal one's device tables, and beside it NAME.report.json: what is known how
+    well, and what no capture determined.
+    """
     from reconstruction import Capture, Rig
     from reconstruction.calibration.rig_comparison import compare_rigs
     from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
@@ -117,11 +114,10 @@ def run_rig(args: argparse.Namespace, output: Output) -> int:
     if args.truth is not None:
         data["errors"] = compare_rigs(rig, Rig.load(args.truth))
     output.result(data)
-    return 0
 
 
-def run_board(args: argparse.Namespace, output: Output) -> int:
-    """Draw the board."""
+def run_board(args: argparse.Namespace, output: Output) -> None:
+    """The board as a picture to print."""
     import cv2
 
     board = _board(args)
@@ -136,4 +132,3 @@ def run_board(args: argparse.Namespace, output: Output) -> int:
         f"{args.out}: print it {width:g} mm wide and {height:g} mm high, measure a square, and "
         "mount it flat with white around it",
     )
-    return 0

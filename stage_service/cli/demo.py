@@ -10,7 +10,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.support import (
+from stage_service.cli.stage.processes import add_subject, exit_on_sigterm
+from stage_service.cli.support.commands import (
     FAILED,
     BadArgument,
     CommandError,
@@ -19,7 +20,6 @@ from stage_service.cli.support import (
     add_command,
     progress_bar,
 )
-from stage_service.cli.support.processes import add_subject, exit_on_sigterm
 
 if TYPE_CHECKING:
     from reconstruction import Rig
@@ -35,15 +35,7 @@ FILES = ("strands.npz", "strands.hair", "strands.usdc", "appearance.json", "repo
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    demo = add_command(
-        commands,
-        "demo",
-        run_demo,
-        "capture, reconstruct, fit and relight a simulated subject",
-        "Start a simulated rig, the service and a worker; make one capture through the REST API, "
-        "follow its job, which judges the result against the truth, and print the figures. "
-        "Everything is left in OUT; an earlier demo's results there are replaced.",
-    )
+    demo = add_command(commands, "demo", run_demo)
     add_subject(demo)
     demo.add_argument(
         "--out", type=Path, default=Path("runs/demo"), help="folder, made where there is none"
@@ -52,8 +44,13 @@ def add(commands: Commands) -> None:
     demo.add_argument("--hold-out-camera", metavar="CAMERA", help="default: the rig's last camera")
 
 
-def run_demo(args: argparse.Namespace, output: Output) -> int:
-    """Run the demo."""
+def run_demo(args: argparse.Namespace, output: Output) -> None:
+    """Capture, reconstruct, fit and relight a simulated subject.
+
+    Start a simulated rig, the service and a worker; make one capture through the REST API, follow
+    its job, which judges the result against the truth, and print the figures. Everything is left in
+    OUT; an earlier demo's results there are replaced.
+    """
     from reconstruction import Rig
     from reconstruction.array_backend import chosen_variant
     from stage_service.cli.support.children import Children
@@ -105,7 +102,6 @@ def run_demo(args: argparse.Namespace, output: Output) -> int:
     }
     (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
     output.result(results, figures_table(results, out))
-    return 0
 
 
 def _capture(

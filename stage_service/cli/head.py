@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     BadArgument,
     Commands,
     Output,
@@ -17,36 +17,26 @@ from stage_service.cli.support import (
 def add(commands: Commands) -> None:
     """Add the commands."""
     group = add_group(commands, "head", "heads for captures that have none")
-    fit = add_command(
-        group,
-        "fit",
-        run_fit,
-        "lay a head mesh under points of a head or of its scalp",
-        "Fit the generic head, or the user's, to points (.obj, .ply, .csv, .npy; metres, z up) and "
-        "write it with its scalp marked: put it into a capture as head.obj.",
-    )
+    fit = add_command(group, "fit", run_fit)
     fit.add_argument("points", type=Path)
     fit.add_argument("--part", choices=["head", "scalp"], default="scalp", help="what they lie on")
     fit.add_argument("--mesh", type=Path, help="the head to lay there (default: the generic one)")
     fit.add_argument("--turn-deg", type=float, help="of the head about z, where known; 0 faces −y")
     fit.add_argument("--out", type=Path, required=True, help=".obj")
 
-    mark = add_command(
-        group,
-        "mark",
-        run_mark,
-        "a user's head mesh as a template: upright, in metres, its scalp marked",
-        "Cut and turn a head or body of any unit, mark the generic head's scalp on it, and write "
-        "it in the generic head's frame, for 'head fit --mesh' or the option head_mesh.",
-    )
+    mark = add_command(group, "mark", run_mark)
     mark.add_argument("mesh", type=Path, help=".obj")
     mark.add_argument("--up", choices=["y", "z"], default="z", help="the mesh's upward axis")
     mark.add_argument("--above", type=float, help="cut off what is lower, in the mesh's unit")
     mark.add_argument("--out", type=Path, required=True, help=".obj")
 
 
-def run_fit(args: argparse.Namespace, output: Output) -> int:
-    """Fit a head."""
+def run_fit(args: argparse.Namespace, output: Output) -> None:
+    """Lay a head mesh under points of a head or of its scalp.
+
+    Fit the generic head, or the user's, to points (.obj, .ply, .csv, .npy; metres, z up) and write
+    it with its scalp marked: put it into a capture as head.obj.
+    """
     import numpy as np
 
     from reconstruction import read_obj, write_obj
@@ -75,11 +65,14 @@ def run_fit(args: argparse.Namespace, output: Output) -> int:
         },
         "\n".join(lines),
     )
-    return 0
 
 
-def run_mark(args: argparse.Namespace, output: Output) -> int:
-    """Make a template."""
+def run_mark(args: argparse.Namespace, output: Output) -> None:
+    """A user's head mesh as a template: upright, in metres, its scalp marked.
+
+    Cut and turn a head or body of any unit, mark the generic head's scalp on it, and write it in
+    the generic head's frame, for 'head fit --mesh' or the option head_mesh.
+    """
     from reconstruction import read_obj, write_obj
     from reconstruction.head.template import template
 
@@ -92,7 +85,6 @@ def run_mark(args: argparse.Namespace, output: Output) -> int:
     if fit is not None:
         data |= {"unit_m": 1 / fit.pose.scale, "fit": fit.figures(), "warnings": list(fit.warnings)}
     output.result(data, f"{args.out}: {scalp:.0f} cm² of scalp on {len(mesh.faces)} faces")
-    return 0
 
 
 def _require_obj(path: Path) -> None:

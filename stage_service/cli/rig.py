@@ -5,27 +5,24 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from stage_service.cli.support import Commands, Output, add_command, add_group, rig_path
+from stage_service.cli.support.commands import Commands, Output, add_command, add_group, rig_path
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     group = add_group(commands, "rig", "look at rig files")
-    check = add_command(
-        group,
-        "check",
-        run_check,
-        "check a rig file and report the angles between camera rays and planes of light",
-        "Read a rig file, count what it holds, cost its full capture, and report for each camera "
-        "and projector the angle between camera rays and planes of light on a head-sized sphere: "
-        "near 0 the depth is worthless.",
-    )
+    check = add_command(group, "check", run_check)
     check.add_argument("file", type=rig_path, help="rig file (.toml or .json)")
     check.add_argument("--radius", type=float, default=0.12, help="of the sphere, metres")
 
 
-def run_check(args: argparse.Namespace, output: Output) -> int:
-    """Check a rig file."""
+def run_check(args: argparse.Namespace, output: Output) -> None:
+    """Check a rig file and report the angles between camera rays and planes of light.
+
+    Read a rig file, count what it holds, cost its full capture, and report for each camera and
+    projector the angle between camera rays and planes of light on a head-sized sphere: near 0 the
+    depth is worthless.
+    """
     from reconstruction.light_planes.plane_conditioning import condition
     from stage_service.config import load_rig_file
     from stage_service.plan.capture_plan import CapturePlan
@@ -59,7 +56,6 @@ def run_check(args: argparse.Namespace, output: Output) -> int:
             f"no light beside {sorted(alone)}: visibility is less certain there"
         )
     output.result(data, _table(data))
-    return 0
 
 
 def _table(data: dict[str, Any]) -> Any:

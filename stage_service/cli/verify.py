@@ -5,33 +5,24 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from stage_service.cli.support import FAILED, Commands, Output, add_command, progress_bar
+from stage_service.cli.support.commands import FAILED, Commands, Output, add_command, progress_bar
 
 
 def add(commands: Commands) -> None:
     """Add the commands."""
-    verify = add_command(
-        commands,
-        "verify",
-        run_verify,
-        "re-read a whole capture and list what is wrong with it",
-        "Re-read every file of a capture against its checksum; exit code 1 when anything is wrong.",
-    )
+    verify = add_command(commands, "verify", run_verify)
     verify.add_argument("capture", type=Path, help="the capture folder")
 
-    imported = add_command(
-        commands,
-        "import",
-        run_import,
-        "turn a folder made elsewhere into a capture",
-        "Read cameras.json, lights.json, images/<camera>/<light>.exr and masks/<camera>.png.",
-    )
+    imported = add_command(commands, "import", run_import)
     imported.add_argument("folder", type=Path)
     imported.add_argument("--out", type=Path, required=True, help="new capture folder")
 
 
 def run_verify(args: argparse.Namespace, output: Output) -> int:
-    """Verify a capture."""
+    """Re-read a whole capture and list what is wrong with it.
+
+    Re-read every file of a capture against its checksum; exit code 1 when anything is wrong.
+    """
     from reconstruction import verify
 
     with progress_bar("verify") as progress:
@@ -41,8 +32,11 @@ def run_verify(args: argparse.Namespace, output: Output) -> int:
     return FAILED if problems else 0
 
 
-def run_import(args: argparse.Namespace, output: Output) -> int:
-    """Import a folder."""
+def run_import(args: argparse.Namespace, output: Output) -> None:
+    """Turn a folder made elsewhere into a capture.
+
+    Read cameras.json, lights.json, images/<camera>/<light>.exr and masks/<camera>.png.
+    """
     from reconstruction import import_folder
 
     with progress_bar("import") as progress:
@@ -54,4 +48,3 @@ def run_import(args: argparse.Namespace, output: Output) -> int:
     }
     text = f"{args.out}: " + ", ".join(f"{n} {what}" for what, n in counts.items())
     output.result({"capture": str(args.out), **counts}, text)
-    return 0

@@ -8,7 +8,7 @@ from importlib import import_module
 
 from benchmarks.command import Benchmark, LeftOut
 from stage_service.cli.bench import BENCHMARKS
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     FAILED,
     CommandError,
     Output,

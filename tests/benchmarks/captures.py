@@ -12,9 +12,9 @@ from typing import Any
 
 from reconstruction import Progress, silent
 from reconstruction.capture.compression import compress
-from stage_service.cli.support import FAILED, CommandError
 from stage_service.cli.support.children import Children, SimulatedRig, own_command
 from stage_service.cli.support.client import ServiceClient
+from stage_service.cli.support.commands import FAILED, CommandError
 
 VERSION = 1
 """Of the frames: another number makes kept captures stale."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction import Progress
-from stage_service.cli.support import rig_path
+from stage_service.cli.support.commands import rig_path
 
 DATA = "HAIRSTAGE_DATA"
 """The environment variable that names the folder of subjects which others made."""

@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull
 from appearance import HairAppearance, HairScene, build_scene
 from reconstruction import Mesh, Strands, read_obj, read_strands
 from reconstruction.tangents.line_evidence import half_sphere
-from stage_service.cli.support import FAILED, CommandError
 from stage_service.cli.support.children import SimulatedRig
+from stage_service.cli.support.commands import FAILED, CommandError
 
 
 @dataclass(frozen=True)

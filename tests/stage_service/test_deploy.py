@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from stage_service.cli import build_parser
-from stage_service.cli.support import rig_path
+from stage_service.cli.support.commands import rig_path
 from stage_service.config import load_rig_file
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.support import BadArgument, Commands, Output, add_command
+from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
 
 if TYPE_CHECKING:
     from appearance import FittedModel
@@ -22,14 +22,7 @@ DYED_LAYERS = 8
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    edit = add_command(
-        commands,
-        "edit",
-        run,
-        "a fitted model in other colours, rougher, shorter, or with other strands",
-        "Write the edited MODEL as a new model folder, which render and export take. Several edits "
-        "are made in this order: strands, cut, colour, roughness.",
-    )
+    edit = add_command(commands, "edit", run)
     edit.add_argument("model", type=Path, help="fitted model folder")
     edit.add_argument("--out", type=Path, required=True, help="the new model folder")
     edit.add_argument("--capture", type=Path, help="the capture that gives the head")
@@ -67,8 +60,12 @@ def add(commands: Commands) -> None:
     edit.add_argument("--roughen", type=float, metavar="FACTOR", help="times the roughness beta_m")
 
 
-def run(args: argparse.Namespace, output: Output) -> int:
-    """Edit a model."""
+def run(args: argparse.Namespace, output: Output) -> None:
+    """A fitted model in other colours, rougher, shorter, or with other strands.
+
+    Write the edited MODEL as a new model folder, which render and export take. Several edits are
+    made in this order: strands, cut, colour, roughness.
+    """
     from appearance import FittedModel
     from appearance.model.edit import cut, restyled, roughened
     from reconstruction import Capture, Model, read_strands
@@ -100,7 +97,6 @@ def run(args: argparse.Namespace, output: Output) -> int:
     data: dict[str, Any] = {"model": str(model), "strands": len(fitted.strands)}
     data["edits"] = {k: str(v) if isinstance(v, Path) else v for k, v in edits.items()}
     output.result(data, f"{model}: {', '.join(edits)}; see it with 'hairstage render {model}'")
-    return 0
 
 
 def _coloured(fitted: FittedModel, args: argparse.Namespace) -> HairMaps:

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     BadArgument,
     Commands,
     Output,
@@ -19,16 +19,7 @@ from stage_service.cli.support import (
 def add(commands: Commands) -> None:
     """Add the commands."""
     group = add_group(commands, "evaluate", "compare results with the truth")
-    geometry = add_command(
-        group,
-        "geometry",
-        run_geometry,
-        "precision, recall and F of strands against true ones",
-        "Compare two strand files (metres, z up, roots first) at 1 mm/10°, 2 mm/20° and 3 mm/30°: "
-        "over all of the true strands, and with --capture over those its cameras can see; with and "
-        "without their direction from root to tip; by part of the hair; and how long and how whole "
-        "the strands are.",
-    )
+    geometry = add_command(group, "geometry", run_geometry)
     geometry.add_argument("pred", type=Path, help="strand file")
     geometry.add_argument("true", type=Path, help="strand file")
     geometry.add_argument("--capture", type=Path, help="capture that gives cameras and head")
@@ -36,32 +27,23 @@ def add(commands: Commands) -> None:
     geometry.add_argument("--out", type=Path, help="folder for report.json and pictures")
     geometry.add_argument("--seed", type=int, default=0)
 
-    images = add_command(
-        group,
-        "images",
-        run_images,
-        "PSNR and SSIM of pictures against true ones",
-        "Compare two pictures, or two folders by file name. EXR files are exposed alike (the 99th "
-        "percentile of the true pixels becomes 1) and get the sRGB curve first.",
-    )
+    images = add_command(group, "images", run_images)
     images.add_argument("pred", type=Path, help="picture or folder")
     images.add_argument("true", type=Path, help="picture or folder")
     images.add_argument("--mask", type=Path, help="grey picture, half and above counts")
 
-    table = add_command(
-        group,
-        "table",
-        run_table,
-        "the README's table of figures, as Markdown",
-        "Print a column for each results.json of 'hairstage demo': F of the strands at 1 mm/10° "
-        "over visible and all points beside the baselines, PSNR / SSIM of held-out lights and "
-        "camera, fitted and true roughness, and what the job warned of.",
-    )
+    table = add_command(group, "table", run_table)
     table.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="results.json")
 
 
-def run_geometry(args: argparse.Namespace, output: Output) -> int:
-    """Compare strands."""
+def run_geometry(args: argparse.Namespace, output: Output) -> None:
+    """Precision, recall and F of strands against true ones.
+
+    Compare two strand files (metres, z up, roots first) at 1 mm/10°, 2 mm/20° and 3 mm/30°: over
+    all of the true strands, and with --capture over those its cameras can see; with and without
+    their direction from root to tip; by part of the hair; and how long and how whole the strands
+    are.
+    """
     from reconstruction import Capture, read_obj, read_strands
     from reconstruction.evaluation.assessment import assess_strands
     from stage_service.cli.support.tables import assessment_text
@@ -92,11 +74,14 @@ def run_geometry(args: argparse.Namespace, output: Output) -> int:
     for warning in figures["warnings"]:
         output.note(f"warning: {warning}")
     output.result(figures, assessment_text(figures))
-    return 0
 
 
-def run_images(args: argparse.Namespace, output: Output) -> int:
-    """Compare pictures."""
+def run_images(args: argparse.Namespace, output: Output) -> None:
+    """PSNR and SSIM of pictures against true ones.
+
+    Compare two pictures, or two folders by file name. EXR files are exposed alike (the 99th
+    percentile of the true pixels becomes 1) and get the sRGB curve first.
+    """
     from stage_service.cli.model.pictures import compare_pictures, pair_up
 
     pairs = pair_up(args.pred, args.true)
@@ -109,11 +94,15 @@ def run_images(args: argparse.Namespace, output: Output) -> int:
     }
     lines = [f"{n}: {f['psnr']:.2f} dB, SSIM {f['ssim']:.4f}" for n, f in images.items()]
     output.result({**mean, "images": images}, "\n".join(lines))
-    return 0
 
 
-def run_table(args: argparse.Namespace, output: Output) -> int:
-    """Print the table of several demos."""
+def run_table(args: argparse.Namespace, output: Output) -> None:
+    """The README's table of figures, as Markdown.
+
+    Print a column for each results.json of 'hairstage demo': F of the strands at 1 mm/10° over
+    visible and all points beside the baselines, PSNR / SSIM of held-out lights and camera, fitted
+    and true roughness, and what the job warned of.
+    """
     from stage_service.cli.support.tables import markdown_table
 
     rows = {}
@@ -126,4 +115,3 @@ def run_table(args: argparse.Namespace, output: Output) -> int:
             )
         rows[f"{results['subject']}, seed {results['seed']}"] = results
     output.result({"rows": rows}, markdown_table(rows))
-    return 0

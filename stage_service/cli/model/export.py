@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from stage_service.cli.support import BadArgument, Commands, Output, add_command
+from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
 
 SUFFIXES = {"usd": (".usd", ".usda", ".usdc"), "abc": (".abc",), "hair": (".hair",)}
 SIZE = 512
@@ -14,15 +14,7 @@ SIZE = 512
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    export = add_command(
-        commands,
-        "export",
-        run,
-        "a fitted model for other programs",
-        "Write MODEL for others. maps: a folder with an OpenEXR file for each layer of the hair "
-        "maps; mitsuba: a folder with a scene for stock Mitsuba 3; usd: strands with the "
-        "appearance as primvars; abc, hair: the strands alone, for Alembic's and cyHair's readers.",
-    )
+    export = add_command(commands, "export", run)
     export.add_argument("model", type=Path, help="fitted model folder")
     export.add_argument("--to", choices=("maps", "mitsuba", *SUFFIXES), required=True)
     export.add_argument("--out", type=Path, required=True, help="file, or folder of several")
@@ -30,8 +22,13 @@ def add(commands: Commands) -> None:
     export.add_argument("--camera", help="a camera of the rig for mitsuba's view")
 
 
-def run(args: argparse.Namespace, output: Output) -> int:
-    """Export a model."""
+def run(args: argparse.Namespace, output: Output) -> None:
+    """A fitted model for other programs.
+
+    Write MODEL for others. maps: a folder with an OpenEXR file for each layer of the hair maps;
+    mitsuba: a folder with a scene for stock Mitsuba 3; usd: strands with the appearance as
+    primvars; abc, hair: the strands alone, for Alembic's and cyHair's readers.
+    """
     from appearance import FittedModel
     from appearance.model.export import export_maps, export_mitsuba, export_usd
     from appearance.model.relight import three_quarter_view
@@ -62,4 +59,3 @@ def run(args: argparse.Namespace, output: Output) -> int:
                 camera = capture.rig.camera(args.camera)
             files = [export_mitsuba(fitted, out, camera)]
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
-    return 0

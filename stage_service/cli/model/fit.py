@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_command,
@@ -20,17 +20,7 @@ METHODS = ("sun", "inverse_rendering")
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    fit = add_command(
-        commands,
-        "fit",
-        run,
-        "the hair's appearance from a capture and its strands",
-        "Write MODEL/appearance.json: roughness and colour of hair and skin (method sun). "
-        "inverse_rendering goes on from there, with a sun fit first where there is none: hair that "
-        "varies over the scalp and along strands, and the lights as they are found, in "
-        "MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With held-out "
-        "cameras or lights, judge the model on them.",
-    )
+    fit = add_command(commands, "fit", run)
     fit.add_argument("capture", type=Path)
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
     fit.add_argument("--method", choices=METHODS, default="sun")
@@ -40,8 +30,15 @@ def add(commands: Commands) -> None:
     fit.add_argument("--seed", type=int, default=0)
 
 
-def run(args: argparse.Namespace, output: Output) -> int:
-    """Fit the appearance."""
+def run(args: argparse.Namespace, output: Output) -> None:
+    """The hair's appearance from a capture and its strands.
+
+    Write MODEL/appearance.json: roughness and colour of hair and skin (method sun).
+    inverse_rendering goes on from there, with a sun fit first where there is none: hair that varies
+    over the scalp and along strands, and the lights as they are found, in MODEL/hair_maps.npz and
+    lights.json; stopped, it goes on where it was. With held-out cameras or lights, judge the model
+    on them.
+    """
     from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
@@ -67,4 +64,3 @@ def run(args: argparse.Namespace, output: Output) -> int:
         with progress_bar("assess") as progress:
             data["images"] = assess(StepContext(args.capture, model, options, progress))
     output.result(data)
-    return 0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from reconstruction.methods import METHODS
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_command,
@@ -18,13 +18,7 @@ from stage_service.cli.support import (
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    reconstruct = add_command(
-        commands,
-        "reconstruct",
-        run,
-        "strands from a capture",
-        "Write MODEL/strands.npz, .hair and .usdc, and MODEL/report.json.",
-    )
+    reconstruct = add_command(commands, "reconstruct", run)
     reconstruct.add_argument("capture", type=Path)
     reconstruct.add_argument("--method", choices=METHODS, default="light_planes")
     reconstruct.add_argument("--out", type=Path, required=True, help="model folder")
@@ -32,8 +26,11 @@ def add(commands: Commands) -> None:
     add_held_out(reconstruct)
 
 
-def run(args: argparse.Namespace, output: Output) -> int:
-    """Reconstruct strands."""
+def run(args: argparse.Namespace, output: Output) -> None:
+    """Strands from a capture.
+
+    Write MODEL/strands.npz, .hair and .usdc, and MODEL/report.json.
+    """
     from reconstruction import Capture, Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, reconstruct
@@ -55,4 +52,3 @@ def run(args: argparse.Namespace, output: Output) -> int:
         {**data, "seconds": seconds},
         f"{len(strands)} strands in {model.file('strands.npz')} ({seconds:.0f} s)",
     )
-    return 0

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.support import Commands, Output, add_command, progress_bar
+from stage_service.cli.support.commands import Commands, Output, add_command, progress_bar
 
 if TYPE_CHECKING:
     from reconstruction import Progress
@@ -19,14 +19,7 @@ SIZE = 512
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    render = add_command(
-        commands,
-        "render",
-        run,
-        "a model under an environment map, or lights of its rig",
-        "Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, "
-        "where there are any), in the pose of its capture.",
-    )
+    render = add_command(commands, "render", run)
     render.add_argument("model", type=Path)
     render.add_argument("--capture", type=Path, help="the capture that gives rig and head")
     render.add_argument("--camera", help="a camera of the rig, instead of a three-quarter view")
@@ -48,12 +41,15 @@ def add(commands: Commands) -> None:
     render.add_argument("--seed", type=int, default=0)
 
 
-def run(args: argparse.Namespace, output: Output) -> int:
-    """Render a model."""
+def run(args: argparse.Namespace, output: Output) -> None:
+    """A model under an environment map, or lights of its rig.
+
+    Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, where
+    there are any), in the pose of its capture.
+    """
     with progress_bar("render") as progress:
         done = _render(args, progress)
     output.result(done, f"{done['image']} ({done['camera']}, {done['seconds']:.0f} s)")
-    return 0
 
 
 def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:

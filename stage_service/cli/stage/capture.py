@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.stage.jobs import add_pipeline, wait_for_job
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     FAILED,
     Commands,
     Output,
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add the commands."""
     capture = add_group(commands, "capture", "make and steer captures on a running service")
-    check = add_remote(capture, "check", run_check, "cost a plan without lighting a lamp")
-    start = add_remote(capture, "start", run_start, "begin a capture")
+    check = add_remote(capture, "check", run_check)
+    start = add_remote(capture, "start", run_start)
     check.add_argument("--rig", type=rig_path, help="ask this rig file, not a service")
     for parser in (check, start):
         parser.add_argument("--plan", type=Path, help="plan as JSON; without it, everything")
@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
     add_pipeline(start, None, "job to enqueue when the capture completes")
     start.add_argument("--armed-by", help="who answers for flashes that the plan has consent for")
     start.add_argument("--wait", action="store_true", help="wait for capture and job, steer alone")
-    add_remote(capture, "list", run_list_captures, "list captures, oldest first")
+    add_remote(capture, "list", run_list_captures)
     for action, what in (
         ("show", "show where a capture is"),
         ("pause", "pause at the next step"),
@@ -48,8 +48,8 @@ def add(commands: Commands) -> None:
             parser.add_argument("--armed-by", help="as for start")
 
 
-def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Cost a plan; with a rig file, without a service or a device."""
+def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Cost a plan without lighting a lamp."""
     if args.rig is not None:
         from reconstruction import parse_options
         from stage_service.config import load_rig_file
@@ -61,7 +61,6 @@ def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) 
     else:
         cost = service.post("/plans:validate", read_json(args.plan))
     output.result(cost, _costed(cost))
-    return 0
 
 
 def _costed(cost: dict[str, Any]) -> str:
@@ -85,7 +84,7 @@ def _costed(cost: dict[str, Any]) -> str:
 
 
 def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Begin a capture, and wait for it where asked."""
+    """Begin a capture."""
     body: dict[str, Any] = {"plan": read_json(args.plan)}
     for field in ("head", "masks"):
         if getattr(args, field) is not None:
@@ -110,8 +109,8 @@ def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) 
     return wait_for_job(service, capture["job"], output, {"capture": capture})
 
 
-def run_list_captures(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """List captures."""
+def run_list_captures(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """List captures, oldest first."""
     captures = service.get("/captures")
     lines = [
         f"{c['id']}  {c['outcome'] or c['state']}  {c['frames_written']}/{c['frames_planned']} "
@@ -119,15 +118,13 @@ def run_list_captures(args: argparse.Namespace, output: Output, service: Service
         for c in captures
     ]
     output.result({"captures": captures}, "\n".join(lines) or "no captures")
-    return 0
 
 
-def run_capture_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
+def run_capture_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Show, pause, resume or abort."""
     path = f"/captures/{args.capture}"
     if args.action == "show":
         output.result(service.get(path))
-        return 0
+        return
     body = {"armed_by": args.armed_by} if args.action == "resume" else None
     output.result(service.post(f"{path}/{args.action}", body))
-    return 0

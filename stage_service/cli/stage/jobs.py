@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.support import (
+from stage_service.cli.support.commands import (
     FAILED,
     Commands,
     Output,
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add the commands."""
     jobs = add_group(commands, "jobs", "submit, follow and cancel jobs on a running service")
-    submit = add_remote(jobs, "submit", run_submit, "enqueue a pipeline on a finished capture")
+    submit = add_remote(jobs, "submit", run_submit)
     submit.add_argument("capture", help="the capture's id")
     add_pipeline(submit, "light_planes", "the steps to run")
     submit.add_argument("--model", help="name of the model folder; without it, a new one")
     submit.add_argument("--wait", action="store_true", help="wait until the job is done")
-    add_remote(jobs, "list", run_list_jobs, "list jobs, newest first")
+    add_remote(jobs, "list", run_list_jobs)
     for action, what in (
         ("show", "show where a job is"),
         ("wait", "wait until a job is done"),
@@ -47,7 +47,7 @@ def add_pipeline(parser: argparse.ArgumentParser, default: str | None, help: str
 
 
 def run_submit(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Enqueue a job."""
+    """Enqueue a pipeline on a finished capture."""
     body = {
         "capture": args.capture,
         "pipeline": {"name": args.pipeline, "options": read_json(args.options)},
@@ -60,12 +60,11 @@ def run_submit(args: argparse.Namespace, output: Output, service: ServiceClient)
     return 0
 
 
-def run_list_jobs(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """List jobs."""
+def run_list_jobs(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """List jobs, newest first."""
     jobs = service.get("/jobs")
     lines = [f"{j['id']}  {j['pipeline']}  {j['outcome'] or j['state']}" for j in jobs]
     output.result({"jobs": jobs}, "\n".join(lines) or "no jobs")
-    return 0
 
 
 def run_job_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:

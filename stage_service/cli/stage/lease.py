@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from stage_service.cli.support import Commands, Output, add_group, add_remote
+from stage_service.cli.support.commands import Commands, Output, add_group, add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -14,40 +14,36 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add the commands."""
     lease = add_group(commands, "lease", "steer a stage alone for some time")
-    take = add_remote(lease, "take", run_take_lease, "take the lease; prints its token")
+    take = add_remote(lease, "take", run_take_lease)
     take.add_argument("--holder", help="in whose name; without it, this user and machine")
     take.add_argument("--seconds", type=float, default=600.0)
-    add_remote(lease, "show", run_show_lease, "show who steers, and until when")
-    renew = add_remote(lease, "renew", run_renew_lease, "let the lease of --lease end later")
+    add_remote(lease, "show", run_show_lease)
+    renew = add_remote(lease, "renew", run_renew_lease)
     renew.add_argument("--seconds", type=float, default=600.0, help="from now")
-    add_remote(lease, "release", run_release_lease, "end the lease of --lease")
+    add_remote(lease, "release", run_release_lease)
 
 
-def run_take_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Take the lease."""
+def run_take_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Take the lease; prints its token."""
     from stage_service.cli.support.client import me
 
     granted = service.post("/lease", {"holder": args.holder or me(), "seconds": args.seconds})
     output.result(granted, granted["token"])
-    return 0
 
 
-def run_show_lease(_args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Show who steers."""
+def run_show_lease(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Show who steers, and until when."""
     held = service.get("/lease")
     text = f"{held['holder']} until {held['expires']}" if held["holder"] else "nobody: anybody may"
     output.result(held, text)
-    return 0
 
 
-def run_renew_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Renew the lease."""
+def run_renew_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Let the lease of --lease end later."""
     granted = service.ask("PATCH", "/lease", json={"seconds": args.seconds})
     output.result(granted, f"until {granted['expires']}")
-    return 0
 
 
-def run_release_lease(_args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """End the lease."""
+def run_release_lease(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """End the lease of --lease."""
     output.result(service.ask("DELETE", "/lease"), "released")
-    return 0

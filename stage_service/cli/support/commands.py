@@ -1,17 +1,21 @@
-"""What every command shares: `--json`, help, errors that become sentences and exit codes."""
+"""What every command shares: `--json`, help, what it prints (results on stdout, progress on
+stderr), errors that become sentences and exit codes."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import inspect
 import json
 import os
 import sys
+import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.support.output import Output
+from reconstruction import Progress
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -25,10 +29,81 @@ EXIT_CODES = {
     130: "interrupted",
 }
 FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
+LINE_EVERY_S = 10.0
+"""Where progress goes to a log, a line so often."""
+
+
+class Output:
+    """Prints one JSON object on stdout, or text for people."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+
+    def result(self, data: dict[str, Any], text: Any = None) -> None:
+        """Print a command's result: `data` as JSON, or `text` (a string or a rich renderable)."""
+        if self.as_json:
+            print(json.dumps(data, allow_nan=False), flush=True)
+            return
+        from rich.console import Console
+
+        shown = json.dumps(data, indent=1, allow_nan=False) if text is None else text
+        # A table in a file or a log has no window to fit.
+        width = None if sys.stdout.isatty() else 120
+        Console(width=width, highlight=False).print(shown, markup=False, soft_wrap=True)
+
+    def error(self, kind: str, detail: str, **more: Any) -> None:
+        """Say what went wrong: on stderr, and with --json as the one object on stdout too."""
+        if self.as_json:
+            print(json.dumps({"error": {"type": kind, "detail": detail, **more}}), flush=True)
+        print(f"hairstage: {detail}", file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        """A line for people, on stderr."""
+        print(text, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def progress_bar(title: str) -> Iterator[Progress]:
+    """A `Progress` that draws a bar on stderr; no terminal there: now and then a line."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(title)
+        return
+    with Bars(
+        TextColumn("{task.fields[title]:<12}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+        console=console,
+    ) as bars:
+        task = bars.add_task("", total=1.0, title=title)
+
+        def show(what: str, share: float) -> None:
+            bars.update(task, description=what, completed=share)
+
+        yield show
+
+
+def _lines(title: str) -> Progress:
+    last = [float("-inf")]
+
+    def show(what: str, share: float) -> None:
+        now = time.monotonic()
+        if now - last[0] >= LINE_EVERY_S or share >= 1:
+            print(f"{title}: {share:4.0%} {what}", file=sys.stderr, flush=True)
+            last[0] = now if share < 1 else float("inf")
+
+    return show
+
 
 Commands = Any  # argparse does not export the type of what add_subparsers returns
-Run = Callable[[argparse.Namespace, Output], int]
-RemoteRun = Callable[[argparse.Namespace, Output, "ServiceClient"], int]
+Run = Callable[[argparse.Namespace, Output], int | None]
+RemoteRun = Callable[[argparse.Namespace, Output, "ServiceClient"], int | None]
 
 
 class CommandError(Exception):
@@ -56,27 +131,35 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def add_command(
-    commands: Commands, name: str, run: Run, help: str, description: str | None = None
+    commands: Commands, name: str, run: Run | RemoteRun, help: str | None = None
 ) -> argparse.ArgumentParser:
-    """Add a command with what every command has: `--json`, help, the function that runs it."""
+    """Add a command with what every command has: `--json`, help, the function that runs it.
+
+    The help is that function's docstring: its first sentence, and what follows as the description.
+    """
+    first, _, rest = (inspect.getdoc(run) or "").partition("\n\n")
+    help = help or _phrase(first)
     parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=help, description=description or _sentence(help), formatter_class=_Help
+        name, help=help, description=rest or _sentence(help), formatter_class=_Help
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     parser.set_defaults(run=run)
     return parser
 
 
-def add_remote(commands: Commands, name: str, run: RemoteRun, help: str) -> argparse.ArgumentParser:
+def add_remote(
+    commands: Commands, name: str, run: RemoteRun, help: str | None = None
+) -> argparse.ArgumentParser:
     """Add a command that asks a running service."""
 
-    def connected(args: argparse.Namespace, output: Output) -> int:
+    def connected(args: argparse.Namespace, output: Output) -> int | None:
         from stage_service.cli.support.client import ServiceClient
 
         with ServiceClient(args.url, args.lease) as service:
             return run(args, output, service)
 
-    parser = add_command(commands, name, connected, help)
+    parser = add_command(commands, name, run, help)
+    parser.set_defaults(run=connected)
     parser.add_argument("--url", help="the service's URL (also: HAIRSTAGE_URL)")
     parser.add_argument("--lease", help="token of the lease under which to steer")
     return parser
@@ -90,6 +173,11 @@ def add_group(commands: Commands, name: str, help: str) -> Commands:
 
 def _sentence(help: str) -> str:
     return help[0].upper() + help[1:] + "."
+
+
+def _phrase(sentence: str) -> str:
+    text = " ".join(sentence.removesuffix(".").split())
+    return text if text[1:2].isupper() else text[0].lower() + text[1:]
 
 
 def add_held_out(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +214,7 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
     args = parser.parse_args(argv)
     output = Output(as_json=args.json)
     try:
-        return args.run(args, output)
+        return args.run(args, output) or 0
     except KeyboardInterrupt:
         output.error("Interrupted", "interrupted")
         return 130

@@ -19,8 +19,8 @@ import pytest
 
 from reconstruction import CaptureWriter, Rig, Step, Strands, write_exr, write_strands
 from stage_service.cli import build_parser, main
-from stage_service.cli.support import CommandError, rig_path
 from stage_service.cli.support.children import Children
+from stage_service.cli.support.commands import CommandError, rig_path
 
 RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 

@@ -1,0 +1,128 @@
+"""`hairstage serve`, `worker` and `simulate`: the processes of a stage."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+import time
+from pathlib import Path
+
+from stage_service.cli.support.commands import Commands, Output, add_command, rig_path
+
+DEFAULT_PORT = 8331
+RIG_HELP = "rig file, or one that comes with hairstage: demo, stage331"
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    serve = add_command(commands, "serve", run_serve)
+    serve.add_argument("--rig", type=rig_path, required=True, help=RIG_HELP)
+    serve.add_argument("--devices", type=Path, help="file whose [devices] wins over the rig file's")
+    serve.add_argument("--root", type=Path, default=Path("runs/stage"), help="captures and models")
+    serve.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 takes any free port")
+
+    worker = add_command(commands, "worker", run_worker)
+    worker.add_argument("--root", type=Path, default=Path("runs/stage"), help="as the service's")
+    worker.add_argument("--concurrency", type=int, default=1, help="jobs at the same time")
+
+    simulate = add_command(commands, "simulate", run_simulate)
+    add_subject(simulate)
+    simulate.add_argument("--state", type=Path, default=Path("runs/simulated"), help="state folder")
+    simulate.add_argument("--truth", type=Path, help="write the true strands and appearance here")
+    simulate.add_argument("--faults", type=Path, help="faults to inject")
+    simulate.add_argument(
+        "--ports", choices=("auto", "rig"), default="auto", help="free TCP ports, or the rig file's"
+    )
+
+
+def run_serve(args: argparse.Namespace, output: Output) -> None:
+    """Run the service: devices, captures and the HTTP API.
+
+    Run the service for one rig on 127.0.0.1. SIGTERM and Ctrl-C put the lights off first. With
+    --json, one object with the URL is printed when requests are answered.
+    """
+    log_to_stderr()
+    from stage_service.api.app import serve
+    from stage_service.config import load_rig_file
+    from stage_service.service import Service
+
+    exit_on_sigterm()
+    service = Service(load_rig_file(args.rig, args.devices), args.root)
+
+    def ready(url: str) -> None:
+        text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"
+        output.result({"url": url, "root": str(args.root), "rig": str(args.rig)}, text)
+
+    serve(service, args.port, ready)
+
+
+def run_worker(args: argparse.Namespace, output: Output) -> None:
+    """Run a worker: takes jobs off the queue.
+
+    Run the jobs of one root folder. A worker that dies leaves its job to the next worker, which
+    goes on at the step that was under way.
+    """
+    log_to_stderr()
+    from stage_service.jobs.worker import run_worker as work
+
+    args.root.mkdir(parents=True, exist_ok=True)
+    work(
+        args.root,
+        concurrency=args.concurrency,
+        ready=lambda name: output.result(
+            {"worker": name, "root": str(args.root)}, f"{name} works on the jobs of {args.root}"
+        ),
+    )
+
+
+def run_simulate(args: argparse.Namespace, output: Output) -> int:
+    """Run a simulated rig behind the same wires as a real one.
+
+    Run the device side of every wire. STATE/devices.toml is written when they answer: give it to
+    'hairstage serve --devices'. To calibrate, SUBJECT is board:N, mirror:N or diffuse:N, in pose or
+    place N.
+    """
+    from stage_service.cli.support.children import Children, SimulatedRig
+
+    exit_on_sigterm()
+    more = ["--state", args.state, "--ports", args.ports]
+    for option in ("truth", "faults"):
+        if getattr(args, option) is not None:
+            more += [f"--{option}", getattr(args, option)]
+    simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed)
+    with Children(args.state / "logs") as children:
+        child = children.start("simulators", simulated.command(*more), to_log=False, answers=True)
+        devices = children.first_line("simulators", child, 600)["devices"]
+        output.result({"devices": devices}, f"the simulated rig answers; see {devices}")
+        while (code := child.poll()) is None:  # a signal may come just before a sleep: a short one
+            time.sleep(0.2)
+        return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
+
+
+def add_subject(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which subject sits in which rig."""
+    parser.add_argument("--rig", type=rig_path, default="demo", help=RIG_HELP)
+    parser.add_argument("--subject", default="wavy", help="wavy, straight, curly or a strand file")
+    parser.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def exit_on_sigterm() -> None:
+    """Make SIGTERM end the process as `sys.exit` does: every `finally` runs.
+
+    SIGHUP, a terminal that is closed, counts as SIGTERM unless it is ignored (nohup).
+    """
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
+
+
+def log_to_stderr() -> None:
+    """Log records of level INFO and above go to stderr."""
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.INFO,
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+    )
