@@ -8,6 +8,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +61,9 @@ class FrameMaker:
         self._cache = cache
         self._key = key
         self._lights: dict[str, Response] = {}
-        self._moved: dict[str, OrderedDict[Hashable, Response]] = {
-            c.name: OrderedDict() for c in rig.cameras
-        }
-        self._sweeps: dict[str, OrderedDict[int, Mapping[str, Response]]] = {
-            c.name: OrderedDict() for c in rig.cameras
-        }
+        names = [c.name for c in rig.cameras]
+        self._moved = {n: OrderedDict[Hashable, Response]() for n in names}
+        self._sweeps = {n: OrderedDict[Hashable, Mapping[str, Response]]() for n in names}
 
     def counts(self, camera: str, shot: Snapshot, exposure: float) -> NDArray[np.uint16]:
         """The sensor's counts `(H, W, 3)`; the same seed, camera and pulse give the same bytes."""
@@ -94,18 +92,14 @@ class FrameMaker:
             weights = shot.power[lit].astype(np.float32)
             flat[response.pixels] += np.tensordot(weights, response.images[lit], 1)
             return
-        response = _kept(
-            self._moved[camera],
-            (shot.pose, shot.power.tobytes()),
-            lambda: self._responder.lights_together(camera, shot.pose, shot.power),
-            4,
-        )
+        key = (shot.pose, shot.power.tobytes())
+        render = partial(self._responder.lights_together, camera, shot.pose, shot.power)
+        response = _kept(self._moved[camera], key, render, 4)
         flat[response.pixels] += response.images[0]
 
     def _add_projectors(self, flat: Floats, camera: str, shot: Snapshot) -> None:
-        sweep = _kept(
-            self._sweeps[camera], shot.pose, lambda: self._responder.sweep(camera, shot.pose), 2
-        )
+        render = partial(self._responder.sweep, camera, shot.pose)
+        sweep = _kept(self._sweeps[camera], shot.pose, render, 2)
         power = np.float32(shot.show.power)
         for name, response in sweep.items():
             if shot.show.projector is None:

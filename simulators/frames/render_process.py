@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
@@ -18,7 +19,30 @@ class RenderError(RuntimeError):
     """The rendering process failed or ended; the message has its reason."""
 
 
-class RenderProcess:
+class _Remote(ABC):
+    """A `Responder` whose answers are made elsewhere; every call may raise `RenderError`."""
+
+    def lights(self, camera: str) -> Response:
+        """See `Responder.lights`."""
+        answer: Response = self._call("lights", camera)
+        return answer
+
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """See `Responder.lights_together`; `power (L,)`."""
+        answer: Response = self._call("lights_together", camera, pose, power)
+        return answer
+
+    def sweep(self, camera: str, pose: int) -> dict[str, Response]:
+        """See `Responder.sweep`."""
+        answer: dict[str, Response] = self._call("sweep", camera, pose)
+        return answer
+
+    @abstractmethod
+    def _call(self, what: str, camera: str, *args: Any) -> Any:
+        """The answer of the responder's method `what`."""
+
+
+class RenderProcess(_Remote):
     """A `Responder` in a child process, made there by `make()`.
 
     `make` and what it holds must be picklable. Calls from several threads wait for each other.
@@ -34,21 +58,6 @@ class RenderProcess:
         theirs.close()
         self._lock = threading.Lock()
 
-    def lights(self, camera: str) -> Response:
-        """See `Responder.lights`; raises `RenderError`."""
-        answer: Response = self._call("lights", camera)
-        return answer
-
-    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`; `power (L,)`. Raises `RenderError`."""
-        answer: Response = self._call("lights_together", camera, pose, power)
-        return answer
-
-    def sweep(self, camera: str, pose: int) -> dict[str, Response]:
-        """See `Responder.sweep`; raises `RenderError`."""
-        answer: dict[str, Response] = self._call("sweep", camera, pose)
-        return answer
-
     def stop(self) -> None:
         """End the child at once, in mid-picture if need be."""
         self._process.terminate()
@@ -56,15 +65,15 @@ class RenderProcess:
         with self._lock:  # a call in the middle ends first: it finds the pipe closed at the far end
             self._ours.close()
 
-    def _call(self, what: str, *args: Any) -> Any:
+    def _call(self, what: str, camera: str, *args: Any) -> Any:
         with self._lock:
             try:
-                self._ours.send((what, args))
+                self._ours.send((what, (camera, *args)))
                 fine, answer = self._ours.recv()
             except (OSError, EOFError) as error:
                 code = self._process.exitcode
                 raise RenderError(
-                    f"the rendering process ended (exit code {code}) in {what} {args[:2]}; its "
+                    f"the rendering process ended (exit code {code}) in {what} of {camera}; its "
                     "last words are on stderr"
                 ) from error
         if not fine:
@@ -72,7 +81,7 @@ class RenderProcess:
         return answer
 
 
-class RenderPool:
+class RenderPool(_Remote):
     """A `Responder` of `count` processes; each camera has its own among them.
 
     Camera number i belongs to process i modulo `count`, as `World` deals its frames to its lanes:
@@ -83,25 +92,13 @@ class RenderPool:
         self._processes = [RenderProcess(make) for _ in range(min(count, len(cameras)))]
         self._lane = {name: i % len(self._processes) for i, name in enumerate(cameras)}
 
-    def lights(self, camera: str) -> Response:
-        """See `Responder.lights`; raises `RenderError`."""
-        return self._of(camera).lights(camera)
-
-    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`; `power (L,)`. Raises `RenderError`."""
-        return self._of(camera).lights_together(camera, pose, power)
-
-    def sweep(self, camera: str, pose: int) -> dict[str, Response]:
-        """See `Responder.sweep`; raises `RenderError`."""
-        return self._of(camera).sweep(camera, pose)
-
     def stop(self) -> None:
         """End all processes at once."""
         for process in self._processes:
             process.stop()
 
-    def _of(self, camera: str) -> RenderProcess:
-        return self._processes[self._lane[camera]]
+    def _call(self, what: str, camera: str, *args: Any) -> Any:
+        return self._processes[self._lane[camera]]._call(what, camera, *args)
 
 
 def _serve(pipe: Connection, make: Callable[[], Responder]) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from reconstruction import Camera, Rig
 from reconstruction.arrays import Array, Floats, Ints
 from simulators.subject.drift import Drift
 from simulators.subject.subject import Subject
+
+if TYPE_CHECKING:
+    from appearance import HairScene
 
 
 @dataclass(frozen=True)
@@ -99,12 +103,8 @@ class MitsubaResponder:
     def __init__(
         self, rig: Rig, subject: Subject, drift: Drift, quality: Quality, seed: int
     ) -> None:
-        self._rig = rig
-        self._subject = subject
-        self._drift = drift
-        self._quality = quality
-        self._seed = seed
-        self._scene: Any = None
+        self._rig, self._subject, self._drift = rig, subject, drift
+        self._quality, self._seed = quality, seed
 
     def lights(self, camera: str) -> Response:
         """See `Responder.lights`."""
@@ -112,7 +112,7 @@ class MitsubaResponder:
 
         seen, pixels = self._view(camera, 0)
         images = render_olat(
-            self._built(),
+            self._scene,
             seen,
             self._rig.lights,
             spp=self._quality.lights,
@@ -134,7 +134,7 @@ class MitsubaResponder:
             if share > 0
         ]
         images = render_olat(
-            self._built(),
+            self._scene,
             seen,
             lit,
             spp=self._quality.together,
@@ -153,7 +153,7 @@ class MitsubaResponder:
         seen, pixels = self._view(camera, pose)
         rotation, translation = self._drift.pose(pose)
         rows = render_scanlines(
-            self._built(),
+            self._scene,
             seen,
             [p.moved(rotation, translation) for p in self._rig.projectors],
             spp=self._quality.sweep,
@@ -163,19 +163,18 @@ class MitsubaResponder:
         )
         return {name: Response.halved(pixels, images) for name, images in rows.items()}
 
-    def _built(self) -> Any:
-        if self._scene is None:
-            from appearance import build_scene
+    @cached_property
+    def _scene(self) -> HairScene:
+        from appearance import build_scene
 
-            s = self._subject
-            self._scene = build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
-        return self._scene
+        s = self._subject
+        return build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
 
     def _view(self, camera: str, pose: int) -> tuple[Camera, Ints]:
         from appearance.render.coverage import covered_pixels
 
         seen = self._rig.camera(camera).moved(*self._drift.pose(pose))
-        return seen, covered_pixels(self._built(), seen)
+        return seen, covered_pixels(self._scene, seen)
 
     def _seeds(self, camera: str, pose: int, what: int) -> int:
         """Each picture its own paths: noise that all poses shared would look like structure."""

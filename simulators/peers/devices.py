@@ -6,8 +6,8 @@ import functools
 import json
 import os
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from simulators.frames.sensor import Sensor
@@ -22,6 +22,7 @@ HOST = "127.0.0.1"
 DEVICES_FILE = "devices.toml"
 
 
+@dataclass(eq=False)
 class SimulatedStage:
     """The four peers around a `World`; a context manager.
 
@@ -31,23 +32,13 @@ class SimulatedStage:
     and paths, which `state/devices.toml` holds, too.
     """
 
-    def __init__(
-        self,
-        world: World,
-        sensor: Sensor,
-        state: Path,
-        configured: DevicesConfig | None = None,
-        free_ports: bool = True,
-        paced: bool = False,
-    ) -> None:
-        self._world = world
-        self._sensor = sensor
-        self._state = state
-        self._configured = configured
-        self._free_ports = free_ports
-        self._paced = paced
-        self._stack = ExitStack()
-        self.devices: dict[str, Any] = {}
+    world: World
+    sensor: Sensor
+    state: Path
+    configured: DevicesConfig | None = None
+    free_ports: bool = True
+    paced: bool = False
+    devices: dict[str, Any] = field(default_factory=dict, init=False)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -55,18 +46,13 @@ class SimulatedStage:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def _start(self, stack: ExitStack) -> None:
-        self._state.mkdir(parents=True, exist_ok=True)
-        world, wires = self._world, self._configured
-        fixed = None if self._free_ports else wires
+        self.state.mkdir(parents=True, exist_ok=True)
+        world, wires = self.world, self.configured
+        fixed = None if self.free_ports else wires
         light_kind = wires.lights if wires else ModbusTcpConfig()
         light_tcp = (HOST, 0)
         if fixed and isinstance(fixed.lights, ModbusTcpConfig):
@@ -75,8 +61,8 @@ class SimulatedStage:
         if fixed and isinstance(fixed.cameras, LinkCamerasConfig):
             camera_host, camera_port = fixed.cameras.host, fixed.cameras.port
         stack.callback(world.stop)
-        link = self._state.absolute() / "lights"
-        lights = light_bank(light_kind, world, link, light_tcp, self._paced)
+        link = self.state.absolute() / "lights"
+        lights = light_bank(light_kind, world, link, light_tcp, self.paced)
         stack.callback(lights.stop)
         light: dict[str, Any] = {"kind": light_kind.kind, "port": lights.start()}
         if isinstance(light_kind, ModbusTcpConfig):
@@ -84,7 +70,7 @@ class SimulatedStage:
         if isinstance(light_kind, ModbusRtuConfig):
             # A pseudo-terminal has no parity bit; a second stop bit keeps a character as long.
             light |= {"parity": "N", "stop_bits": 2}
-        cameras = CameraLink(world, self._sensor, camera_host, camera_port)
+        cameras = CameraLink(world, self.sensor, camera_host, camera_port)
         stack.callback(cameras.stop)
         camera_port = cameras.start()
         trigger = TriggerBox(world, world.faults)
@@ -93,7 +79,7 @@ class SimulatedStage:
         paths = {}
         for name, reply in serial.items():
             strikes = functools.partial(world.strikes, name)
-            peer = SerialPeer(self._state.absolute() / name, reply, strikes)
+            peer = SerialPeer(self.state.absolute() / name, reply, strikes)
             peer.start()
             stack.callback(peer.stop)
             paths[name] = str(peer.link)
@@ -109,7 +95,7 @@ class SimulatedStage:
             self.devices[name] = {**base, **table} if base.get("kind") == table["kind"] else table
         if not world.rig.projectors:
             del self.devices["projectors"]
-        file = self._state / DEVICES_FILE
+        file = self.state / DEVICES_FILE
         stack.callback(file.unlink, missing_ok=True)
         ready = file.with_name(f"{file.name}.{os.getpid()}")
         ready.write_text(_toml({"devices": self.devices}))

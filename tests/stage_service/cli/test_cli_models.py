@@ -75,7 +75,7 @@ def made(tmp_path_factory):
         images = render_olat(scene, camera, lights, spp=128, max_depth=DEPTH, seed=7)
         for step in steps:
             image = images[int(step.light[1:])]
-            writer.write_frame(step, camera.name, image, pulse=1, block_id=1, timestamp=0.0)
+            writer.write_frame(step, camera.name, image)
         model.write_mask(camera.name, "hair", coverage(scene, camera)["hair"] > 0.5)
     writer.finish("completed", {})
     unseen = images[int(UNSEEN[1:])]
