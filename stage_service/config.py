@@ -144,8 +144,8 @@ class DmxConfig(_LightBank):
         return 255
 
 
-def _modbus_tcp_by_default(table: Any) -> Any:
-    return {"kind": "modbus_tcp", **table} if isinstance(table, dict) else table
+def _kind_by_default(kind: str) -> BeforeValidator:
+    return BeforeValidator(lambda t: {"kind": kind, **t} if isinstance(t, dict) else t)
 
 
 LightBankConfig = Annotated[
@@ -174,33 +174,38 @@ class PjLinkConfig(Strict):
     timeout_s: Seconds = 5.0
 
 
-class LinkCamerasConfig(Strict):
-    """`[devices.cameras]`: the camera link.
+class _Cameras(Strict):
+    """`readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are for predictions.
 
-    `timeout_s` bounds each answer, `busy_s` how long a camera may say that its frame is not ready.
-    `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are for predictions.
     `buffers` is how many frames a camera holds unread; it bounds a hardware-stepped run.
     """
 
-    kind: Literal["link"] = "link"
-    host: str = "127.0.0.1"
-    port: Port
     timeout_s: Seconds = 2.0
-    busy_s: Seconds = 60.0
     readout_s: float = Field(default=0.02, ge=0.0)
     bytes_per_s: float = Field(default=100e6, gt=0.0)
     buffers: int = Field(default=64, ge=1, le=4096)
 
 
-class BaslerConfig(Strict):
+class LinkCamerasConfig(_Cameras):
+    """`[devices.cameras]`: the camera link.
+
+    `timeout_s` bounds each answer, `busy_s` how long a camera may say that its frame is not ready.
+    """
+
+    kind: Literal["link"] = "link"
+    host: str = "127.0.0.1"
+    port: Port
+    busy_s: Seconds = 60.0
+
+
+class BaslerConfig(_Cameras):
     """`[devices.cameras]`: Basler cameras, found by serial number.
 
     `serials` maps each camera of the rig file to its number. `gain` is counts per
     (W/(sr m²) · s) and `black` counts: calibrated, the camera knows neither. `features` are written
     to the camera in their order after its default settings are loaded: region of interest, analog
     gain, black level, packet size. `timeout_s` bounds arming; a frame may come `frame_s` later than
-    its exposure takes. `readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are
-    for predictions. `buffers` is how many frames are held unread.
+    its exposure takes.
     """
 
     kind: Literal["basler"]
@@ -212,10 +217,7 @@ class BaslerConfig(Strict):
     )
     trigger_line: str = Field(default="Line1", pattern=r"^Line\d+$")
     features: dict[str, bool | int | float | str] = Field(default_factory=dict)
-    timeout_s: Seconds = 2.0
     frame_s: Seconds = 0.5
-    readout_s: float = Field(default=0.02, ge=0.0)
-    bytes_per_s: float = Field(default=100e6, gt=0.0)
     buffers: int = Field(default=16, ge=1, le=4096)
 
     @field_validator("serials")
@@ -224,10 +226,6 @@ class BaslerConfig(Strict):
         if len(set(serials.values())) < len(serials):
             raise ValueError("two cameras have the same serial number")
         return serials
-
-
-def _link_by_default(table: Any) -> Any:
-    return {"kind": "link", **table} if isinstance(table, dict) else table
 
 
 CamerasConfig = Annotated[LinkCamerasConfig | BaslerConfig, Field(discriminator="kind")]
@@ -243,11 +241,11 @@ class DevicesConfig(Strict):
     hardware_stepping: bool = False
     heartbeat_s: Seconds = 0.5
     watchdog_s: float = Field(default=2.0, ge=0.1, le=60.0)
-    lights: Annotated[LightBankConfig, BeforeValidator(_modbus_tcp_by_default)]
+    lights: Annotated[LightBankConfig, _kind_by_default("modbus_tcp")]
     trigger: SerialConfig
     projectors: SerialConfig | None = None
     pjlink: dict[str, PjLinkConfig] = Field(default_factory=dict)
-    cameras: Annotated[CamerasConfig, BeforeValidator(_link_by_default)]
+    cameras: Annotated[CamerasConfig, _kind_by_default("link")]
 
     @model_validator(mode="after")
     def _heartbeat_before_watchdog(self) -> DevicesConfig:

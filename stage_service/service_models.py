@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from stage_service.acquisition.capture_status import CaptureStatus
+from stage_service.config import Strict
 from stage_service.jobs.records import PipelineRequest
 from stage_service.plan.capture_plan import CapturePlan
 
@@ -20,11 +21,7 @@ def _example(**fields: Any) -> ConfigDict:
     return ConfigDict(extra="forbid", frozen=True, json_schema_extra={"examples": [fields]})
 
 
-class _Request(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class CaptureRequest(_Request):
+class CaptureRequest(Strict):
     """A capture to make, and the job that follows it by itself when it completes.
 
     `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine.
@@ -44,13 +41,13 @@ class CaptureRequest(_Request):
     armed_by: PersonName | None = None
 
 
-class ResumeRequest(_Request):
+class ResumeRequest(Strict):
     """`armed_by`: who answers at the stage for flashes that the plan has consent for."""
 
     armed_by: PersonName | None = None
 
 
-class JobRequest(_Request):
+class JobRequest(Strict):
     """A pipeline to run on a capture; `model` names the model folder (default: a new one)."""
 
     model_config = _example(capture="20261121-093000", pipeline={"name": "light_planes"})
@@ -60,20 +57,20 @@ class JobRequest(_Request):
     model: FileName | None = None
 
 
-class LeaseRequest(_Request):
+class LeaseRequest(Strict):
     """Who wants to steer alone, and for how long."""
 
     holder: PersonName
     seconds: LeaseSeconds = 60.0
 
 
-class RenewRequest(_Request):
+class RenewRequest(Strict):
     """How long the lease is to last from now."""
 
     seconds: LeaseSeconds = 60.0
 
 
-class AcknowledgeRequest(_Request):
+class AcknowledgeRequest(Strict):
     """Who looked at the stage, and what they saw."""
 
     name: Annotated[str, Field(min_length=2, max_length=100)]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
 from textwrap import fill
@@ -23,12 +25,7 @@ from stage_service.jobs.queue import NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
-from stage_service.service import (
-    BadInput,
-    NotFinished,
-    UnknownArtifact,
-    UnknownFrame,
-)
+from stage_service.service import BadInput, NotFinished, UnknownArtifact, UnknownFrame
 
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"
@@ -44,131 +41,67 @@ class Kind:
     help: str
 
 
-KINDS = {
-    k.slug: k
-    for k in (
-        Kind(
-            "invalid-request",
-            422,
-            "The request does not fit the schema",
-            "`errors` lists each field that is wrong and why. The schema is in /openapi.json.",
-        ),
-        Kind(
-            "invalid-plan",
-            422,
-            "This rig cannot shoot this plan",
-            "`problems` has one sentence for each reason. No lamp was touched. Correct the plan "
-            "and try it with `POST /plans:validate`.",
-        ),
-        Kind(
-            "bad-input",
-            422,
-            "A file or name in the request cannot be used",
-            "`detail` names it and says what was expected. Paths are those of the service's "
-            "machine.",
-        ),
-        Kind(
-            "busy",
-            409,
-            "Another capture is running",
-            "The stage makes one capture at a time. Wait for `running`, or abort it.",
-        ),
-        Kind(
-            "flash-rate",
-            422,
-            "A living subject would see flashes of 3 to 30 Hz",
-            "`problems` has the ways out: a slower plan, or recorded consent that somebody at the "
-            "stage arms. docs/safety.md says why. No lamp was touched.",
-        ),
-        Kind(
-            "unsafe",
-            409,
-            "Nobody knows whether the lamps are off",
-            "The last blackout could not be verified. Look at the stage, put `detail` right, then "
-            "`POST /devices/blackout`; where the link cannot read back, `POST "
-            "/devices/acknowledge`.",
-        ),
-        Kind(
-            "cannot-acknowledge",
-            409,
-            "This is not for a person to say",
-            "Nothing is latched, or the light bank can tell by itself: `POST /devices/blackout`.",
-        ),
-        Kind(
-            "leased",
-            409,
-            "Somebody else steers the stage",
-            "`holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are "
-            "open to everybody.",
-        ),
-        Kind(
-            "no-lease",
-            409,
-            "The token is no lease's",
-            "The lease has expired or was released. `GET /lease` says who holds one now.",
-        ),
-        Kind(
-            "journal-in-use",
-            409,
-            "The capture is being written or compressed",
-            "Wait until that is done; `GET /jobs` shows a compression.",
-        ),
-        Kind(
-            "wrong-state",
-            409,
-            "The capture's state does not allow this",
-            "`detail` lists what is possible now; `state` is where the capture is. Steps that the "
-            "trigger box clocks cannot pause.",
-        ),
-        Kind(
-            "not-finished",
-            409,
-            "The capture is not finished",
-            "Wait until its state is `done`; an interrupted capture has no manifest and cannot be "
-            "processed.",
-        ),
-        Kind("unknown-capture", 404, "No such capture", "`GET /captures` lists the captures."),
-        Kind(
-            "unknown-frame",
-            404,
-            "No such step or camera",
-            "`detail` says which steps and cameras this capture has.",
-        ),
-        Kind(
-            "missing-frame",
-            404,
-            "The frame is missing",
-            "It was planned and did not come, or has not been shot yet; `detail` says which.",
-        ),
-        Kind("unknown-job", 404, "No such job", "`GET /jobs` lists the jobs."),
-        Kind(
-            "unknown-artifact",
-            404,
-            "No such file in the model folder",
-            "`GET /jobs/{id}/artifacts` lists the files. Paths that lead out of the folder are not "
-            "followed.",
-        ),
-        Kind(
-            "damaged-capture",
-            500,
-            "The capture folder cannot be read",
-            "`detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.",
-        ),
-        Kind(
-            "http",
-            400,
-            "The request cannot be served",
-            "The status says why: no such route, method not allowed, or a host name that is not "
-            "this machine's.",
-        ),
-        Kind(
-            "internal",
-            500,
-            "A fault in the service",
-            "The service's log has the traceback. Lamps go off by themselves if the service dies.",
-        ),
-    )
-}
+TABLE = """
+invalid-request 422 The request does not fit the schema
+    `errors` lists each field that is wrong and why. The schema is in /openapi.json.
+invalid-plan 422 This rig cannot shoot this plan
+    `problems` has one sentence for each reason. No lamp was touched. Correct the plan and try
+    it with `POST /plans:validate`.
+bad-input 422 A file or name in the request cannot be used
+    `detail` names it and says what was expected. Paths are those of the service's machine.
+busy 409 Another capture is running
+    The stage makes one capture at a time. Wait for `running`, or abort it.
+flash-rate 422 A living subject would see flashes of 3 to 30 Hz
+    `problems` has the ways out: a slower plan, or recorded consent that somebody at the stage
+    arms. docs/safety.md says why. No lamp was touched.
+unsafe 409 Nobody knows whether the lamps are off
+    The last blackout could not be verified. Look at the stage, put `detail` right, then `POST
+    /devices/blackout`; where the link cannot read back, `POST /devices/acknowledge`.
+cannot-acknowledge 409 This is not for a person to say
+    Nothing is latched, or the light bank can tell by itself: `POST /devices/blackout`.
+leased 409 Somebody else steers the stage
+    `holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are open to
+    everybody.
+no-lease 409 The token is no lease's
+    The lease has expired or was released. `GET /lease` says who holds one now.
+journal-in-use 409 The capture is being written or compressed
+    Wait until that is done; `GET /jobs` shows a compression.
+wrong-state 409 The capture's state does not allow this
+    `detail` lists what is possible now; `state` is where the capture is. Steps that the
+    trigger box clocks cannot pause.
+not-finished 409 The capture is not finished
+    Wait until its state is `done`; an interrupted capture has no manifest and cannot be
+    processed.
+unknown-capture 404 No such capture
+    `GET /captures` lists the captures.
+unknown-frame 404 No such step or camera
+    `detail` says which steps and cameras this capture has.
+missing-frame 404 The frame is missing
+    It was planned and did not come, or has not been shot yet; `detail` says which.
+unknown-job 404 No such job
+    `GET /jobs` lists the jobs.
+unknown-artifact 404 No such file in the model folder
+    `GET /jobs/{id}/artifacts` lists the files. Paths that lead out of the folder are not
+    followed.
+damaged-capture 500 The capture folder cannot be read
+    `detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.
+http 400 The request cannot be served
+    The status says why: no such route, method not allowed, or a host name that is not this
+    machine's.
+internal 500 A fault in the service
+    The service's log has the traceback. Lamps go off by themselves if the service dies.
+"""
+"""Each kind's anchor, status and title, and below them what to do about it."""
+
+
+def _kinds() -> Iterator[Kind]:
+    for entry in re.split(r"\n(?=\S)", TABLE.strip()):
+        first, _, help = entry.partition("\n")
+        slug, status, title = first.split(" ", 2)
+        yield Kind(slug, int(status), title, " ".join(help.split()))
+
+
+KINDS = {kind.slug: kind for kind in _kinds()}
 
 BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",

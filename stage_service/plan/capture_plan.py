@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from stage_service.config import Exposure, Level
+from stage_service.config import Exposure, Level, Strict
 
 Bracket = Annotated[float, Field(gt=0.0, le=1000.0)]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class KindExposures(_Model):
+class KindExposures(Strict):
     """Seconds per kind of step; None takes the rig file's."""
 
     dark: Exposure | None = None
@@ -25,7 +21,7 @@ class KindExposures(_Model):
     tracking: Exposure | None = None
 
 
-class KindLevels(_Model):
+class KindLevels(Strict):
     """Levels per kind of step, above 0 up to 1; None takes the rig file's."""
 
     all_on: Level | None = None
@@ -34,7 +30,7 @@ class KindLevels(_Model):
     tracking: Level | None = None
 
 
-class Rows(_Model):
+class Rows(Strict):
     """Scanlines `first`, `first + step`, … up to and including `last` (None: the last row)."""
 
     first: int = Field(default=0, ge=0)
@@ -42,7 +38,7 @@ class Rows(_Model):
     step: int = Field(default=1, ge=1)
 
 
-class CapturePlan(_Model):
+class CapturePlan(Strict):
     """What to shoot. The order is: dark, all on; each light alone; the sweep; dark, all on.
 
     `brackets` are factors on the exposure of a light alone: all lights at the first factor, then

@@ -5,20 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from reconstruction import Rig, Step
+from stage_service.config import Strict
 from stage_service.plan.flash import FlashRate
 
 EXR_HEADER_BYTES = 700
 """What an EXR file holds beside 12 bytes a pixel, not counting its table of lines."""
 
 
-class _Told(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class LeftOutWork(_Told):
+class LeftOutWork(Strict):
     """Work that this plan does not need on this rig."""
 
     what: str
@@ -26,7 +22,7 @@ class LeftOutWork(_Told):
     saved: str
 
 
-class PlanCost(_Told):
+class PlanCost(Strict):
     """What a plan takes, retries apart.
 
     `frames` counts pictures (steps times cameras), `bytes` what the capture folder gets while
