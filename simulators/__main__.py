@@ -14,10 +14,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from reconstruction.geometry.rig import RigError
-from simulators.frames.frames import FrameMaker, cache_key
+from simulators.frames.frames import FrameMaker, Sensor, cache_key
 from simulators.frames.render_process import RenderPool
 from simulators.frames.responses import Quality, Responder, reproducible
-from simulators.frames.sensor import Sensor
 from simulators.peers.devices import SimulatedStage
 from simulators.peers.faults import Faults
 from simulators.peers.lamps import Lamps

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from waiting import machine_slack, slowed
 
 from reconstruction import Rig
-from simulators.frames.frames import FrameMaker
+from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.responses import Response
-from simulators.frames.sensor import Sensor
 from simulators.peers.devices import DEVICES_FILE, SimulatedStage
 from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps

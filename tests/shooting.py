@@ -9,9 +9,8 @@ import numpy as np
 
 from reconstruction import Capture, CaptureWriter, Rig, Step
 from reconstruction.capture.folder import FrameRecord
-from simulators.frames.frames import FrameMaker, Snapshot
+from simulators.frames.frames import FrameMaker, Sensor, Snapshot
 from simulators.frames.responses import Responder
-from simulators.frames.sensor import Sensor
 from simulators.peers.projector_controller import FULL, Show
 
 

@@ -8,7 +8,7 @@ import struct
 import threading
 from typing import Any
 
-from simulators.frames.sensor import Sensor
+from simulators.frames.frames import Sensor
 from simulators.peers.tcp import TcpServer, exactly
 from simulators.world import World
 

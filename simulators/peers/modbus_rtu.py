@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from simulators.peers.modbus_faults import DisturbedUnit
+from simulators.peers.modbus_unit import DisturbedUnit
 from simulators.peers.terminal import TerminalPeer
 from stage_service.config import ModbusRtuConfig
 

@@ -6,7 +6,7 @@ import socket
 import struct
 import threading
 
-from simulators.peers.modbus_faults import DisturbedUnit
+from simulators.peers.modbus_unit import DisturbedUnit
 from simulators.peers.tcp import TcpServer, exactly
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol, bytes that follow, unit

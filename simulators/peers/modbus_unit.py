@@ -1,6 +1,7 @@
 """The light bank as a Modbus unit: its register map (docs/wire.md) and the functions it knows.
 
 Written from the Modbus Application Protocol Specification 1.1b3; it carries no framing.
+`DisturbedUnit` is the same behind a wire with faults.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from simulators.peers.faults import Fault
 from simulators.peers.lamps import ENTRIES, FULL, Lamps, NotNow
 from stage_service.config import LightRegisters
 
@@ -16,6 +18,8 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, FAILURE = 1, 2, 3, 4
 _MOST_READ, _MOST_WRITTEN = 125, 123
 _MOST_COILS_READ, _MOST_COILS_WRITTEN = 2000, 1968
 _ON, _OFF = 0xFF00, 0x0000
+GARBAGE = b"\x00\xffhs\x7f\x81\x00\x00\x55\xaa"
+_WRITES = (5, 6, 15, 16)
 
 
 class Refused(Exception):
@@ -167,6 +171,56 @@ class ModbusUnit:
     def _status(self) -> tuple[int, int]:
         bits, lit = self._lamps.status()
         return (bits & ~8, 0) if self._begun("lies") else (bits, lit)
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What goes back: nothing where `frame` is None; after `delay_s`; or the link goes away."""
+
+    frame: bytes | None = None
+    delay_s: float = 0.0
+    unplugged_s: float | None = None
+
+
+class DisturbedUnit:
+    """`unit`, its answers framed by `frame`. The fault that `strikes(request)` disturbs one answer.
+
+    A request is told to `strikes` as function code and address, "6 1000".
+    """
+
+    def __init__(
+        self,
+        unit: ModbusUnit,
+        strikes: Callable[[str], Fault | None] = lambda _request: None,
+        begun: Callable[[str], bool] = lambda _fault: False,
+    ) -> None:
+        self._unit = unit
+        self._strikes = strikes
+        self._begun = begun
+
+    def reply(self, request: bytes, frame: Callable[[bytes], bytes]) -> Reply:
+        """Carry a request out, unless the fault keeps it from that."""
+        if self._begun("hang"):
+            return Reply()
+        fault = self._strikes(f"{request[0]} {int.from_bytes(request[1:3], 'big')}")
+        kind = None if fault is None else fault.kind
+        if fault is not None and kind == "unplug":
+            return Reply(unplugged_s=fault.seconds)
+        nak = bytes([request[0] | 0x80, FAILURE])
+        answer = nak if kind == "nak" else self._unit.answer(request)
+        if kind == "echo" and answer[0] in _WRITES:
+            answer = answer[:-1] + bytes([answer[-1] ^ 1])
+        framed = frame(answer)
+        match kind:
+            case "silent":
+                return Reply()
+            case "garbage":
+                return Reply(GARBAGE)
+            case "noise":
+                return Reply(GARBAGE + framed)
+            case "crc":
+                return Reply(framed[:-1] + bytes([framed[-1] ^ 1]))
+        return Reply(framed, fault.seconds if fault is not None and kind == "late" else 0.0)
 
 
 def _parts(blocks: list[_Block], address: int, count: int) -> Iterator[tuple[_Block, int, int]]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from reconstruction import Mesh, Strands
 from reconstruction.arrays import Array, Ints
-from simulators.subject.head import HeadField
+from reconstruction.geometry.signed_distance import blend, ellipsoid
+from reconstruction.head.generic import HEAD_BOX, NECK_END, skin_distance
 
 # A human head: 100,000 fibres of 40 µm. Fewer, thicker strands keep its coverage.
 _COVERAGE = 100_000 * 40e-6
@@ -84,6 +87,46 @@ GROOMS = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class HeadField:
+    """Signed distance (metres, negative inside) and its gradient on a grid from `low` on."""
+
+    distance: Array
+    gradient: Array
+    low: Array
+    cell: float
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Distances `(N,)` and unit outward directions `(N, 3)` at `points (N, 3)`."""
+        at = ((points - self.low) / self.cell).T
+        distance, *gradient = (
+            map_coordinates(values, at, order=1, mode="nearest")
+            for values in (self.distance, *self.gradient)
+        )
+        out = np.stack(gradient, axis=1)
+        length = np.linalg.norm(out, axis=1, keepdims=True)
+        return distance / np.maximum(length[:, 0], 0.3), out / np.maximum(length, 1e-9)
+
+
+@cache
+def hair_field(cell: float = 0.004) -> HeadField:
+    """`_hair_distance` over the generic head's box, sampled every `cell` metres."""
+    axes = [np.arange(a, b + cell, cell) for a, b in HEAD_BOX.T]
+    distance = _hair_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    gradient = np.array(np.gradient(distance, cell))
+    return HeadField(distance, gradient, HEAD_BOX[0], cell)
+
+
+def _hair_distance(p: Array) -> Array:
+    """What hair slides along, metres `(...)` at `p (..., 3)`: the skin on an endless neck, filled
+    in front so that hair passes beside the face."""
+    lifted = p.copy()
+    lifted[..., 2] = NECK_END + 0.01
+    skin = skin_distance(np.where(p[..., 2:] < NECK_END + 0.01, lifted, p))
+    guard = ellipsoid(p, [0, -0.062, -0.040], [0.066, 0.075, 0.105])
+    return blend(skin, guard, 0.01)
+
+
 def covering_radius(strands: int) -> float:
     """Strand radius (metres) with which `strands` cover what a whole head of hair covers.
 
@@ -92,14 +135,12 @@ def covering_radius(strands: int) -> float:
     return float(np.clip(_COVERAGE / max(strands, 1), 40e-6, 1e-3))
 
 
-def grow(
-    groom: Groom, head: Mesh, field: HeadField, seed: int, count: int | None = None
-) -> Strands:
+def grow(groom: Groom, head: Mesh, seed: int, count: int | None = None) -> Strands:
     """Strands of `groom` rooted on the scalp of `head`; `count` overrides the number of strands.
 
     The same arguments give the same bytes. Raises `ValueError` when `head` has no scalp.
     """
-    rng = np.random.default_rng(seed)
+    rng, field = np.random.default_rng(seed), hair_field()
     roots, normals = _roots(head, count or groom.strands, rng)
     length = _lengths(groom, roots, rng)
     paths = _step(groom, roots, normals, length, field, rng)

@@ -16,7 +16,6 @@ from reconstruction.arrays import Array
 from reconstruction.files.strands import READABLE
 from reconstruction.head.generic import generic_head
 from simulators.subject.grooms import GROOMS, covering_radius, grow
-from simulators.subject.head import hair_field
 
 _APPEARANCE = {
     "wavy": HairAppearance((0.12, 0.24, 0.50), 0.28, 0.30),
@@ -73,7 +72,7 @@ def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subjec
     head = generic_head()
     # The three grooms of one seed are three heads of hair, not one with three settings.
     draw = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
-    hair = grow(GROOMS[name], head, hair_field(), draw, strands)
+    hair = grow(GROOMS[name], head, draw, strands)
     return Subject(name, hair, head, _APPEARANCE[name], _SKIN[name])
 
 

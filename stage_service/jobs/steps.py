@@ -10,13 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from reconstruction import Capture, Model, Progress
 from stage_service.jobs.records import JobOptions
-
-if TYPE_CHECKING:
-    from appearance import HeldOut
 
 Figures = dict[str, Any]
 
@@ -30,6 +27,19 @@ class StepContext:
     options: JobOptions
     progress: Progress
     previous: Mapping[str, Figures] = field(default_factory=dict)
+
+    def for_appearance(self) -> dict[str, Any]:
+        """What fits and assessment of the appearance take alike."""
+        from appearance import HeldOut
+
+        asked = self.options
+        return {
+            "capture": Capture(self.capture),
+            "model": self.model,
+            "held_out": HeldOut(asked.held_out_cameras, asked.held_out_lights),
+            "progress": self.progress,
+            "seed": asked.seed,
+        }
 
 
 def compress(context: StepContext) -> Figures:
@@ -58,14 +68,7 @@ def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
     from appearance import fit as run
 
-    run(
-        Capture(context.capture),
-        context.model,
-        held_out=_held_out(context.options),
-        options=context.options.fit,
-        progress=context.progress,
-        seed=context.options.seed,
-    )
+    run(**context.for_appearance(), options=context.options.fit)
     return {"appearance": "appearance.json"}
 
 
@@ -76,15 +79,7 @@ def inverse_rendering(context: StepContext) -> Figures:
     """
     from appearance import fit_maps as run
 
-    asked = context.options
-    found = run(
-        Capture(context.capture),
-        context.model,
-        held_out=_held_out(asked),
-        request=asked.inverse_rendering,
-        progress=context.progress,
-        seed=asked.seed,
-    )
+    found = run(**context.for_appearance(), request=context.options.inverse_rendering)
     return {"maps": "hair_maps.npz", "lights": "lights.json", **found}
 
 
@@ -92,15 +87,8 @@ def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
     from appearance import assess as run
 
-    return run(
-        Capture(context.capture),
-        context.model,
-        held_out=_held_out(context.options),
-        environment=context.options.environment,
-        options=context.options.assess,
-        seed=context.options.seed,
-        progress=context.progress,
-    )
+    asked = context.options
+    return run(**context.for_appearance(), environment=asked.environment, options=asked.assess)
 
 
 def evaluate(context: StepContext) -> Figures:
@@ -134,10 +122,9 @@ def results(context: StepContext) -> Figures:
     plot_report(report, plots)
     done = {step: result["figures"] for step, result in context.previous.items()}
     figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
-    if "assess" in done:
-        figures["images"] = done["assess"]
-    if "inverse_rendering" in done:
-        figures["inverse_rendering"] = done["inverse_rendering"]
+    for step, name in (("assess", "images"), ("inverse_rendering", "inverse_rendering")):
+        if step in done:
+            figures[name] = done[step]
     if "visible" in done.get("evaluate", {}):
         geometry = dict(done["evaluate"])
         for key in ("baselines", "appearance"):
@@ -150,18 +137,5 @@ def results(context: StepContext) -> Figures:
     return {"results": "results.json"}
 
 
-def _held_out(options: JobOptions) -> HeldOut:
-    from appearance import HeldOut
-
-    return HeldOut(options.held_out_cameras, options.held_out_lights)
-
-
-STEPS: dict[str, Callable[[StepContext], Figures]] = {
-    "compress": compress,
-    "reconstruct": reconstruct,
-    "fit": fit,
-    "inverse_rendering": inverse_rendering,
-    "assess": assess,
-    "evaluate": evaluate,
-    "results": results,
-}
+_ALL = (compress, reconstruct, fit, inverse_rendering, assess, evaluate, results)
+STEPS: dict[str, Callable[[StepContext], Figures]] = {step.__name__: step for step in _ALL}

@@ -17,9 +17,8 @@ from waiting import machine_slack
 
 from reconstruction import Camera, Light, Projector, Rig
 from reconstruction.geometry.lights import dome_positions
-from simulators.frames.frames import FrameMaker
+from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.responses import Response
-from simulators.frames.sensor import Sensor
 from simulators.peers.devices import SimulatedStage
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps

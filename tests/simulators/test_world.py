@@ -7,9 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from simulators.frames.frames import FrameMaker, Snapshot
+from simulators.frames.frames import FrameMaker, Sensor, Snapshot
 from simulators.frames.responses import Response
-from simulators.frames.sensor import Sensor
 from simulators.peers.faults import Faults
 from simulators.peers.lamps import Lamps
 from simulators.peers.projector_controller import Show

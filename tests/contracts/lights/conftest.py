@@ -14,9 +14,9 @@ import pytest
 from pyModbusTCP.server import DataHandler, ModbusServer
 from waiting import slowed
 
+from simulators.peers.devices import light_bank
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps
-from simulators.peers.light_bank import light_bank
 from stage_service.config import (
     DmxConfig,
     LightBankConfig,

@@ -14,7 +14,7 @@ from shooting import shoot
 
 from reconstruction import Camera, Capture, Light, Projector, Rig, Step
 from reconstruction.calibration.boards import Board, Sighting
-from simulators.frames.sensor import Sensor
+from simulators.frames.frames import Sensor
 from simulators.subject.props import Prop, PropResponder, SphereProp, board_pose
 
 POSES = (0, 1, 2, 13, 14, 15, 16, 17, 31)

@@ -10,9 +10,8 @@ import serial
 
 from simulators.peers.dmx_widget import DmxWidget
 from simulators.peers.lamps import Lamps
-from simulators.peers.modbus_faults import DisturbedUnit
 from simulators.peers.modbus_rtu import ModbusRtuPeer, with_crc
-from simulators.peers.modbus_unit import ModbusUnit
+from simulators.peers.modbus_unit import DisturbedUnit, ModbusUnit
 from stage_service.config import ModbusRtuConfig
 
 SELECT_2 = bytes.fromhex("07 06 03e8 0002")

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from waiting import until
 
 from reconstruction import Camera as CameraGeometry
-from simulators.frames.sensor import Sensor
+from simulators.frames.frames import Sensor
 from stage_service.acquisition.accounting import FrameAccount
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
