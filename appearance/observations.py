@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction import Camera, Capture, CaptureError, Light
+from reconstruction import Camera, Capture, CaptureError, Light, Model, ModelError
 from reconstruction.arrays import Bools, Floats, Ints
 
 
@@ -93,3 +93,20 @@ def chosen(mask: Bools, most: int, rng: np.random.Generator) -> Ints:
     """Flat indices `(P,)` of `most` pixels of `mask (H, W)` at random, or of all of fewer."""
     index = np.flatnonzero(mask)
     return index if len(index) <= most else np.sort(rng.choice(index, most, replace=False))
+
+
+def observe_hair(
+    capture: Capture, model: Model, lights: Sequence[str], most: int, rng: np.random.Generator
+) -> list[Observed]:
+    """`most` random hair pixels of each camera of `capture` under `lights`.
+
+    Raises `ModelError` where no camera sees hair.
+    """
+    seen = []
+    for camera in capture.rig.cameras:
+        pixels = chosen(model.mask(camera.name, "hair", capture), most, rng)
+        if len(pixels):
+            seen.append(observe(capture, camera.name, lights, pixels))
+    if not seen:
+        raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
+    return seen

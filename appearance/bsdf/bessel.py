@@ -30,12 +30,13 @@ def _coefficients(degree: int) -> tuple[float, ...]:
 def scaled_i0(x: Any) -> Any:
     """exp(-x) I0(x) for x >= 0, float32 or float64; relative error below 1e-6 or 1e-12."""
     single = dr.is_array_v(x) and dr.itemsize_v(x) == 4
+    first, *others = _coefficients(20 if single else 40)
     t = 1 - 2 * _CENTRE / (x + _CENTRE)
     b1: Any = 0.0
     b2: Any = 0.0
-    for c in reversed(_coefficients(20 if single else 40)[1:]):
+    for c in reversed(others):
         b1, b2 = 2 * t * b1 - b2 + c, b1
-    return (t * b1 - b2 + _coefficients(20 if single else 40)[0]) * dr.rsqrt(1 + x)
+    return (t * b1 - b2 + first) * dr.rsqrt(1 + x)
 
 
 def i0(x: Any) -> Any:

@@ -220,13 +220,8 @@ def sample(fibre: Fibre, wi: Any, u1: Any, u2: Any, u3: Any) -> tuple[Any, Any, 
     """
     k = known(fibre, wi)
     past, u = choose(k.choice, u1)
-    wo = _draw(
-        k,
-        (pick(past, k.sine), pick(past, k.cosine), pick(past, k.v)),
-        pick(past, (*k.turn, 0.0)),
-        past[-1],
-        (u, u2, u3),
-    )
+    m = (pick(past, k.sine), pick(past, k.cosine), pick(past, k.v))
+    wo = _draw(k, m, pick(past, (*k.turn, 0.0)), past[-1], (u, u2, u3))
     value, pdf = evaluate_known(k, wo)
     return wo, pdf, value / pdf
 

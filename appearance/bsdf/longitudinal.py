@@ -28,7 +28,7 @@ class ColourRange(UserWarning):
 
 
 def log_longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
-    """Logarithm of the longitudinal lobe M (Sun 2021, Eq. 8), broadcast over its arguments.
+    """Logarithm of the longitudinal lobe M (Sun 2021, Eq. 8), of the arguments' broadcast shape.
 
     M = I0(c/v) exp(-s/v - 1/v) / (v (1 - exp(-2/v))), c = cos cos, s = sin sin, normalised so that
     the integral of M cos(theta_o) over theta_o is 1. As printed it overflows below v = 0.0015 and
@@ -46,10 +46,7 @@ def log_longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Ar
 
 
 def longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
-    """The longitudinal lobe M itself, broadcast over its arguments; see `log_longitudinal`.
-
-    Far from the mirror direction it underflows to 0, as it should.
-    """
+    """The lobe M of `log_longitudinal`, of their broadcast shape; 0 where it underflows."""
     return np.exp(log_longitudinal(theta_i, theta_o, v))
 
 

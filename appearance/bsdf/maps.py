@@ -47,11 +47,9 @@ class HairMaps:
 
     @classmethod
     def of(cls, hair: HairAppearance, shape: tuple[int, int, int] = (1, 1, 1)) -> HairMaps:
-        """Maps of `shape` (n_c, w, h), absorption `(n_c, w, h, 3)`, that are `hair` everywhere."""
-        sigma_a = np.broadcast_to(hair.sigma_a, (*shape, 3))
-        return cls(
-            sigma_a, np.zeros((*shape, 2)), hair.beta_m, hair.beta_n, hair.eta, hair.tilt_deg
-        )
+        """Maps of `shape` (n_c, w, h) that are `hair` everywhere: `(n_c, w, h, 3)` and `(…, 2)`."""
+        sigma_a, rotation = np.broadcast_to(hair.sigma_a, (*shape, 3)), np.zeros((*shape, 2))
+        return cls(sigma_a, rotation, hair.beta_m, hair.beta_n, hair.eta, hair.tilt_deg)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -126,34 +124,31 @@ class MappedStrands:
 
     def with_maps(self, maps: HairMaps) -> HairScene:
         """The scene with the maps on its hair; geometry is shared."""
-        bsdf = mi.load_dict(
-            {
-                "type": "extended_hair",
-                "longitudinal_roughness": maps.beta_m,
-                "azimuthal_roughness": maps.beta_n,
-                "scale_tilt": -maps.tilt_deg,
-                "eta": maps.eta,
-                "sigma_a": mi.TensorXf(for_kernels(maps.sigma_a)),
-                "rotation": mi.TensorXf(for_kernels(maps.rotation)),
-                **self.coordinates,
-            }
-        )
+        values = {**_scalars(maps), **_tables(maps), **self.coordinates}
+        bsdf = mi.load_dict({"type": "extended_hair", **values})
         return replace(self.scene, hair=maps.mean(), hair_bsdf=bsdf)
 
     def update_maps(self, scene: HairScene, maps: HairMaps) -> HairScene:
         """`scene`, which `painted` made, with other maps on the same BSDF: `scene` changes too."""
         values = mi.traverse(scene.hair_bsdf)
-        values["sigma_a"] = mi.TensorXf(for_kernels(maps.sigma_a))
-        values["rotation"] = mi.TensorXf(for_kernels(maps.rotation))
-        for name, value in (
-            ("longitudinal_roughness", maps.beta_m),
-            ("azimuthal_roughness", maps.beta_n),
-            ("scale_tilt", -maps.tilt_deg),
-            ("eta", maps.eta),
-        ):
-            values[name] = opaque([value])[0]
+        scalars = {name: opaque([value])[0] for name, value in _scalars(maps).items()}
+        for name, value in {**_tables(maps), **scalars}.items():
+            values[name] = value
         values.update()
         return replace(scene, hair=maps.mean())
+
+
+def _scalars(maps: HairMaps) -> dict[str, float]:
+    return {
+        "longitudinal_roughness": maps.beta_m,
+        "azimuthal_roughness": maps.beta_n,
+        "scale_tilt": -maps.tilt_deg,
+        "eta": maps.eta,
+    }
+
+
+def _tables(maps: HairMaps) -> dict[str, Any]:
+    return {name: mi.TensorXf(for_kernels(getattr(maps, name))) for name in ("sigma_a", "rotation")}
 
 
 def scalp_coordinates(strands: Strands, head: Mesh | None) -> Array:

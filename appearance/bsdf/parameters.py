@@ -11,9 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.absorption import of_colour, of_melanin
-from appearance.bsdf.corrective import axis_in_frame
 from appearance.bsdf.lobes import Fibre
-from appearance.bsdf.shading_frame import ShadingFrame
+from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
 from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
 from reconstruction.array_backend import for_kernels
 
@@ -52,8 +51,6 @@ class HairParameters:
             self.values["rotation"] = _tensor("rotation", props["rotation"], 2, -np.pi, np.pi)
         self.scale = float(props.get("scale", 1.0))
         self.strands = {name: props[name] for name in NAMES if name in props}
-        self._constant: dict[str, Any] = {}
-        self._turns = False
         self.refresh()
         missing = sorted(set(NAMES) - set(self.strands))
         tables = [n for n, v in self.values.items() if _cells(v) > 1 or n == "rotation"]
@@ -65,12 +62,10 @@ class HairParameters:
 
     def refresh(self) -> None:
         """Look for tables that are constant: those are read without a lookup."""
-        for name in ("sigma_a", "rotation"):
-            if name in self.values:
-                self._constant[name] = _constant(self.values[name])
-        if "rotation" in self.values:
-            constant = self._constant["rotation"]
-            self._turns = constant is None or any(x[0] != 0 for x in constant)
+        tables = [name for name in ("sigma_a", "rotation") if name in self.values]
+        self._constant = {name: _constant(self.values[name]) for name in tables}
+        turn = self._constant.get("rotation", [])
+        self._turns = turn is None or any(x[0] != 0 for x in turn)
 
     def fibre(self, place: StrandHit) -> Fibre:
         """The fibre at a hit."""
@@ -92,15 +87,13 @@ class HairParameters:
     def frame(self, place: StrandHit) -> ShadingFrame:
         """The fibre's frame at a hit: its own direction, and the corrective of its cell."""
         tangent = place.tangent if self._many_segments() else None
-        if "rotation" not in self.values:
-            return ShadingFrame(tangent, None)
-        if not self._turns and not dr.grad_enabled(self.values["rotation"]):
-            return ShadingFrame(tangent, None)
+        straight = ShadingFrame(tangent, None)
+        if not self._turns and not dr.grad_enabled(self.values.get("rotation")):
+            return straight
         turn = self._look_up("rotation", mi.Vector2f, place)
-        normal = ShadingFrame(tangent, None).enter(place.si.to_local(place.normal))
-        return ShadingFrame(
-            tangent, mi.Vector3f(*axis_in_frame(turn.x, turn.y, normal.x, normal.z))
-        )
+        normal = straight.enter(place.si.to_local(place.normal))
+        axis = mi.Vector3f(*axis_in_frame(turn.x, turn.y, normal.x, normal.z))
+        return ShadingFrame(tangent, axis)
 
     def _many_segments(self) -> bool:
         """Whether the curves have more segments than Mitsuba finds a frame for."""

@@ -169,14 +169,9 @@ class _System:
                 self.left.append(np.where(channel == i, level, 0))
             else:
                 self.left.append(self._first_hit(raw, gain, number))
-        self.weight = np.concatenate(
-            [
-                losses.noise_weighted(
-                    np.where(s.valid[..., None], losses.weights(s.level), 0), squares
-                ).ravel()
-                for s, squares in zip(seen, self._split(noise), strict=True)
-            ]
-        )
+        weights = [np.where(s.valid[..., None], losses.weights(s.level), 0) for s in seen]
+        parts = zip(weights, self._split(noise), strict=True)
+        self.weight = np.concatenate([losses.noise_weighted(w, n).ravel() for w, n in parts])
 
     def step(self, raw: Raw, gain: Array, estimate: int) -> Array:
         """How far to move each number, by its width: the first estimate is from half the paths."""
@@ -221,12 +216,8 @@ class _System:
     ) -> Array:
         effort = replace(effort or self.effort, spp=spp)
         first = self.seed + number * len(self.patches)
-        return np.concatenate(
-            [
-                self.problem.render(raw, gain, patch, effort, first + k).ravel()
-                for k, patch in enumerate(self.patches)
-            ]
-        )
+        render, patches = self.problem.render, enumerate(self.patches)
+        return np.concatenate([render(raw, gain, p, effort, first + k).ravel() for k, p in patches])
 
     def _compared(self, picture: Array) -> list[Comparison]:
         parts = zip(self.patches, self._split(picture), strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -50,16 +51,9 @@ def judge(
     found: dict[str, list[dict[str, float]]] = {name: [] for name in scenes}
     rows: list[Row] = []
     for k, o in enumerate(frames):
+        spent = asdict(replace(sampling, seed=(sampling.seed << 8) + 91 + k))
         rendered = {
-            name: render_olat(
-                scene,
-                o.camera,
-                o.lights,
-                spp=sampling.spp,
-                max_depth=sampling.max_depth,
-                pixels=o.pixels,
-                seed=(sampling.seed << 8) + 91 + k,
-            )
+            name: render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent)
             for name, scene in scenes.items()
         }
         mask = np.zeros((o.camera.height, o.camera.width), bool)

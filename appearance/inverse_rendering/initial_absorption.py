@@ -19,7 +19,7 @@ from appearance.bsdf.parameters import StrandHit
 from appearance.inverse_rendering.batches import Patch
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import Problem
-from appearance.inverse_rendering.unknowns import BRACKET, LightDeviations, Raw, decode
+from appearance.inverse_rendering.unknowns import BRACKET, Raw, decode, encode_absorption
 from appearance.observations import Observed
 from appearance.render.paths import Surface, jittered, stream
 from reconstruction.array_backend import for_kernels
@@ -31,7 +31,7 @@ _WIDE = 0.02
 """Share of what a cell's far neighbours say: all that a cell has which no ray meets."""
 
 
-def initial_absorption(
+def absorption_of_cells(
     problem: Problem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 12, seed: int = 0
 ) -> HairMaps:
     """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
@@ -47,9 +47,7 @@ def initial_absorption(
     for k in range(rounds):
         sums = np.zeros((2, *maps.shape, 3))
         trial = replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
-        now = raw | {
-            "sigma_a": problem.encode(trial, LightDeviations.calibrated(len(gain)))["sigma_a"]
-        }
+        now = raw | {"sigma_a": encode_absorption(trial.sigma_a)}
         for i, o in enumerate(problem.views):
             lights = np.arange(len(o.lights))
             every = Patch(i, lights, np.ones(len(lights)), np.arange(len(o.pixels)))

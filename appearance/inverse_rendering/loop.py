@@ -17,14 +17,12 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Batch, Pairs
 from appearance.inverse_rendering.checkpoint import State
 from appearance.inverse_rendering.global_parameters import WIDE, Evidence, solve_global_parameters
-from appearance.inverse_rendering.initial_absorption import initial_absorption
+from appearance.inverse_rendering.initial_absorption import absorption_of_cells
 from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
 from appearance.inverse_rendering.problem import Objective, Problem, ValidationSet
 from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
-
-Shape = tuple[int, int, int]
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
 VARIANTS: dict[Variant, tuple[tuple[str, ...], bool]] = {
@@ -119,7 +117,8 @@ class _Fit:
     def run(self) -> Outcome:
         self.begun, self.worked = time.perf_counter(), time.process_time()
         if not self.pairs.used.any():
-            return self._unchanged("no pair of camera and light shows lit hair")
+            reason = "no pair of camera and light shows lit hair"
+            return Outcome(self.start, self.lights, reason, 0.0, 0.0, 0)
         state = self._begun()
         self.pairs.squared_error = state.tables["squared_error"]
         ended = "all steps taken" if self.free else "converged"
@@ -133,8 +132,7 @@ class _Fit:
                 if state.convergence.update(error) and self._level(state.step) == self._last_level:
                     ended = "converged"
                     break
-            reason = self._step(state)
-            if reason:
+            if reason := self._step(state):
                 ended = reason
                 break
         self.monitor.snapshot(time.process_time() - self.worked, decode(state.average))
@@ -144,9 +142,8 @@ class _Fit:
         """Validate a guess and report its error; CPU time for that does not count."""
         self.monitor.snapshot(time.process_time() - self.worked, decode(raw))
         paused = time.process_time()
-        error = self.problem.error(
-            raw, gain, self._validation, self.options.effort, self.seed << 16
-        )
+        effort, seed = self.options.effort, self.seed << 16
+        error = self.problem.error(raw, gain, self._validation, effort, seed)
         self.series.append((time.perf_counter() - self.begun, step, error))
         self.monitor.progress(f"{what}: error {max(error, 0.0) ** 0.5:.4f}", share)
         self.worked += time.process_time() - paused
@@ -180,16 +177,12 @@ class _Fit:
         for k in range(rounds):
             if cells:
                 self._record(raw, gain, "cells", 0.5 * k / rounds)
-            raw, gain = solve_global_parameters(
-                self.problem,
-                raw,
-                gain,
-                solves,
-                Evidence(self.spread, self.options.effort, (self.seed << 4) + k),
-                lambda what, share, k=k: self.monitor.progress(  # type: ignore[misc]
-                    what, 0.5 * (k + share) / rounds
-                ),
-            )
+
+            def progress(what: str, share: float, begun: int = k) -> None:
+                self.monitor.progress(what, 0.5 * (begun + share) / rounds)
+
+            evidence = Evidence(self.spread, self.options.effort, (self.seed << 4) + k)
+            raw, gain = solve_global_parameters(self.problem, raw, gain, solves, evidence, progress)
             self._record(raw, gain, "global parameters", 0.5 * (k + 1) / rounds)
             if cells:
                 raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
@@ -197,9 +190,8 @@ class _Fit:
 
     def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
         effort, seed = self.options.effort, (self.seed << 4) + number
-        return self._raw(
-            initial_absorption(self.problem, raw, gain, effort, rounds=rounds, seed=seed)
-        )
+        maps = absorption_of_cells(self.problem, raw, gain, effort, rounds=rounds, seed=seed)
+        return self._raw(maps)
 
     @cached_property
     def _fingerprint(self) -> str:
@@ -226,13 +218,10 @@ class _Fit:
         for k, batch in enumerate(self._batches(rng)):
             numbers = batch.view if options.common_numbers else state.step * options.images + k
             first = (self.seed << 20) + 2 * numbers
+            patch = self.problem.patch(batch, options.effort.pixels, rng)
+            objective = Objective(self.free, self.series[-1][2], smooth=k == 0)
             gradient, seen = self.problem.gradient(
-                state.raw,
-                state.gain,
-                self.problem.patch(batch, options.effort.pixels, rng),
-                Objective(self.free, self.series[-1][2], smooth=k == 0),
-                options.effort,
-                (first, first + 1),
+                state.raw, state.gain, patch, objective, options.effort, (first, first + 1)
             )
             if not all(np.isfinite(g).all() for g in gradient.values()):
                 return f"step {state.step}: the gradient is not finite"
@@ -259,9 +248,8 @@ class _Fit:
     def _pull_to_priors(self, raw: Raw, gradient: Raw) -> None:
         for name, spread in PRIORS.items():
             if name in gradient:
-                gradient[name] = gradient[name] + (
-                    PRIOR_WEIGHT * raw[name] / (raw[name].size * spread**2)
-                )
+                pull = PRIOR_WEIGHT * raw[name] / (raw[name].size * spread**2)
+                gradient[name] = gradient[name] + pull
 
     @property
     def _last_level(self) -> int:
@@ -273,7 +261,7 @@ class _Fit:
             return self._last_level
         return min(step * 6 // self.options.steps, self._last_level)
 
-    def _shape(self, level: int) -> Shape:
+    def _shape(self, level: int) -> tuple[int, int, int]:
         if not self.spatial:
             return 1, 1, 1
         layers, columns, rows = self.options.shape
@@ -296,12 +284,9 @@ class _Fit:
 
     @cached_property
     def _validation(self) -> ValidationSet:
+        start, effort = self._raw(self.start), self.options.effort
         return self.problem.validation(
-            self._raw(self.start),
-            self.lights.gain,
-            self.spread,
-            self.options.effort,
-            self.seed << 16,
+            start, self.lights.gain, self.spread, effort, self.seed << 16
         )
 
     def _judged(self, state: State, ended: str) -> Outcome:
@@ -313,29 +298,20 @@ class _Fit:
         if state.step:
             guesses.append((state.first, found, f"{ended}; kept the first maps, which are better"))
         if (found != self.lights.gain).any():
-            guesses.append(
-                (start, found, f"{ended}; kept all but the intensities, which is better")
-            )
+            kept = f"{ended}; kept all but the intensities, which is better"
+            guesses.append((start, found, kept))
         guesses.append((start, self.lights.gain, f"{ended}; kept the start, which is better"))
-        errors = [
-            self.problem.error(raw, gain, self._validation, effort, seed)
-            for raw, gain, _ in guesses
-        ]
+        validation = self._validation
+        errors = [self.problem.error(r, g, validation, effort, seed) for r, g, _ in guesses]
         best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
         raw, gain, how = guesses[best]
         self.series.append((time.perf_counter() - self.begun, state.step, errors[best]))
         if best == len(errors) - 1:
             # in cells, though all alike: the next variant need not tell them apart again
-            maps = self.start.resized(raw["sigma_a"].shape[:3])
-            return Outcome(
-                maps, self.lights, how, errors[best], errors[best], state.step, self.series
-            )
-        profile = np.exp(raw["profile"])[self.problem.profile_of]
-        lights = LightDeviations(raw["position"], raw["turn"], gain, profile)
-        return Outcome(decode(raw), lights, how, errors[-1], errors[best], state.step, self.series)
-
-    def _unchanged(self, reason: str) -> Outcome:
-        return Outcome(self.start, self.lights, reason, 0.0, 0.0, 0)
+            maps, lights = self.start.resized(raw["sigma_a"].shape[:3]), self.lights
+        else:
+            maps, lights = decode(raw), self.problem.deviations(raw, gain)
+        return Outcome(maps, lights, how, errors[-1], errors[best], state.step, self.series)
 
 
 def _copied(raw: Raw) -> Raw:

@@ -15,12 +15,12 @@ from appearance.inverse_rendering.options import InverseRenderingOptions, Invers
 from appearance.inverse_rendering.problem import Problem
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
-from appearance.observations import HeldOut, Observed, chosen, observe
+from appearance.observations import HeldOut, observe_hair
 from appearance.render.bounces import bounce_limit
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, Strands, silent
+from reconstruction import Capture, Mesh, Model, Progress, Stage, Strands, silent
 from reconstruction.arrays import Array
 from reconstruction.report.report import Series
 
@@ -53,13 +53,14 @@ def fit_maps(
     report = model.report()
     with report.stage("inverse_rendering") as stage:
         progress("reading hair pixels", 0.0)
-        views = _views(training, model, request.hair_pixels, seed)
+        rng = np.random.default_rng(seed)
+        views = observe_hair(training, model, training.olat_lights(), request.hair_pixels, rng)
         scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
         mapped = MappedStrands.of(scene, strands, root_uv(model, strands, head))
         depth = request.max_depth
         if depth is None:
-            look = views[0]
-            found = bounce_limit(scene, look.camera, 0.01, pixels=look.pixels, seed=seed)
+            o = views[0]
+            found = bounce_limit(scene, o.camera, 0.01, pixels=o.pixels, seed=seed)
             depth = min(found.depth, MOST_DEPTH)
         options = replace(request.fit, effort=replace(request.fit.effort, max_depth=depth))
         problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
@@ -118,36 +119,15 @@ class _Fit:
     ) -> Outcome:
         """Fit from `maps` and `lights`; `part` is what it is of the progress."""
         begin, end = part
-        outcome = run(
-            self.problem,
-            maps,
-            lights,
-            options=options,
-            monitor=Monitor(
-                lambda what, share: self.progress(what, begin + (end - begin) * share),
-                self.model.checkpoint(options.variant),
-            ),
-            seed=self.seed,
+        monitor = Monitor(
+            lambda what, share: self.progress(what, begin + (end - begin) * share),
+            self.model.checkpoint(options.variant),
         )
-        series = Series(
-            f"inverse rendering, {options.variant}",
-            "weighted mean squared difference, noise taken off",
-        )
+        outcome = run(self.problem, maps, lights, options=options, monitor=monitor, seed=self.seed)
+        measured = "weighted mean squared difference, noise taken off"
+        series = Series(f"inverse rendering, {options.variant}", measured)
         series.points = [(seconds, error) for seconds, _, error in outcome.history]
         self.stage.series.append(series)
         if outcome.steps < options.steps and outcome.ended != "converged":
             self.stage.warn(f"{options.variant}: {outcome.ended}")
         return outcome
-
-
-def _views(training: Capture, model: Model, hair_pixels: int, seed: int) -> list[Observed]:
-    rng = np.random.default_rng(seed)
-    lights = training.olat_lights()
-    views = []
-    for name in [c.name for c in training.rig.cameras]:
-        pixels = chosen(model.mask(name, "hair", training), hair_pixels, rng)
-        if len(pixels):
-            views.append(observe(training, name, lights, pixels))
-    if not views:
-        raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
-    return views

@@ -20,7 +20,7 @@ from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
-from reconstruction import Light
+from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Ints
 
@@ -91,7 +91,8 @@ class Problem:
         weight = losses.gradient(difference, seen.level, seen.valid, objective.error)
         # a pair's loss is its mean over pixels; losses.gradient took the mean over pairs too
         weight *= patch.share[:, None, None] * len(patch.lights) * self.scale
-        op = self._op(raw, gain, patch, effort)
+        sampling = ReplaySampling(effort.gradient_spp, effort.max_depth, effort.rr_depth)
+        op = DifferentiableOlat(*self._seen(raw, gain, patch), sampling)
         values = hair_values(leaves)
         values |= self._light_values(op, leaves, objective.free, patch.lights)
         known = op.parameters() | {k: dr.detach(v) for k, v in values.items()}
@@ -112,14 +113,9 @@ class Problem:
         values = []
         for patch, share in validation:
             a, b = self._twice(raw, gain, patch, effort, seed)
-            values.append(
-                losses.squares(
-                    a.rendered - a.captured,
-                    b.rendered - b.captured,
-                    share * losses.weights(0.5 * (a.level + b.level)),
-                    a.valid,
-                )
-            )
+            one, other = (x.rendered - x.captured for x in (a, b))
+            weight = share * losses.weights(0.5 * (a.level + b.level))
+            values.append(losses.squares(one, other, weight, a.valid))
         return float(np.mean(values)) if values else 0.0
 
     def validation(
@@ -144,7 +140,7 @@ class Problem:
         return self.compare(patch, one), self.compare(patch, other)
 
     def compare(self, patch: Patch, rendered: Array) -> Comparison:
-        """`rendered (k, P, 3)` beside what was captured of a patch."""
+        """`rendered (k, P, 3)` beside what was captured of a patch, `(P,)` pixels."""
         o = self.views[patch.view]
         captured = o.radiance[patch.lights][:, patch.few].astype(float) * self.scale
         level = self._level[patch.view][patch.lights][:, patch.few].astype(float)
@@ -154,24 +150,15 @@ class Problem:
 
     def render(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> Array:
         """A patch under `gain (L,)` in exposure units `(k, P, 3)`."""
-        moved = self.lights_at(raw, gain)
-        o = self.views[patch.view]
-        radiance = render_olat(
-            self._scene_of(raw),
-            o.camera,
-            [moved[i] for i in patch.lights],
-            spp=effort.spp,
-            max_depth=effort.max_depth,
-            thrift=0,
-            seed=seed,
-            pixels=o.pixels[patch.few],
-        )
+        *seen, pixels = self._seen(raw, gain, patch)
+        spp, depth = effort.spp, effort.max_depth
+        radiance = render_olat(*seen, spp=spp, max_depth=depth, thrift=0, seed=seed, pixels=pixels)
         return radiance.astype(float) * self.scale
 
-    def lights_at(self, raw: Raw, gain: Array) -> list[Light]:
-        """All lights as `raw` and `gain (L,)` have them."""
+    def deviations(self, raw: Raw, gain: Array) -> LightDeviations:
+        """How `raw` and `gain (L,)` have the lights."""
         profile = np.exp(raw["profile"])[self.profile_of]
-        return LightDeviations(raw["position"], raw["turn"], gain, profile).applied(self.lights)
+        return LightDeviations(raw["position"], raw["turn"], gain, profile)
 
     def spread(self, pairs: Pairs, views: int, images: int) -> list[Batch]:
         """Some views and lights, spread evenly over what is used."""
@@ -191,17 +178,12 @@ class Problem:
         self._scene = self.mapped.update_maps(self._scene, maps)
         return self._scene
 
-    def _op(self, raw: Raw, gain: Array, patch: Patch, effort: Effort) -> DifferentiableOlat:
-        scene = self._scene_of(raw)
-        moved = self.lights_at(raw, gain)
-        o = self.views[patch.view]
-        return DifferentiableOlat(
-            scene,
-            o.camera,
-            [moved[i] for i in patch.lights],
-            o.pixels[patch.few],
-            ReplaySampling(effort.gradient_spp, effort.max_depth, effort.rr_depth),
-        )
+    def _seen(
+        self, raw: Raw, gain: Array, patch: Patch
+    ) -> tuple[HairScene, Camera, list[Light], Ints]:
+        """Scene, camera, lights and pixels of a patch, as `raw` and `gain (L,)` have them."""
+        moved, o = self.deviations(raw, gain).applied(self.lights), self.views[patch.view]
+        return self._scene_of(raw), o.camera, [moved[i] for i in patch.lights], o.pixels[patch.few]
 
     def _light_values(
         self,
@@ -216,9 +198,8 @@ class Problem:
         rows = (lights[:, None] * 3 + np.arange(3)).ravel()
         for name, parameter in (("position", "lights.position"), ("turn", "lights.turn")):
             if name in free:
-                moved = dr.gather(
-                    mi.Float, leaves[name].array, mi.UInt32(for_kernels(rows, np.uint32))
-                )
+                index = mi.UInt32(for_kernels(rows, np.uint32))
+                moved = dr.gather(mi.Float, leaves[name].array, index)
                 moved = moved - dr.detach(moved)
                 out[parameter] = known[parameter] + mi.TensorXf(moved, (len(lights), 3))
         if "profile" in free:

@@ -73,7 +73,7 @@ class LightDeviations:
 def encode(maps: HairMaps, lights: LightDeviations, profile_of: Ints) -> Raw:
     """The unconstrained numbers of `maps` and `lights`; `profile_of (L,)` numbers the profiles."""
     raw = {
-        "sigma_a": _logit_of_colour(-BRACKET * np.sqrt(np.maximum(maps.sigma_a, 1e-12))),
+        "sigma_a": encode_absorption(maps.sigma_a),
         "rotation": MOST_TURN * np.arctanh(np.clip(maps.rotation / MOST_TURN, -0.999, 0.999)),
         "tilt_deg": np.array(
             [MOST_TILT * np.arctanh(np.clip(maps.tilt_deg / MOST_TILT, -0.99, 0.99))]
@@ -117,8 +117,9 @@ def decode(raw: Raw) -> HairMaps:
     )
 
 
-def _logit_of_colour(log_colour: Array) -> Array:
-    """logit C from log C, both ends kept: C to 1e-7 from 1 and down to any blackness."""
+def encode_absorption(sigma_a: Array) -> Array:
+    """The logit of the colour C of `sigma_a (…, 3)`: to 1e-7 from 1 and down to any blackness."""
+    log_colour = -BRACKET * np.sqrt(np.maximum(sigma_a, 1e-12))
     short = np.maximum(-np.expm1(log_colour), 1e-7)
     return log_colour - np.log(short)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import Surface
-from appearance.render.tracing import PathLimits, PathPlan, Paths, follow
+from appearance.render.tracing import PathLimits, PathPlan, Paths, add_light, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera
@@ -80,11 +80,8 @@ def _by_depth(scene: HairScene, camera: Camera, index: Ints, spp: int, seed: int
 
     def escape(ray: Any, paths: Paths) -> None:
         left = paths.active & (paths.depth > 0)
-        for channel in range(3):
-            put = ((paths.depth - 1) * 3 + channel) * slots + paths.slot
-            dr.scatter_add(
-                film, paths.throughput[channel], put, left, mode=dr.ReduceMode.NoConflicts
-            )
+        first = (paths.depth - 1) * 3 * slots + paths.slot
+        add_light(film, paths.throughput, first, left, slots)
 
     # one ray more than vertices: the light of the last vertex is the ray that leaves it
     plan = PathPlan(spp, (seed, _STREAM), PathLimits(_LONGEST + 1, _ROULETTE))

@@ -26,30 +26,25 @@ from numpy.typing import ArrayLike
 
 from appearance.render.lights import LightBank
 from appearance.render.paths import Surface, Wave, continue_path, each_sample, pixel_indices
+from appearance.render.tracing import Count
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import Ints
+from reconstruction.options import options
 
 _GRADIENT_STREAM = 1 << 29
 _UNITS = {"lights.position": SCALE, "lights.intensity": SCALE**2, "lights.turn": 1.0}
 
 
-@dataclass(frozen=True)
+@options
 class ReplaySampling:
     """`spp` paths a pixel of at most `max_depth` vertices, with roulette from vertex `rr_depth`."""
 
-    spp: int = 32
-    max_depth: int = 8
+    spp: Count = 32
+    max_depth: Count = 8
     rr_depth: int = 4
-
-    def __post_init__(self) -> None:
-        if self.spp < 1 or self.max_depth < 1:
-            raise ValueError(
-                f"spp and max_depth must be positive, got {self.spp}, {self.max_depth}"
-            )
 
 
 SAMPLING = ReplaySampling()
@@ -191,13 +186,8 @@ class DifferentiableOlat:
         return {k: dr.grad(leaves[k]) * _UNITS.get(k, 1.0) for k in wanted}
 
     def _each_sample(self, seed: int, trace: Any) -> None:
-        each_sample(
-            self.camera, _array(self.index), len(self.index), self.sampling.spp, (seed,), trace
-        )
-
-
-def _array(index: Ints) -> Any:
-    return mi.UInt32(for_kernels(index, np.uint32))
+        index = mi.UInt32(for_kernels(self.index, np.uint32))
+        each_sample(self.camera, index, len(self.index), self.sampling.spp, seed, trace)
 
 
 def _operation() -> Any:

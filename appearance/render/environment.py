@@ -17,7 +17,15 @@ import numpy as np
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.paths import Surface, camera_rays
-from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
+from appearance.render.tracing import (
+    SAMPLING,
+    PathLimits,
+    PathPlan,
+    Paths,
+    Sampling,
+    add_light,
+    follow,
+)
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
@@ -52,19 +60,13 @@ def render_environment(
         gather = _Gather(Surface(scene), film, sky)
 
         def missed(ray: Any, paths: Paths) -> None:
-            _add(film, paths.slot, sky.radiance(ray.d), paths.active & (paths.depth == 0))
+            add_light(film, sky.radiance(ray.d), paths.slot * 3, paths.active & (paths.depth == 0))
 
         plan = PathPlan(sampling.spp, (sampling.seed,), PathLimits(sampling.max_depth))
         escape = missed if background else None
         follow(gather.surface, camera, index, plan, gather, escape)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(sampling.spp)
     return image.reshape(camera.height, camera.width, 3)
-
-
-def _add(film: Any, slot: Any, value: Any, active: Any) -> None:
-    for channel in range(3):
-        put = slot * 3 + channel
-        dr.scatter_add(film, value[channel], put, active, mode=dr.ReduceMode.NoConflicts)
 
 
 @dataclass(frozen=True)
@@ -134,4 +136,4 @@ class _Gather:
         value = paths.throughput * light * answer
         lit = paths.active & (dr.max(value) > 0)
         lit &= ~self.surface.scene.mi_scene.ray_test(si.spawn_ray(towards), lit)
-        _add(self.film, paths.slot, value, lit)
+        add_light(self.film, value, paths.slot * 3, lit)

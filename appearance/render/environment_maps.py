@@ -46,28 +46,27 @@ def check_environment(envmap: AnyFloats, name: str) -> Floats:
 
 
 def studio(height: int = 128) -> Floats:
-    """A dim grey room of shape `(height, 2 height, 3)` with key, cool fill and warm rim.
+    """A dim grey room `(h, 2 h, 3)` with key, cool fill and warm rim; `height` is h.
 
     The key is in front of a subject that faces −y, high on its right; mean radiance about 1.
     """
     direction = _directions(height)
     image = np.empty((height, 2 * height, 3), np.float32)
     image[:] = (0.08 + 0.06 * np.clip(direction[..., 2:] + 0.5, 0, 1)) * np.array([1, 1, 1.05])
-    for azimuth, elevation, half_width, half_height, colour in (
-        (-125.0, 38.0, 22.0, 18.0, (22.0, 20.5, 18.5)),
-        (-40.0, 12.0, 26.0, 30.0, (2.2, 2.6, 3.2)),
-        (75.0, 42.0, 12.0, 20.0, (26.0, 22.0, 17.0)),
+    for middle, half, colour in (
+        ((-125.0, 38.0), (22.0, 18.0), (22.0, 20.5, 18.5)),
+        ((-40.0, 12.0), (26.0, 30.0), (2.2, 2.6, 3.2)),
+        ((75.0, 42.0), (12.0, 20.0), (26.0, 22.0, 17.0)),
     ):
-        image += _soft_box(direction, azimuth, elevation, half_width, half_height)[
-            ..., None
-        ] * np.array(colour, np.float32)
+        box = _soft_box(direction, middle, half)[..., None]
+        image += box * np.array(colour, np.float32)
     return image
 
 
 def sky(
     height: int = 128, sun_azimuth_deg: float = -120.0, sun_elevation_deg: float = 40.0
 ) -> Floats:
-    """A clear sky of shape `(height, 2 height, 3)`, a sun 4° wide, over grey ground.
+    """A clear sky `(h, 2 h, 3)`, a sun 4° wide, over grey ground; `height` is h.
 
     A gradient from a pale horizon to a blue zenith with a glow about the sun; not a physical sky
     model. Azimuth in the world's frame, from +x towards +y.
@@ -101,17 +100,15 @@ def _unit(azimuth_deg: float, elevation_deg: float) -> Array:
 
 
 def _soft_box(
-    direction: Array,
-    azimuth_deg: float,
-    elevation_deg: float,
-    half_width_deg: float,
-    half_height_deg: float,
+    direction: Array, middle_deg: tuple[float, float], half_deg: tuple[float, float]
 ) -> Floats:
-    """Share `(h, w)` of a rectangle on the sphere, its edge soft over 2°."""
+    """Share `(h, w)` of a rectangle (azimuth, elevation) on the sphere, its edge soft over 2°."""
     elevation = np.degrees(np.arcsin(np.clip(direction[..., 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(direction[..., 1], direction[..., 0]))
-    across = np.abs((azimuth - azimuth_deg + 180) % 360 - 180)
-    along = np.abs(elevation - elevation_deg)
-    edge_x = np.clip((half_width_deg - across) / 2 + 0.5, 0, 1)
-    edge_y = np.clip((half_height_deg - along) / 2 + 0.5, 0, 1)
+    across = np.abs((azimuth - middle_deg[0] + 180) % 360 - 180)
+    along = np.abs(elevation - middle_deg[1])
+    edge_x, edge_y = (
+        np.clip((half - off) / 2 + 0.5, 0, 1)
+        for half, off in zip(half_deg, (across, along), strict=True)
+    )
     return (edge_x * edge_y).astype(np.float32)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.bsdf.corrective import rodrigues
+from appearance.bsdf.shading_frame import rodrigues
 from appearance.scene.hair_scene import SCALE, light_arrays
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction import Light

@@ -17,7 +17,15 @@ from appearance.render.environment_maps import check_environment
 from appearance.render.lights import LightBank
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface
-from appearance.render.tracing import SAMPLING, PathLimits, PathPlan, Paths, Sampling, follow
+from appearance.render.tracing import (
+    SAMPLING,
+    PathLimits,
+    PathPlan,
+    Paths,
+    Sampling,
+    add_light,
+    follow,
+)
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
 from reconstruction import Camera, Light
@@ -90,17 +98,11 @@ def _choice(
     if len(lights) < 2:
         return np.ones(len(lights))
     few = index[:: max(1, len(index) // _PILOT)]
-    mean = render_olat(
-        scene,
-        camera,
-        lights,
-        spp=4,
-        max_depth=sampling.max_depth,
-        seed=sampling.seed + _PILOT_STREAM,
-        pixels=few,
-        thrift=0,
-    ).mean(axis=1)
-    share = np.abs(mean * weight).sum(axis=1)
+    seed, depth = sampling.seed + _PILOT_STREAM, sampling.max_depth
+    pilot = render_olat(
+        scene, camera, lights, spp=4, max_depth=depth, seed=seed, pixels=few, thrift=0
+    )
+    share = np.abs(pilot.mean(axis=1) * weight).sum(axis=1)
     uniform = np.full(len(lights), 1 / len(lights))
     total = share.sum()
     return uniform if total == 0 else (1 - _SPREAD) * share / total + _SPREAD * uniform
@@ -136,6 +138,4 @@ class _Gather:
     def _add(self, value: Any, ray: Any, paths: Paths) -> None:
         lit = paths.active & (dr.max(dr.abs(value)) > 0)
         lit &= ~self.surface.scene.mi_scene.ray_test(ray, lit)
-        for channel in range(3):
-            put = paths.slot * 3 + channel
-            dr.scatter_add(self.film, value[channel], put, lit, mode=dr.ReduceMode.NoConflicts)
+        add_light(self.film, value, paths.slot * 3, lit)

@@ -220,7 +220,7 @@ def each_sample(
     pixels: Any,
     slots: int,
     spp: int,
-    seeds: tuple[int, ...],
+    seed: int,
     trace: Callable[[Wave], None],
 ) -> None:
     """Call `trace` with samples 0 to `spp` of each of the `slots` Dr.Jit `pixels`, one at a time.
@@ -231,7 +231,7 @@ def each_sample(
     """
     slot = dr.arange(mi.UInt32, slots)
     size, end = opaque_index(slots), opaque_index(spp)
-    start = seed_state(*seeds)
+    start = seed_state(seed)
     generator: Any = mi.PCG32  # the stubs call it a plain object
 
     def more(sample: Any) -> Any:

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
-from appearance.render.tracing import LANE_BYTES, PathLimits, PathPlan, Paths, follow
+from appearance.render.tracing import (
+    Count,
+    PathLimits,
+    PathPlan,
+    Paths,
+    add_light,
+    follow,
+    tile_count,
+)
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction import Camera, Projector
 from reconstruction.arrays import Floats, Ints
+from reconstruction.options import options
 
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31
 _REACH = 4.0  # standard deviations of the line's blur beyond which a row is not asked
 
 
-@dataclass(frozen=True)
+@options
 class ScanlineOptions:
     """How `render_scanlines` spends its time.
 
@@ -33,18 +43,10 @@ class ScanlineOptions:
     here a path costs more than its shadow rays, and fewer of them are spared.
     """
 
-    spp: int = 16
-    max_depth: int | None = None
-    thrift: float = 0.2
-    memory: int = 1 << 30
-
-    def __post_init__(self) -> None:
-        depth = 1 if self.max_depth is None else self.max_depth
-        if min(self.spp, self.memory, depth) < 1 or not self.thrift >= 0:
-            raise ValueError(
-                "spp, max_depth and memory must be positive and thrift 0 or more, "
-                f"got {self.spp}, {self.max_depth}, {self.memory}, {self.thrift}"
-            )
+    spp: Count = 16
+    max_depth: Count | None = None
+    thrift: Annotated[float, Field(ge=0)] = 0.2
+    memory: Count = 1 << 30
 
 
 def render_scanlines(
@@ -63,7 +65,7 @@ def render_scanlines(
     indices). Every vertex of a camera path that a projector sees lies on one fractional row of it:
     its light goes to the few rows within reach of the line's blur (`Projector.row_weight`), so one
     pass answers the whole sweep. The sum over all rows is that projector with all rows on.
-    `rows` limits a projector to a range of its rows; `options` are those of `ScanlineOptions`. A
+    `rows` limits a projector to a range of its rows; `options` are as in `ScanlineOptions`. A
     moved subject is rendered with the camera and the projectors `moved` instead: the scene stays as
     it is.
     """
@@ -72,9 +74,13 @@ def render_scanlines(
     size = camera.height * camera.width if pixels is None else len(index)
     out = {p.name: np.zeros((len(r), size, 3), np.float32) for p, r in sweep}
     chosen = ScanlineOptions(**options)
-    for part, films in _tiles(scene, camera, sweep, index, chosen, seed):
-        for name, film in films.items():
-            out[name][:, index[part] if pixels is None else part] = film
+    if len(index):
+        plan = _plan(scene, camera, sweep, index, chosen, seed)
+        tiles = tile_count(index, 3 * 12 * sum(len(r) for _, r in sweep), chosen.memory)
+        for k in range(tiles):
+            part = slice(k, None, tiles)
+            for name, film in plan.render(index[part], chosen.spp, (seed, k)).items():
+                out[name][:, index[part] if pixels is None else part] = film
     if pixels is not None:
         return out
     return {n: o.reshape(len(o), camera.height, camera.width, 3) for n, o in out.items()}
@@ -105,65 +111,49 @@ def _rows(projector: Projector, rows: range | None) -> range:
 class _Plan:
     """What is swept, and how paths and shadow rays are spent; `dim` as in `PointSource`."""
 
+    scene: HairScene
+    camera: Camera
     sweep: Sweep
     limits: PathLimits
     dim: tuple[float, ...]
 
+    def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> dict[str, Floats]:
+        """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
+        n = len(index)
+        surface, slots = Surface(self.scene), opaque_index(n)
+        gathers = [
+            _Gather(surface, dr.zeros(mi.Float, 3 * len(rows) * n), slots, p, rows, dim)
+            for (p, rows), dim in zip(self.sweep, self.dim, strict=True)
+        ]
 
-def _tiles(
+        def gather(si: Any, paths: Paths) -> None:
+            for one in gathers:
+                one(si, paths)
+
+        follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
+        out = {}
+        for one in gathers:
+            film = np.array(one.film).reshape(len(one.rows), 3, n).transpose(0, 2, 1)
+            out[one.projector.name] = np.asarray(film / np.float32(spp), np.float32)
+        return out
+
+
+def _plan(
     scene: HairScene,
     camera: Camera,
     sweep: Sweep,
     index: Ints,
     options: ScanlineOptions,
     seed: int,
-) -> Iterator[tuple[slice, dict[str, Floats]]]:
-    """Slices of `index` and the rows' radiance `(rows, P, 3)` at their pixels."""
-    if not len(index):
-        return
-    depth = options.max_depth
-    if depth is None:
-        depth = bounce_limit(scene, camera, pixels=index, seed=seed).depth
-    plan = _Plan(sweep, PathLimits(depth), (0.0,) * len(sweep))
+) -> _Plan:
+    depth = options.max_depth or bounce_limit(scene, camera, pixels=index, seed=seed).depth
+    plan = _Plan(scene, camera, sweep, PathLimits(depth), (0.0,) * len(sweep))
     if options.thrift > 0:
-        few = index[:: -(-len(index) // _PILOT)]
-        films = _render(scene, camera, few, plan, 1, (seed, _PILOT_STREAM))
+        films = plan.render(index[:: -(-len(index) // _PILOT)], 1, (seed, _PILOT_STREAM))
         brought = [f.sum(0).max(-1) for f in films.values()]
         dim = (options.thrift * float(np.sqrt((b**2).mean())) for b in brought)
         plan = replace(plan, dim=tuple(dim))
-    each = 3 * 12 * sum(len(r) for _, r in sweep) + LANE_BYTES
-    tiles = -(-len(index) // max(1, options.memory // each))
-    for k in range(tiles):
-        part = slice(k, None, tiles)
-        yield part, _render(scene, camera, index[part], plan, options.spp, (seed, k))
-
-
-def _render(
-    scene: HairScene,
-    camera: Camera,
-    index: Ints,
-    plan: _Plan,
-    spp: int,
-    seed: tuple[int, int],
-) -> dict[str, Floats]:
-    """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
-    n = len(index)
-    surface, slots = Surface(scene), opaque_index(n)
-    gathers = [
-        _Gather(surface, dr.zeros(mi.Float, 3 * len(rows) * n), slots, p, rows, dim)
-        for (p, rows), dim in zip(plan.sweep, plan.dim, strict=True)
-    ]
-
-    def gather(si: Any, paths: Paths) -> None:
-        for one in gathers:
-            one(si, paths)
-
-    follow(surface, camera, index, PathPlan(spp, seed, plan.limits), gather)
-    out = {}
-    for one in gathers:
-        film = np.array(one.film).reshape(len(one.rows), 3, n).transpose(0, 2, 1)
-        out[one.projector.name] = np.asarray(film / np.float32(spp), np.float32)
-    return out
+    return plan
 
 
 @dataclass(frozen=True)
@@ -212,11 +202,8 @@ class _Gather:
             above = dr.erf((mi.Float(row) - v + 0.5) * slope)
             weight = 0.5 * (above - below)
             inside = seen & (row >= start) & (row < stop)
-            for channel in range(3):
-                put = (mi.UInt32(row - start) * 3 + channel) * self.slots + slot
-                dr.scatter_add(
-                    self.film, value[channel] * weight, put, inside, mode=dr.ReduceMode.NoConflicts
-                )
+            first = mi.UInt32(row - start) * 3 * self.slots + slot
+            add_light(self.film, value * weight, first, inside, self.slots)
             return j + 1, above
 
         below = dr.erf((mi.Float(lowest) - v - 0.5) * slope)

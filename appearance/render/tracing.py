@@ -4,23 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from pydantic import Field
 
-from appearance.render.paths import Surface, jittered
+from appearance.render.paths import Surface, jittered, seed_state
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
+from reconstruction.options import options
 
 LANE_BYTES = 512
 """What a path in flight takes, about."""
 
 
-@dataclass(frozen=True)
+Count = Annotated[int, Field(gt=0)]
+
+
+@options
 class PathLimits:
     """How far paths go.
 
@@ -30,30 +35,17 @@ class PathLimits:
     the same error; 0.3 to 1 is within a sixth of it.
     """
 
-    max_depth: int
-    roulette: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.max_depth < 1 or not self.roulette >= 0:
-            raise ValueError(
-                "max_depth must be positive and roulette not negative, "
-                f"got {self.max_depth}, {self.roulette}"
-            )
+    max_depth: Count
+    roulette: Annotated[float, Field(ge=0)] = 0.5
 
 
-@dataclass(frozen=True)
+@options
 class Sampling:
     """Paths a pixel, vertices a path at most, and the seed of a picture."""
 
-    spp: int = 64
-    max_depth: int = 24
+    spp: Count = 64
+    max_depth: Count = 24
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.spp < 1 or self.max_depth < 1:
-            raise ValueError(
-                f"spp and max_depth must be positive, got {self.spp}, {self.max_depth}"
-            )
 
 
 SAMPLING = Sampling()
@@ -73,8 +65,8 @@ class Paths:
     """One step of the paths in flight, all Dr.Jit variables.
 
     `throughput` (`Color3f`) is the product of weights so far, `depth` counts the vertices so far,
-    `slot` is the lane's place in the list of pixels, `rng`
-    its random stream. Lanes that are not `active` are to be left alone.
+    `slot` is the lane's place in the list of pixels, `rng` its random stream. Lanes that are not
+    `active` are to be left alone.
     """
 
     throughput: Any
@@ -105,10 +97,7 @@ def follow(
     pixel = mi.UInt32(for_kernels(pixels, np.uint32))
     size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(limits.max_depth)
     (roulette,) = opaque(limits.roulette)
-    state = np.random.SeedSequence([n & 0xFFFFFFFF for n in plan.seeds]).generate_state(
-        1, np.uint64
-    )
-    origin = dr.opaque(mi.UInt64, int(state[0]))
+    origin = seed_state(*plan.seeds)
     generator: Any = mi.PCG32  # the stubs call it a plain object
 
     def begin(sample: Any) -> tuple[Any, Any]:
@@ -149,3 +138,15 @@ def follow(
     rng, ray = begin(first)
     start = (ray, mi.Color3f(1), dr.zeros(mi.UInt32, len(pixels)), first, rng, first < end)
     dr.while_loop(start, more, body, label="paths")
+
+
+def add_light(film: Any, value: Any, first: Any, active: Any, stride: Any = 1) -> None:
+    """Add the channels of `value` at `first`, `first + stride`, …: places of one lane alone."""
+    for channel in range(3):
+        put = first + channel * stride
+        dr.scatter_add(film, value[channel], put, active, mode=dr.ReduceMode.NoConflicts)
+
+
+def tile_count(pixels: Ints, each: int, memory: int) -> int:
+    """In how many tiles to render `pixels (P,)`, which take `each` bytes beside a path's."""
+    return -(-len(pixels) // max(1, memory // (each + LANE_BYTES)))

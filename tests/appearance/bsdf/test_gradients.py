@@ -9,7 +9,7 @@ from benchmarks.bsdf.integrals import Case, array_types, fibre, known_direction
 from scipy.spatial.transform import Rotation
 
 from appearance.bsdf import absorption, lobes, reference
-from appearance.bsdf.corrective import rodrigues
+from appearance.bsdf.shading_frame import rodrigues
 
 PARAMETERS = ("sigma_a", "beta_m", "beta_n", "eta", "tilt")
 INSIDE = [

@@ -210,7 +210,7 @@ def test_mixtures_of_seeds_and_of_nothing(tufted):
     assert not render_mixed(scene, camera, sampling=Sampling(1)).any()
     with pytest.raises(ValueError, match="must be finite"):
         render_mixed(scene, camera, lights, weights=np.nan)
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match="greater than 0"):
         Sampling(0)
 
 

@@ -141,7 +141,7 @@ def test_bad_arguments_are_refused(floor, above):
         render_scanlines(floor, above, [projector()], rows={"nobody": range(3)})
     with pytest.raises(ValueError, match="rows must be a range"):
         render_scanlines(floor, above, [projector()], rows={"proj": range(10, 17)})
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="greater than 0"):
         render_scanlines(floor, above, [projector()], spp=0)
 
 
