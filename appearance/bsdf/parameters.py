@@ -62,7 +62,7 @@ class HairParameters:
 
     def refresh(self) -> None:
         """Look for tables that are constant: those are read without a lookup."""
-        tables = [name for name in ("sigma_a", "rotation") if name in self.values]
+        tables: list[str] = [n for n in ("sigma_a", "rotation") if n in self.values]
         self._constant = {name: _constant(self.values[name]) for name in tables}
         turn = self._constant.get("rotation", [])
         self._turns = turn is None or any(x[0] != 0 for x in turn)

@@ -117,8 +117,8 @@ class _Fit:
     def run(self) -> Outcome:
         self.begun, self.worked = time.perf_counter(), time.process_time()
         if not self.pairs.used.any():
-            reason = "no pair of camera and light shows lit hair"
-            return Outcome(self.start, self.lights, reason, 0.0, 0.0, 0)
+            unlit = "no pair of camera and light shows lit hair"
+            return Outcome(self.start, self.lights, unlit, 0.0, 0.0, 0)
         state = self._begun()
         self.pairs.squared_error = state.tables["squared_error"]
         ended = "all steps taken" if self.free else "converged"

@@ -150,9 +150,9 @@ class Problem:
 
     def render(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> Array:
         """A patch under `gain (L,)` in exposure units `(k, P, 3)`."""
-        *seen, pixels = self._seen(raw, gain, patch)
-        spp, depth = effort.spp, effort.max_depth
-        radiance = render_olat(*seen, spp=spp, max_depth=depth, thrift=0, seed=seed, pixels=pixels)
+        scene, camera, lights, pixels = self._seen(raw, gain, patch)
+        spent: dict[str, int] = {"spp": effort.spp, "max_depth": effort.max_depth, "thrift": 0}
+        radiance = render_olat(scene, camera, lights, seed=seed, pixels=pixels, **spent)
         return radiance.astype(float) * self.scale
 
     def deviations(self, raw: Raw, gain: Array) -> LightDeviations:

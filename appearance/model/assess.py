@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from appearance.metrics.pictures import comparison_picture
+from appearance.metrics.pictures import Row, comparison_picture
 from appearance.metrics.scores import (
     Exposure,
     mean_scores,
@@ -21,13 +22,13 @@ from appearance.metrics.scores import (
 from appearance.model.fitted_model import FittedModel
 from appearance.model.options import AssessOptions
 from appearance.model.relight import relight
-from appearance.observations import HeldOut, Observed, chosen, observe
+from appearance.observations import HeldOut, Observed, observe_hair
 from appearance.render.smoothed import olat_smoothed
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
-from reconstruction import Capture, Light, Model, ModelError, Progress, Stage, silent
+from reconstruction import Capture, Light, Model, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Bools
 
 METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
@@ -127,35 +128,26 @@ class _Comparison:
 
     def _observed(self) -> list[Observed]:
         """Hair pixels of the training cameras under some of the training lights."""
-        rng = np.random.default_rng(self.seed)
+        rng, most = np.random.default_rng(self.seed), self.options.baseline_pixels
         names = _spread(self.training.olat_lights(), self.options.baseline_lights)
-        out = []
-        for camera in [c.name for c in self.training.rig.cameras]:
-            mask = self.model.mask(camera, "hair", self.training)
-            pixels = chosen(mask, self.options.baseline_pixels, rng)
-            if len(pixels):
-                seen = observe(self.training, camera, names, pixels)
-                out.append(replace(seen, lights=tuple(self.fitted.lights(names))))
-        if not out:
-            raise ModelError(f"{self.model}: the hair masks of the training cameras are all empty")
-        return out
+        lights = tuple(self.fitted.lights(names))
+        seen = observe_hair(self.training, self.model, names, most, rng)
+        return [replace(o, lights=lights) for o in seen]
 
     def _views(self) -> dict[str, list[tuple[str, list[str]]]]:
         """Which cameras to compare under which lights, by group."""
         held_out, options = self.held_out, self.options
-        new = _spread(list(held_out.lights), options.lights)
+        new = _spread(held_out.lights, options.lights)
         training = self.training.olat_lights()
         views: dict[str, list[tuple[str, list[str]]]] = {}
         if new:
             cameras = _spread([c.name for c in self.training.rig.cameras], options.cameras)
             views["held_out_lights"] = [(camera, new) for camera in cameras]
         if held_out.cameras:
-            both = _spread(training, max(options.lights - len(new) // 2, 1)) + _spread(
-                new, len(new) // 2
-            )
-            views["held_out_camera"] = [
-                (camera, both) for camera in _spread(list(held_out.cameras), options.cameras)
-            ]
+            both = _spread(training, max(options.lights - len(new) // 2, 1))
+            both += _spread(new, len(new) // 2)
+            cameras = _spread(held_out.cameras, options.cameras)
+            views["held_out_camera"] = [(camera, both) for camera in cameras]
         return views
 
     def _compared(
@@ -168,22 +160,17 @@ class _Comparison:
         if not names or not mask.any():
             return []
         device, lights = capture.rig.camera(camera), self.fitted.lights(names)
-        spp, seed = self.options.spp, self.seed
-        rendered = {
-            method: olat_smoothed(s, device, lights, Sampling(spp, MAX_DEPTH, seed))
-            for method, s in scenes.items()
-        }
+        sampling = Sampling(self.options.spp, MAX_DEPTH, self.seed)
+        rendered = {m: olat_smoothed(s, device, lights, sampling) for m, s in scenes.items()}
+        training = self.training.olat_lights()
         out = []
         for i, name in enumerate(names):
             captured = capture.light(name, camera)[0]
-            near = three_nearest(
-                capture, camera, capture.rig.light(name), self.training.olat_lights()
-            )
             frames = {
                 "captured": captured,
                 **{method: images[i] for method, images in rendered.items()},
                 "mean_colour": np.broadcast_to(colour, captured.shape),
-                "three_nearest": near,
+                "three_nearest": three_nearest(capture, camera, capture.rig.light(name), training),
             }
             out.append(_Compared(camera, name, frames, mask))
         return out
@@ -197,9 +184,8 @@ def three_nearest(
     Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
     distance to what `light` would give. `light` itself is never among the three.
     """
-    others = [
-        capture.rig.light(n) for n in training if n != light.name and capture.has_light(n, camera)
-    ]
+    names = [n for n in training if n != light.name and capture.has_light(n, camera)]
+    others = [capture.rig.light(n) for n in names]
     positions = np.array([o.position for o in others])
     distance = np.linalg.norm(positions, axis=1)
     own = float(np.linalg.norm(light.position))
@@ -213,7 +199,7 @@ def three_nearest(
         here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
         gain = here / np.maximum(there, 1e-12)
         gain *= (distance[k] / own) ** 2
-        total = total + weight * gain * capture.light(others[k].name, camera)[0]
+        total = total + weight * gain * capture.light(names[k], camera)[0]
     return np.asarray(total)
 
 
@@ -230,18 +216,15 @@ def _scores(images: Sequence[_Compared], method: str, exposure: Exposure) -> dic
 
 def judge(result: dict[str, Any], stage: Stage) -> None:
     """Warn where a trivial baseline is not beaten."""
-    for group, rows in result.items():
-        for baseline in ("mean_colour", "diffuse"):
-            for figure in ("psnr", "ssim"):
-                if rows["ours"][figure] <= rows[baseline][figure]:
-                    stage.warn(f"{group}: the baseline {baseline} is not beaten in {figure}")
+    pairs = product(("mean_colour", "diffuse"), ("psnr", "ssim"))
+    for (group, rows), (baseline, figure) in product(result.items(), pairs):
+        if rows["ours"][figure] <= rows[baseline][figure]:
+            stage.warn(f"{group}: the baseline {baseline} is not beaten in {figure}")
 
 
-def _rows(
-    groups: dict[str, list[_Compared]], exposure: Exposure
-) -> list[tuple[str, dict[str, AnyFloats], dict[str, str]]]:
-    """Two rows a group for the picture: a label, pictures by column, and their scores."""
-    rows: list[tuple[str, dict[str, AnyFloats], dict[str, str]]] = []
+def _rows(groups: dict[str, list[_Compared]], exposure: Exposure) -> list[Row]:
+    """Two rows a group for the picture, with their scores."""
+    rows: list[Row] = []
     for group, images in groups.items():
         # the frames that show most: brightly lit hair, and from different cameras where there are
         ranked = sorted(images, key=lambda c: -float(c.frames["captured"][c.mask].mean()))

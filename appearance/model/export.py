@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -17,10 +16,12 @@ from scipy.cluster.vq import kmeans2
 from appearance.bsdf.maps import HairMaps
 from appearance.model.fitted_model import FittedModel
 from appearance.scene.curves import spline_control_points
-from appearance.scene.hair_scene import SCALE
+from appearance.scene.hair_scene import SCALE, mitsuba_hair
 from reconstruction import Camera, Mesh, Strands, write_exr, write_obj
-from reconstruction.arrays import Array, Floats
+from reconstruction.arrays import Array
 from reconstruction.files.strands.usd import open_curves, write_usd
+
+SCALARS = ("beta_m", "beta_n", "eta", "tilt_deg")
 
 
 def export_maps(maps: HairMaps, folder: Path) -> list[Path]:
@@ -37,12 +38,8 @@ def export_maps(maps: HairMaps, folder: Path) -> list[Path]:
             image[..., : layer.shape[2]] = layer.transpose(1, 0, 2)
             written.append(folder / f"{name}_{i:02d}.exr")
             write_exr(written[-1], image)
-    scalars = {k: getattr(maps, k) for k in ("beta_m", "beta_n", "eta", "tilt_deg")}
-    about = {
-        "layers": len(maps.sigma_a),
-        "units": "absorption per fibre radius; radians",
-        **scalars,
-    }
+    about = {"layers": len(maps.sigma_a), "units": "absorption per fibre radius; radians"}
+    about |= {k: getattr(maps, k) for k in SCALARS}
     (folder / "maps.json").write_text(json.dumps(about, indent=1) + "\n")
     return [*written, folder / "maps.json"]
 
@@ -81,23 +78,15 @@ def export_usd(model: FittedModel, path: Path) -> None:
     tokens = UsdGeom.Tokens
     colour = np.exp(-6.0 * np.sqrt(sigma_a))
     for name, kind, where, values in (
-        ("sigma_a", types.Float3Array, tokens.vertex, Vt.Vec3fArray.FromNumpy(_floats(sigma_a))),
-        ("rotation", types.Float2Array, tokens.vertex, Vt.Vec2fArray.FromNumpy(_floats(rotation))),
-        (
-            "displayColor",
-            types.Color3fArray,
-            tokens.vertex,
-            Vt.Vec3fArray.FromNumpy(_floats(colour)),
-        ),
-        (
-            "scalp_uv",
-            types.TexCoord2fArray,
-            tokens.uniform,
-            Vt.Vec2fArray.FromNumpy(_floats(model.root_uv)),
-        ),
+        ("sigma_a", types.Float3Array, tokens.vertex, sigma_a),
+        ("rotation", types.Float2Array, tokens.vertex, rotation),
+        ("displayColor", types.Color3fArray, tokens.vertex, colour),
+        ("scalp_uv", types.TexCoord2fArray, tokens.uniform, model.root_uv),
     ):
-        api.CreatePrimvar(name, kind, where).Set(values)
-    for name in ("beta_m", "beta_n", "eta", "tilt_deg"):
+        array = Vt.Vec3fArray if values.shape[1] == 3 else Vt.Vec2fArray
+        floats = array.FromNumpy(np.ascontiguousarray(values, np.float32))
+        api.CreatePrimvar(name, kind, where).Set(floats)
+    for name in SCALARS:
         api.CreatePrimvar(name, types.Float, tokens.constant).Set(float(getattr(model.maps, name)))
     stage.GetRootLayer().Save()
 
@@ -138,10 +127,6 @@ def export_mitsuba(
     return path
 
 
-def _floats(values: Array) -> Floats:
-    return np.ascontiguousarray(values, np.float32)
-
-
 def _write_curves(path: Path, strands: Strands) -> None:
     points, _ = spline_control_points(strands)
     rows = points * SCALE
@@ -152,13 +137,7 @@ def _write_curves(path: Path, strands: Strands) -> None:
 
 
 def _hair(file: str, sigma_a: Array, maps: HairMaps) -> str:
-    scalars: dict[str, Any] = {
-        "longitudinal_roughness": maps.beta_m,
-        "azimuthal_roughness": maps.beta_n,
-        "scale_tilt": -maps.tilt_deg,
-        "int_ior": maps.eta,
-        "ext_ior": 1.0,
-    }
+    scalars = {k: v for k, v in mitsuba_hair(maps.mean()).items() if isinstance(v, float)}
     floats = "".join(f'<float name="{k}" value="{v:.6g}"/>' for k, v in scalars.items())
     rgb = " ".join(f"{x:.6g}" for x in sigma_a)
     return (

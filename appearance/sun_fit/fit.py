@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -79,16 +79,9 @@ def fit(
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
             stage.warn("no camera sees skin: its colour is a guess")
-    fitted = FittedAppearance(
-        colours.hair,
-        colours.colour,
-        colours.skin,
-        exposure,
-        float(variance_of_roughness(corrected)),
-        plain.v,
-        printed,
-    )
-    fitted.save(model)
+    v = float(variance_of_roughness(corrected))
+    found = (colours.hair, colours.colour, colours.skin, exposure)
+    FittedAppearance(*found, v, plain.v, printed).save(model)
     for stale in ("hair_maps.npz", "lights.json", "inverse_rendering.png"):
         model.remove(stale)
     model.write_report(report)
@@ -160,19 +153,15 @@ def _reached(training: Capture, pixels: Pixels, exposure: Exposure, stage: Stage
     return Pixels([o.under(lit) for o in hair], [o.under(lit) for o in pixels.skin])
 
 
+@dataclass(frozen=True)
 class SunFit:
     """The observations and the geometry that the two fits share."""
 
-    def __init__(
-        self,
-        scene: HairScene,
-        pixels: Pixels,
-        options: FitOptions,
-        seed: int,
-        progress: Progress,
-    ) -> None:
-        self.scene, self.pixels = scene, pixels
-        self.options, self.seed, self.progress = options, seed, progress
+    scene: HairScene
+    pixels: Pixels
+    options: FitOptions
+    seed: int
+    progress: Progress
 
     def roughness(self, stage: Stage) -> tuple[Lobe, float, float, Colours]:
         """The plain lobe, Eq. 10's variance, the corrected β_M and a first colour."""
@@ -260,9 +249,8 @@ class SunFit:
             "relative_error": min(result.errors),
         }
         if min(result.errors) > 0.05:
-            stage.warn(
-                f"the mean colour is off by {min(result.errors):.0%}: is the geometry whole?"
-            )
+            off = f"the mean colour is off by {min(result.errors):.0%}"
+            stage.warn(f"{off}: is the geometry whole?")
         return result
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:
@@ -277,24 +265,13 @@ class SunFit:
     def _read(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
     ) -> tuple[Lobe, float, int]:
-        bins = binned(
-            MirrorSamples.joined(
-                [mirror_samples(o, f, tilt_deg=self._tilt, channel=channel) for o, f in views]
-            )
-        )
+        parts = [mirror_samples(o, f, tilt_deg=self._tilt, channel=channel) for o, f in views]
+        bins = binned(MirrorSamples.joined(parts))
         return fit_lobe(bins), fit_lobe_as_printed(bins), int(bins.count.sum())
 
     def _render(self, scene: HairScene, o: Observed) -> Observed:
-        radiance = render_olat(
-            scene,
-            o.camera,
-            o.lights,
-            spp=self.options.roughness_spp,
-            max_depth=MAX_DEPTH,
-            seed=self.seed,
-            pixels=o.pixels,
-        )
-        return replace(o, radiance=radiance)
+        spent = asdict(Sampling(self.options.roughness_spp, MAX_DEPTH, self.seed))
+        return replace(o, radiance=render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent))
 
     @property
     def _tilt(self) -> float:

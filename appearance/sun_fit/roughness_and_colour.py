@@ -163,10 +163,8 @@ def fit_colour(
     if not isinstance(scene.hair, HairAppearance):
         raise TypeError("fit_colour needs a scene with HairAppearance, not diffuse fibres")
     beta_n = scene.hair.beta_n
-    target, skin_target = (
-        _mean_colour(pixels.hair),
-        _mean_colour(pixels.skin) if pixels.skin else None,
-    )
+    target = _mean_colour(pixels.hair)
+    skin_target = _mean_colour(pixels.skin) if pixels.skin else None
     colour = np.clip(_as_albedo(pixels.hair) if start is None else start, 0.02, 0.98)
     albedo = np.array(scene.skin)
     pairs: list[tuple[Array, Array]] = []
@@ -201,15 +199,8 @@ def fit_diffuse(
     albedo = np.clip(_as_albedo(hair), 0.02, 0.98)
     pairs: list[tuple[Array, Array]] = []
     for step in range(3):
-        lit = scene.with_hair(DiffuseHair(_rgb(albedo)))
-        pairs.append(
-            (
-                albedo,
-                _mean_colour(
-                    [_rendered(lit, o, replace(SAMPLING, seed=seed + step)) for o in hair]
-                ),
-            )
-        )
+        lit, now = scene.with_hair(DiffuseHair(_rgb(albedo))), replace(SAMPLING, seed=seed + step)
+        pairs.append((albedo, _mean_colour([_rendered(lit, o, now) for o in hair])))
         albedo = next_colour(pairs, target)
     return _rgb(albedo)
 
@@ -249,17 +240,8 @@ def _rgb(values: Array) -> tuple[float, float, float]:
 
 def _rendered(scene: HairScene, o: Observed, sampling: Sampling) -> Observed:
     """The same pixels under the same lights, rendered; lights sampled, as only means are used."""
-    radiance = render_olat(
-        scene,
-        o.camera,
-        o.lights,
-        **asdict(sampling),
-        pixels=o.pixels,
-        first_lights=8,
-        deep_lights=4,
-        thrift=0,
-    )
-    return replace(o, radiance=radiance)
+    spent = {**asdict(sampling), "first_lights": 8, "deep_lights": 4, "thrift": 0}
+    return replace(o, radiance=render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent))
 
 
 def _mean_colour(views: Sequence[Observed]) -> Array:
