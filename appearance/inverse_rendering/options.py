@@ -7,9 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from reconstruction.options import options
+from reconstruction.options import Count, options
 
-Count = Annotated[int, Field(gt=0)]
 Variant = Literal["original", "spatial", "correctives", "lights"]
 """The ablations of GroomLight's Table 1, each with what the ones before it free."""
 

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from pydantic import Field
-
-from reconstruction.options import options
-
-Count = Annotated[int, Field(gt=0)]
+from reconstruction.options import Count, options
 
 
 @options

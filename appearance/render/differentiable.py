@@ -26,13 +26,12 @@ from numpy.typing import ArrayLike
 
 from appearance.render.lights import LightBank
 from appearance.render.paths import Surface, Wave, continue_path, each_sample, pixel_indices
-from appearance.render.tracing import Count
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
-from reconstruction.options import options
+from reconstruction.options import Count, options
 
 _GRADIENT_STREAM = 1 << 29
 _UNITS = {"lights.position": SCALE, "lights.intensity": SCALE**2, "lights.turn": 1.0}

@@ -17,15 +17,7 @@ import numpy as np
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.paths import Surface, camera_rays
-from appearance.render.tracing import (
-    SAMPLING,
-    PathLimits,
-    PathPlan,
-    Paths,
-    Sampling,
-    add_light,
-    follow,
-)
+from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
@@ -62,9 +54,8 @@ def render_environment(
         def missed(ray: Any, paths: Paths) -> None:
             add_light(film, sky.radiance(ray.d), paths.slot * 3, paths.active & (paths.depth == 0))
 
-        plan = PathPlan(sampling.spp, (sampling.seed,), PathLimits(sampling.max_depth))
         escape = missed if background else None
-        follow(gather.surface, camera, index, plan, gather, escape)
+        follow(gather.surface, camera, index, sampling.plan(), gather, escape)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(sampling.spp)
     return image.reshape(camera.height, camera.width, 3)
 

@@ -17,15 +17,7 @@ from appearance.render.environment_maps import check_environment
 from appearance.render.lights import LightBank
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface
-from appearance.render.tracing import (
-    SAMPLING,
-    PathLimits,
-    PathPlan,
-    Paths,
-    Sampling,
-    add_light,
-    follow,
-)
+from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
 from reconstruction import Camera, Light
@@ -80,8 +72,7 @@ def render_mixed(
                 for m, e in zip(maps, environments, strict=True)
             ],
         )
-        plan = PathPlan(sampling.spp, (sampling.seed,), PathLimits(sampling.max_depth))
-        follow(gather.surface, camera, index, plan, gather)
+        follow(gather.surface, camera, index, sampling.plan(), gather)
         image[index] = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
     return image.reshape(camera.height, camera.width, 3)
 

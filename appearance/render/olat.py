@@ -17,7 +17,6 @@ from appearance.render.coverage import covered_pixels
 from appearance.render.lights import LightBank
 from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
 from appearance.render.tracing import (
-    Count,
     PathLimits,
     PathPlan,
     Paths,
@@ -29,7 +28,7 @@ from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera, Light
 from reconstruction.arrays import Floats, Ints
-from reconstruction.options import options
+from reconstruction.options import Count, options
 
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -162,12 +162,6 @@ def seed_state(*seeds: int) -> Any:
     """A `UInt64` made of all of `seeds`, which kernels read from memory."""
     state = np.random.SeedSequence([n & 0xFFFFFFFF for n in seeds]).generate_state(1, np.uint64)
     return dr.opaque(mi.UInt64, int(state[0]))
-
-
-def passes(spp: int, per_pass: int) -> Iterator[tuple[int, int]]:
-    """(first sample, count) of the passes that make up `spp` samples, `per_pass` at most each."""
-    for first in range(0, spp, per_pass):
-        yield first, min(per_pass, spp - first)
 
 
 def jittered(camera: Camera, pixel: Any, sample: Any, spp: int, rng: Any) -> Any:

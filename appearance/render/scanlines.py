@@ -16,7 +16,6 @@ from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
 from appearance.render.tracing import (
-    Count,
     PathLimits,
     PathPlan,
     Paths,
@@ -28,7 +27,7 @@ from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction import Camera, Projector
 from reconstruction.arrays import Floats, Ints
-from reconstruction.options import options
+from reconstruction.options import Count, options
 
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31

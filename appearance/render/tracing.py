@@ -16,13 +16,10 @@ from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
-from reconstruction.options import options
+from reconstruction.options import Count, options
 
 LANE_BYTES = 512
 """What a path in flight takes, about."""
-
-
-Count = Annotated[int, Field(gt=0)]
 
 
 @options
@@ -46,6 +43,10 @@ class Sampling:
     spp: Count = 64
     max_depth: Count = 24
     seed: int = 0
+
+    def plan(self) -> PathPlan:
+        """The paths of a picture in one piece."""
+        return PathPlan(self.spp, (self.seed,), PathLimits(self.max_depth))
 
 
 SAMPLING = Sampling()

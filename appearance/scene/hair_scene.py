@@ -54,25 +54,6 @@ class HairScene:
         """
         return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair, bsdf))
 
-    def material_shapes(self) -> dict[str, Any]:
-        """The shapes with their materials attached, as Mitsuba's own integrators expect them.
-
-        For comparisons with Mitsuba: the shapes are shared with this scene and keep the materials
-        of the latest call. The head gets a two-sided `diffuse`.
-        """
-        shapes: dict[str, Any] = {}
-        if self.hair_shape is not None:
-            bsdf = self.hair_bsdf
-            if isinstance(self.hair, DiffuseHair):
-                bsdf = mi.load_dict(_diffuse(self.hair.albedo))
-            self.hair_shape.set_bsdf(bsdf)
-            shapes["hair"] = self.hair_shape
-        if self.head_shape is not None:
-            skin = {"type": "twosided", "material": _diffuse(self.skin)}
-            self.head_shape.set_bsdf(mi.load_dict(skin))
-            shapes["head"] = self.head_shape
-        return shapes
-
     def with_skin(self, skin: ArrayLike) -> HairScene:
         """The same geometry with another diffuse albedo `skin (3,)` on the head."""
         return replace(self, skin=_albedo(skin))
@@ -124,10 +105,6 @@ def _hair_bsdf(hair: HairAppearance | DiffuseHair, bsdf: str = "extended_hair") 
     if isinstance(hair, DiffuseHair):
         return None
     return mi.load_dict(mitsuba_hair(hair, bsdf))
-
-
-def _diffuse(albedo: tuple[float, float, float]) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}}
 
 
 def _albedo(skin: ArrayLike) -> tuple[float, float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import drjit as dr
@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from appearance import HairScene
-from appearance.render.paths import passes, wave
+from appearance.render.paths import wave
+from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import light_arrays
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
@@ -27,7 +28,7 @@ class PathReference:
 
     def __init__(self, scene: HairScene, max_depth: int, rr_depth: int = 4) -> None:
         light = {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": 1}}
-        self._scene = mi.load_dict({"type": "scene", **scene.material_shapes(), "light": light})
+        self._scene = mi.load_dict({"type": "scene", **material_shapes(scene), "light": light})
         self._parameters = mi.traverse(self._scene)
         # Mitsuba counts segments: its depth 2 is our one vertex.
         self._integrator = mi.load_dict(
@@ -64,7 +65,7 @@ class PathReference:
     def _light(self, camera: Camera, pixels: Ints, spp: int, seed: tuple[int, int]) -> Floats:
         index = mi.UInt32(for_kernels(pixels, np.uint32))
         film = dr.zeros(mi.Float, 3 * len(pixels))
-        for first, count in passes(spp, max(1, _LANES // len(pixels))):
+        for first, count in _passes(spp, max(1, _LANES // len(pixels))):
             paths = wave(camera, index, len(pixels), first, count, spp, *seed)
             sampler: Any = mi.load_dict({"type": "independent"})
             state = np.random.SeedSequence([*seed, first]).generate_state(1)[0]
@@ -77,3 +78,33 @@ class PathReference:
             dr.eval(film)
         image = np.array(film, dtype=np.float32).reshape(len(pixels), 3)
         return np.asarray(image / np.float32(spp), dtype=np.float32)
+
+
+def material_shapes(scene: HairScene) -> dict[str, Any]:
+    """The shapes of `scene` with their materials attached, as Mitsuba's own integrators expect.
+
+    They are shared with the scene and keep the materials of the latest call. The head gets a
+    two-sided `diffuse`.
+    """
+    shapes: dict[str, Any] = {}
+    if scene.hair_shape is not None:
+        bsdf = scene.hair_bsdf
+        if isinstance(scene.hair, DiffuseHair):
+            bsdf = mi.load_dict(_diffuse(scene.hair.albedo))
+        scene.hair_shape.set_bsdf(bsdf)
+        shapes["hair"] = scene.hair_shape
+    if scene.head_shape is not None:
+        skin = {"type": "twosided", "material": _diffuse(scene.skin)}
+        scene.head_shape.set_bsdf(mi.load_dict(skin))
+        shapes["head"] = scene.head_shape
+    return shapes
+
+
+def _diffuse(albedo: tuple[float, float, float]) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}}
+
+
+def _passes(spp: int, most: int) -> Iterator[tuple[int, int]]:
+    """(first sample, count) of the passes that make up `spp` samples, `most` at most each."""
+    for first in range(0, spp, most):
+        yield first, min(most, spp - first)

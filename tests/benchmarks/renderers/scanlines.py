@@ -14,6 +14,7 @@ from appearance import HairScene, render_scanlines
 from appearance.render.bounces import bounce_limit
 from appearance.render.paths import wave
 from appearance.scene.hair_scene import SCALE
+from benchmarks.renderers.path_reference import material_shapes
 from reconstruction import Camera, Projector
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Floats, Ints
@@ -113,7 +114,7 @@ class _Lines:
                 "bitmap": mi.Bitmap(self._picture(0)),
             },
         }
-        self._scene = mi.load_dict({"type": "scene", **scene.material_shapes(), "lamp": lamp})
+        self._scene = mi.load_dict({"type": "scene", **material_shapes(scene), "lamp": lamp})
         self._parameters = mi.traverse(self._scene)
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth + 1, "rr_depth": 5})
 
