@@ -1,13 +1,10 @@
 """Roughness, index, mean colour and light intensities: few numbers, found from pictures alone.
 
-Gauss-Newton, its derivatives on the left and on the right estimated apart. A path tracer's
-derivative is mostly noise, and its square in the normal equations is nothing else. On the left
-stand instruments, which need to be like the derivative but not equal to it: the derivative of the
-light of the first hit, a difference quotient along the same paths, is hardly noisy. With
-instruments Z, weights W and the difference r of rendered and captured, Zᵀ W r is zero on average at
-the truth, whatever Z is. On the right stand quotients of whole pictures over wide steps, whose
-noise has nothing to do with Z's or r's and changes only the length of a step. Pixels count by what
-is known of them: W falls with their noise, of which one in a hundred has nearly half.
+Gauss-Newton, its derivatives on the left and on the right estimated apart: the square of a path
+tracer's derivative is mostly noise. On the left stand instruments Z, the hardly noisy derivative
+of the light of the first hit; with weights W and the difference r of rendered and captured, Zᵀ W r
+is zero on average at the truth, whatever Z is. On the right stand quotients of whole pictures over
+wide steps: their noise, independent of Z's and r's, changes only the length of a step.
 """
 
 from __future__ import annotations

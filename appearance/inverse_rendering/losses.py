@@ -1,14 +1,9 @@
 """What a fit minimises: an image loss on hair pixels, and smoothness along strands.
 
-Everything is a mean: the image loss over pixels, lights and channels of one exposure (the training
-hair's 99th percentile at 1), smoothness over neighbouring layers, cells and channels. So the
-weights mean the same whatever the resolution of images and maps.
-
-The papers' L1 takes the sign of a noisy difference: with few samples a pixel it fits the median of
-the noise, which for path tracing lies far below its mean. Squared differences, the picture's and
-the gradient's noise independent of each other, are unbiased, with weights that make them
-differences of displayed (sRGB) values. The square root is what is minimised: like L1 it is
-proportional to the difference, so that λ_σ and λ_R keep their meaning.
+Everything is a mean, in exposure units, so that weights mean the same at any resolution. The
+papers' L1 fits the median of a path tracer's noise, which lies far below its mean. Squared
+differences with independent noise are unbiased; weights make them differences of displayed (sRGB)
+values. Their square root is minimised: as proportional to the difference as L1 is.
 """
 
 from __future__ import annotations

@@ -2,14 +2,9 @@
 
 The gradient takes two walks along the same camera paths, from the same seeds (Vicini et al. 2021).
 The first sums what each path brings in, weighted by the gradient of the loss; the second subtracts
-vertex after vertex from that sum, so that at every vertex what is left is the light that arrives
-from further along, and needs no memory of the path: neither its length nor the number of lights
-costs any. Directions, roulette and geometry are held fixed; BSDF values and emitter samples are
-differentiated, the way from a vertex to a light included.
-
-What a moving shadow edge does is left out: a vertex is lit or not, and the moment at which that
-changes has no derivative here. With respect to a light's position or turn the gradient is that of
-the light that arrives where it arrives already. All other parameters move no edge.
+vertex after vertex from that sum: what is left is the light that arrives from further along, and
+the path needs no memory. Directions, roulette and geometry are held fixed. What a moving shadow
+edge does is left out: a light's gradient is that of the light that arrives where it does already.
 """
 
 from __future__ import annotations
