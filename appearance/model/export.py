@@ -137,7 +137,7 @@ def _write_curves(path: Path, strands: Strands) -> None:
 
 
 def _hair(file: str, sigma_a: Array, maps: HairMaps) -> str:
-    scalars = {k: v for k, v in mitsuba_hair(maps.mean()).items() if isinstance(v, float)}
+    scalars = {k: v for k, v in mitsuba_hair(maps.mean()).items() if isinstance(v, float | int)}
     floats = "".join(f'<float name="{k}" value="{v:.6g}"/>' for k, v in scalars.items())
     rgb = " ".join(f"{x:.6g}" for x in sigma_a)
     return (
