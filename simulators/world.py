@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -66,17 +67,14 @@ class World:
         log: Path | None = None,
         lanes: int = 1,
     ) -> None:
-        self.rig = rig
-        self.lamps = lamps
-        self.projectors = ProjectorController(rig.projectors, self.blank)
+        self.rig, self.lamps, self.faults = rig, lamps, faults
+        self._make, self._log = make, log
+        self._pulses = self._fired = self._pose = 0
+        self.projectors = ProjectorController(
+            rig.projectors, partial(self.begun, "projectors", "blank")
+        )
         lamps.cut_by(self.safety)
-        self.faults = faults
-        self._make = make
-        self._log = log
         self._lock = threading.RLock()
-        self._pulses = 0
-        self._fired = 0
-        self._pose = 0
         self._rows_shown = False
         self._cameras = {c.name: _CameraState() for c in rig.cameras}
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix="frames") for _ in range(lanes)]
@@ -89,10 +87,7 @@ class World:
 
     def safety(self) -> tuple[bool, bool]:
         """Whether the interlock is open, and whether the emergency stop is pressed."""
-        interlock, estop = (
-            self.faults.since("trigger", kind, self._fired) for kind in ("interlock", "estop")
-        )
-        return interlock, estop
+        return self.begun("trigger", "interlock"), self.begun("trigger", "estop")
 
     def reset(self) -> None:
         """Set the pulse count to 0."""
@@ -107,7 +102,7 @@ class World:
         with self._lock:
             self._pulses += counts
             self._fired += 1
-            if self.faults.once("lights", "stuck", self._pulses):
+            if self.faults.at("lights", "stuck", self._pulses):
                 self.lamps.stick()
             power, show = self.lamps.power(), self.projectors.show
             if fires:
@@ -156,17 +151,9 @@ class World:
         with self._lock:
             return len(self._cameras[camera].queue)
 
-    def mute(self, camera: str) -> bool:
-        """Whether a fault keeps the camera from answering."""
-        return self.faults.since("camera", "mute", self._fired, camera)
-
-    def blank(self) -> bool:
-        """Whether a fault keeps the projectors' patterns from coming up."""
-        return self.faults.since("projectors", "blank", self._fired)
-
-    def begun(self, device: str, kind: str) -> bool:
+    def begun(self, device: str, kind: str, camera: str | None = None) -> bool:
         """Whether a lasting fault of the device shows."""
-        return self.faults.since(device, kind, self._fired)
+        return self.faults.since(device, kind, self._fired, camera)
 
     def stop(self) -> None:
         """Make no more frames."""
@@ -178,20 +165,15 @@ class World:
 
     def _expose(self, shot: Snapshot) -> None:
         for index, (name, camera) in enumerate(self._cameras.items()):
-            if camera.exposure is None:
-                continue
-            if self.faults.once("camera", "drop", shot.pulse, name):
+            if camera.exposure is None or self.faults.at("camera", "drop", shot.pulse, name):
                 continue
             camera.queue.extend(camera.late)
             camera.late.clear()
             lane = self._lanes[index % len(self._lanes)]
             counts = lane.submit(self._make, name, shot, camera.exposure)
-            for kind in ("repeat", "lost", "late_frame", "stray"):
-                if self.faults.once("camera", kind, shot.pulse, name):
-                    self._queue(camera, camera.exposure, counts, kind)
-                    break
-            else:
-                self._queue(camera, camera.exposure, counts)
+            kinds = ("repeat", "lost", "late_frame", "stray")
+            fault = next((k for k in kinds if self.faults.at("camera", k, shot.pulse, name)), "")
+            self._queue(camera, camera.exposure, counts, fault)
 
     def _move_subject(self, power: Array, show: Show) -> None:
         lit = int(np.count_nonzero(power))
@@ -205,7 +187,7 @@ class World:
             self._rows_shown = True
 
     def _queue(
-        self, camera: _CameraState, exposure: float, counts: Future[Counts], fault: str = ""
+        self, camera: _CameraState, exposure: float, counts: Future[Counts], fault: str
     ) -> None:
         for _ in range(2 if fault == "stray" else 1):
             if fault != "repeat":

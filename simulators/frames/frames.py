@@ -89,12 +89,8 @@ class FrameMaker:
         cache: Path | None = None,
         key: str = "",
     ) -> None:
-        self._rig = rig
-        self._responder = responder
-        self._sensor = sensor
-        self._seed = seed
-        self._cache = cache
-        self._key = key
+        self._rig, self._responder, self._sensor = rig, responder, sensor
+        self._seed, self._cache, self._key = seed, cache, key
         self._lights: dict[str, Response] = {}
         names = [c.name for c in rig.cameras]
         self._moved = {n: OrderedDict[Hashable, Response]() for n in names}

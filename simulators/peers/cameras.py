@@ -59,7 +59,7 @@ class _Connection:
                 answer, payload = self._answer(exactly(connection, length))
             except _BadRequest as error:
                 answer = {"ok": False, "error": str(error)}
-            while self._camera is not None and self._world.mute(self._camera):
+            while self._camera is not None and self._world.begun("camera", "mute", self._camera):
                 if self._stopping.wait(0.05):
                     return
             text = json.dumps(answer).encode()

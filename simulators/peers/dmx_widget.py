@@ -34,10 +34,8 @@ class DmxWidget(TerminalPeer):
         begun: Callable[[str], bool] = lambda _fault: False,
     ) -> None:
         lamps.without_dead_man()
-        self._lamps = lamps
-        self._before = first_channel - 1
-        self._strikes = strikes
-        self._begun = begun
+        self._lamps, self._before = lamps, first_channel - 1
+        self._strikes, self._begun = strikes, begun
         super().__init__(link)
 
     def _run(self) -> None:

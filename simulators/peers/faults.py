@@ -11,12 +11,10 @@ from pathlib import Path
 SERIAL = ("silent", "garbage", "nak", "late", "noise", "unplug")
 """What can go wrong on a serial line; see `Fault`."""
 _ON_REQUEST = (*SERIAL, "crc", "echo")
+_TRIGGER = ("interlock", "estop", "double", "dropped", "uncounted", "late_trigger")
 _KINDS = {
     "camera": ("drop", "mute", "lost", "repeat", "stray", "late_frame"),
-    "trigger": (
-        *SERIAL,
-        *("interlock", "estop", "double", "dropped", "uncounted", "late_trigger"),
-    ),
+    "trigger": (*SERIAL, *_TRIGGER),
     "projectors": (*SERIAL, "blank"),
     "lights": (*SERIAL, "crc", "echo", "hang", "lies", "stuck"),
 }
@@ -90,12 +88,9 @@ class Faults:
             raise FaultError(f"{path}: expected a list of faults, got {type(entries).__name__}")
         faults = []
         for number, entry in enumerate(entries, 1):
-            where = f"{path}, fault {number}"
-            if (
-                not isinstance(entry, dict)
-                or not {"device", "kind", "pulse"} <= set(entry) <= known
-            ):
-                optional = ", ".join(sorted(known - {"device", "kind", "pulse"}))
+            where, needed = f"{path}, fault {number}", {"device", "kind", "pulse"}
+            if not isinstance(entry, dict) or not needed <= set(entry) <= known:
+                optional = ", ".join(sorted(known - needed))
                 raise FaultError(
                     f"{where}: expected device, kind, pulse[, {optional}], got {entry}"
                 )
@@ -113,10 +108,6 @@ class Faults:
         with self._lock:
             self._left.append(fault)
 
-    def once(self, device: str, kind: str, pulse: int, camera: str | None = None) -> bool:
-        """Whether this fault shows at exactly `pulse`; it is then used up."""
-        return self.at(device, kind, pulse, camera) is not None
-
     def at(self, device: str, kind: str, pulse: int, camera: str | None = None) -> Fault | None:
         """The fault that shows at exactly `pulse`, which is then used up."""
         wanted = (device, kind, pulse, camera)
@@ -128,12 +119,8 @@ class Faults:
 
         def strikes(fault: Fault) -> bool:
             word = any_request if fault.request is None else fault.request
-            return (
-                fault.device == device
-                and fault.kind in _ON_REQUEST
-                and fault.pulse <= pulse
-                and request.startswith(word)
-            )
+            due = fault.device == device and fault.pulse <= pulse
+            return due and fault.kind in _ON_REQUEST and request.startswith(word)
 
         return self._use(strikes)
 

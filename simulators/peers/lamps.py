@@ -40,15 +40,12 @@ class Lamps:
         self._lock = threading.RLock()
         self._on = np.zeros(count, bool)
         self._level = np.full(count, FULL, np.int64)
-        self._selector = 0
-        self._heartbeat = 0
-        self._watchdog_ms = 2000
+        self._selector, self._heartbeat, self._watchdog_ms = 0, 0, 2000
         self._dead_man = True
         self._fed = clock()
         self._tripped = False
         self._table = np.zeros((ENTRIES, 2), np.uint16)
-        self._armed = 0
-        self._position = 0
+        self._armed = self._position = 0
         self._gate = False
         self._stuck = np.zeros(count, bool)
         self._cut: Callable[[], tuple[bool, bool]] = lambda: (False, False)

@@ -57,8 +57,7 @@ class ModbusUnit:
         registers: LightRegisters | None = None,
         begun: Callable[[str], bool] = lambda _fault: False,
     ) -> None:
-        self._lamps = lamps
-        self._begun = begun
+        self._lamps, self._begun = lamps, begun
         r = registers or LightRegisters()
         self._full = r.level_full
         if None in (r.heartbeat, r.watchdog):
@@ -194,9 +193,7 @@ class DisturbedUnit:
         strikes: Callable[[str], Fault | None] = lambda _request: None,
         begun: Callable[[str], bool] = lambda _fault: False,
     ) -> None:
-        self._unit = unit
-        self._strikes = strikes
-        self._begun = begun
+        self._unit, self._strikes, self._begun = unit, strikes, begun
 
     def reply(self, request: bytes, frame: Callable[[bytes], bytes]) -> Reply:
         """Carry a request out, unless the fault keeps it from that."""

@@ -36,8 +36,7 @@ class SerialPeer(TerminalPeer):
         reply: Callable[[str], str],
         strikes: Callable[[str], Fault | None] = lambda _line: None,
     ) -> None:
-        self._reply = reply
-        self._strikes = strikes
+        self._reply, self._strikes = reply, strikes
         super().__init__(link)
 
     def _run(self) -> None:

@@ -23,6 +23,7 @@ TABLE_ROWS = 4096
 GATES = ("L", "P", "LP", "-")
 _MOST_REPEATS = 1_000_000
 _SETTLE_US, _EXPOSURE_US, _PERIOD_US = 1_000_000, 10_000_000, 60_000_000
+_MISFIRES = {"double": {"fires": 2}, "dropped": {"fires": 0}, "uncounted": {"counts": 0}}
 _TRIGGER_OUT_S = 0.1
 _LOOK_S = 0.002
 """How often a waiting table looks at its inputs."""
@@ -91,14 +92,12 @@ class TriggerBox:
     """
 
     def __init__(self, wiring: Wiring, faults: Faults) -> None:
-        self._wiring = wiring
-        self._faults = faults
+        self._wiring, self._faults = wiring, faults
         self._changed = threading.Condition()
         self._ended = threading.Event()
         self._rows: list[Row] = []
         self._expected = 0
-        self._state = "idle"
-        self._reason = "-"
+        self._state, self._reason = "idle", "-"
         self._steps = self._pulses = 0
         self._open = ""
         self._watchdog = 2.0
@@ -240,12 +239,9 @@ class TriggerBox:
 
     def _fire(self) -> int:
         due = self._wiring.pulses + 1
-        if self._faults.once("trigger", "double", due):
-            return self._wiring.pulse(fires=2)
-        if self._faults.once("trigger", "dropped", due):
-            return self._wiring.pulse(fires=0)
-        if self._faults.once("trigger", "uncounted", due):
-            return self._wiring.pulse(counts=0)
+        for kind, what in _MISFIRES.items():
+            if self._faults.at("trigger", kind, due):
+                return self._wiring.pulse(**what)
         return self._wiring.pulse()
 
     def _delay(self) -> None:

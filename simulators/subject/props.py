@@ -133,9 +133,7 @@ class PropResponder:
     """Answers as `responses.Responder` does; the prop stands still at every pose."""
 
     def __init__(self, rig: Rig, prop: Prop, samples: int = 4) -> None:
-        self._rig = rig
-        self._prop = prop
-        self._samples = samples
+        self._rig, self._prop, self._samples = rig, prop, samples
 
     def lights(self, camera: str) -> Response:
         """See `Responder.lights`."""

@@ -23,10 +23,10 @@ def test_a_drop_shows_once_and_a_mute_stays(tmp_path):
             {"device": "camera", "camera": "cam_a", "kind": "mute", "pulse": 5},
         ],
     )
-    assert not faults.once("camera", "drop", 2, "cam_a")
-    assert not faults.once("camera", "drop", 3, "cam_b")
-    assert faults.once("camera", "drop", 3, "cam_a")
-    assert not faults.once("camera", "drop", 3, "cam_a")
+    assert not faults.at("camera", "drop", 2, "cam_a")
+    assert not faults.at("camera", "drop", 3, "cam_b")
+    assert faults.at("camera", "drop", 3, "cam_a")
+    assert not faults.at("camera", "drop", 3, "cam_a")
     assert [faults.since("camera", "mute", n, "cam_a") for n in (4, 5, 9)] == [False, True, True]
 
 
