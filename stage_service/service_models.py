@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from stage_service.acquisition.capture_status import CaptureStatus
 from stage_service.config import Strict
-from stage_service.jobs.records import PipelineRequest
+from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
 PersonName = Annotated[str, Field(min_length=1, max_length=100)]
 LeaseSeconds = Annotated[float, Field(ge=1.0, le=86400.0)]
-
-
-def _example(**fields: Any) -> ConfigDict:
-    return ConfigDict(extra="forbid", frozen=True, json_schema_extra={"examples": [fields]})
 
 
 class CaptureRequest(Strict):
@@ -28,7 +24,7 @@ class CaptureRequest(Strict):
     `armed_by` says who at the stage answers for flashes that the plan has consent for.
     """
 
-    model_config = _example(
+    model_config = with_example(
         plan={"projectors": [], "exposure": {"olat": 0.01}},
         head="/data/subject/head.obj",
         pipeline={"name": "light_planes", "options": {"held_out_cameras": ["cam_03"]}},
@@ -50,7 +46,7 @@ class ResumeRequest(Strict):
 class JobRequest(Strict):
     """A pipeline to run on a capture; `model` names the model folder (default: a new one)."""
 
-    model_config = _example(capture="20261121-093000", pipeline={"name": "light_planes"})
+    model_config = with_example(capture="20261121-093000", pipeline={"name": "light_planes"})
 
     capture: str
     pipeline: PipelineRequest
@@ -80,7 +76,7 @@ class AcknowledgeRequest(Strict):
 class CaptureView(CaptureStatus):
     """A capture's status and the job that its completion enqueued."""
 
-    model_config = _example(
+    model_config = with_example(
         id="20261121-093000-1f2e",
         state="done",
         outcome="completed",

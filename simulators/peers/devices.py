@@ -115,32 +115,17 @@ class SimulatedStage:
 
 
 class Wired(Protocol):
-    """Lamps, and the faults of the wire to them, as `World` has them."""
+    """Lamps, whether a lasting fault shows, and the fault of a request, as `World` has them."""
 
     lamps: Lamps
 
-    def begun(self, device: str, kind: str) -> bool:
-        """Whether a lasting fault shows."""
-
-    def strikes(self, device: str, request: str) -> Fault | None:
-        """The fault of this request."""
-
-
-class LightBankPeer(Protocol):
-    """A bank's side of its wire; `start` returns its TCP port or its serial port's path."""
-
-    def start(self) -> int | str:
-        """Answer from now on. Raises `OSError` when the address is taken."""
-        ...
-
-    def stop(self) -> None:
-        """Answer no more."""
-        ...
+    def begun(self, device: str, kind: str) -> bool: ...
+    def strikes(self, device: str, request: str) -> Fault | None: ...
 
 
 def light_bank(
     config: LightBankConfig, world: Wired, link: Path, tcp: tuple[str, int], paced: bool = False
-) -> LightBankPeer:
+) -> DmxWidget | ModbusRtuPeer | ModbusTcpPeer:
     """The peer for `config`: at `tcp` (port 0: a free one), or on a serial port at `link`.
 
     With `paced` a serial line takes the time that its baud rate needs.

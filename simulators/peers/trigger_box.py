@@ -32,41 +32,32 @@ _LOOK_S = 0.002
 class Gated(Protocol):
     """A device that a gate of the box is wired to."""
 
-    def gate(self, is_open: bool) -> None:
-        """Open or close the gate."""
+    def gate(self, is_open: bool) -> None: ...
 
 
 class GatedProjectors(Gated, Protocol):
-    """The projector controller with its trigger-out wire."""
+    """The projector controller; its trigger-out wire says whether the pattern is up."""
 
     @property
-    def trigger_out(self) -> bool:
-        """Whether the pattern is up."""
+    def trigger_out(self) -> bool: ...
 
 
 class Wiring(Protocol):
-    """What the trigger box is wired to."""
+    """What the trigger box is wired to, as `World` has it: pulses are counted since `reset`.
+
+    `pulse` fires the cameras and returns the count with this pulse; `safety` says whether the
+    interlock is open, and whether the emergency stop is pressed.
+    """
 
     @property
-    def pulses(self) -> int:
-        """Pulses since reset."""
-
+    def pulses(self) -> int: ...
     @property
-    def lamps(self) -> Gated:
-        """The light bank."""
-
+    def lamps(self) -> Gated: ...
     @property
-    def projectors(self) -> GatedProjectors:
-        """The projector controller."""
-
-    def pulse(self, fires: int = 1, counts: int = 1) -> int:
-        """Fire the cameras; returns the count with this pulse."""
-
-    def reset(self) -> None:
-        """Set the count to 0."""
-
-    def safety(self) -> tuple[bool, bool]:
-        """Whether the interlock is open, and whether the emergency stop is pressed."""
+    def projectors(self) -> GatedProjectors: ...
+    def pulse(self, fires: int = 1, counts: int = 1) -> int: ...
+    def reset(self) -> None: ...
+    def safety(self) -> tuple[bool, bool]: ...
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,19 @@ from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
 from reconstruction import ReconstructOptions
 from reconstruction.methods import Method
+from stage_service.config import Strict
 from stage_service.jobs.pipelines import PIPELINES
 
 JobState = Literal["queued", "running", "done"]
 JobOutcome = Literal["succeeded", "failed", "cancelled"]
 
 
-class JobOptions(BaseModel):
+def with_example(**fields: Any) -> ConfigDict:
+    """Frozen, without other fields, and with an example of them in the schema."""
+    return ConfigDict(extra="forbid", frozen=True, json_schema_extra={"examples": [fields]})
+
+
+class JobOptions(Strict):
     """What a pipeline may be told; every field has a default that works.
 
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may observe:
@@ -26,8 +32,6 @@ class JobOptions(BaseModel):
     file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering` and `assess` go to the step
     of that name.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     method: Method = "light_planes"
     compress: bool = True
@@ -53,10 +57,8 @@ class JobOptions(BaseModel):
         return self.model_dump(mode="json", exclude_defaults=True)
 
 
-class PipelineRequest(BaseModel):
+class PipelineRequest(Strict):
     """Which pipeline to run, and with which options."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     options: JobOptions = JobOptions()
@@ -73,10 +75,8 @@ class PipelineRequest(BaseModel):
         return name
 
 
-class JobProgress(BaseModel):
+class JobProgress(Strict):
     """How far a job is: `share` of the whole job and `step_share` of this step, 0 to 1."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     step: str
     steps: tuple[str, ...]
@@ -85,10 +85,8 @@ class JobProgress(BaseModel):
     step_share: float
 
 
-class JobError(BaseModel):
+class JobError(Strict):
     """Why a job failed: the error's class and its message."""
-
-    model_config = ConfigDict(frozen=True)
 
     type: str
     detail: str
@@ -100,29 +98,22 @@ class Job(BaseModel):
     `options` are those that were asked for; defaults are left out.
     """
 
-    model_config = ConfigDict(
-        frozen=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "id": "job-20261121-093000-1f2e",
-                    "pipeline": "reconstruct",
-                    "state": "running",
-                    "capture": "/data/stage/captures/20261121-093000-1f2e",
-                    "model": "/data/stage/models/20261121-093000-1f2e",
-                    "options": {"held_out_cameras": ["cam_07"]},
-                    "progress": {
-                        "step": "reconstruct",
-                        "steps": ["reconstruct", "evaluate", "results"],
-                        "what": "tracing strands",
-                        "share": 0.23,
-                        "step_share": 0.7,
-                    },
-                    "created": "2026-11-21T09:31:12.000+00:00",
-                    "started": "2026-11-21T09:31:13.000+00:00",
-                }
-            ]
+    model_config = with_example(
+        id="job-20261121-093000-1f2e",
+        pipeline="reconstruct",
+        state="running",
+        capture="/data/stage/captures/20261121-093000-1f2e",
+        model="/data/stage/models/20261121-093000-1f2e",
+        options={"held_out_cameras": ["cam_07"]},
+        progress={
+            "step": "reconstruct",
+            "steps": ["reconstruct", "evaluate", "results"],
+            "what": "tracing strands",
+            "share": 0.23,
+            "step_share": 0.7,
         },
+        created="2026-11-21T09:31:12.000+00:00",
+        started="2026-11-21T09:31:13.000+00:00",
     )
 
     id: str

@@ -10,9 +10,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from reconstruction import Step
+from stage_service.config import Strict
 from stage_service.plan.timeline import Lit
 
 SLOWEST_HZ, FASTEST_HZ = 3.0, 30.0
@@ -26,14 +25,12 @@ IN_BAND: Band = "3 to 30 Hz"
 ROUNDING = 1e-9
 
 
-class FlashRate(BaseModel):
+class FlashRate(Strict):
     """How fast a plan flashes, as predicted: `hz`, over four flashes in a row, decides the band.
 
     Retries, a slow link or a slow disk make it slower: what is above the band can fall into it, so
     the rate is measured while running, too. `by_kind` has how often each kind of step comes again.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     hz: float
     band: Band
