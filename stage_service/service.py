@@ -14,9 +14,9 @@ import cv2
 from pydantic import ValidationError
 
 from reconstruction import Capture, Model, Rig, read_obj
-from stage_service.acquisition.capture_status import CaptureStatus
 from stage_service.acquisition.captures import CaptureManager, UnknownCapture
 from stage_service.acquisition.control import Caller, Control
+from stage_service.acquisition.states import CaptureStatus
 from stage_service.config import RigFile
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id

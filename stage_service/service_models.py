@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
-from stage_service.acquisition.capture_status import CaptureStatus
+from stage_service.acquisition.states import CaptureStatus
 from stage_service.config import Strict
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan

@@ -81,14 +81,10 @@ class FrameAccount:
             low = max(low, self._ahead[0] - slack)
             high = min(high, self._ahead[1] + slack)
         if low > high:
-            raise IndexShift(
-                self.device,
-                "matching time stamps to pulses",
-                expected="a frame made by the newest pulse",
-                received=f"one made {low - high:.4g} s or more before or after it",
-                todo="The camera was triggered by something else, or a frame came late: check the "
-                "trigger cable and start again.",
-            )
+            doing, expected = "matching time stamps to pulses", "a frame made by the newest pulse"
+            received = f"one made {low - high:.4g} s or more before or after it"
+            todo = "Something else fired the camera, or a frame came late: check the trigger cable."
+            raise IndexShift(self.device, doing, expected, received, todo)
         self._ahead, self._timed_at = (low, high), asked
 
     def late(self, block_id: int) -> None:
@@ -117,17 +113,13 @@ class FrameAccount:
         if not block_ids:
             self.unanswered += pulses
             return []
-        skipped = self._skipped(block_ids[0], pulses)
+        skipped = self._advance(block_ids[0], pulses + self.unanswered) - 1
         after = [(b - block_ids[0]) % self.wrap for b in block_ids]
         rising = all(a < b for a, b in pairwise(after))
         known = all(1 <= b <= self.wrap for b in block_ids)
         if not known or not rising or after[-1] >= pulses:
-            raise self._shift(
-                f"at most {pulses} frames with rising numbers",
-                block_ids[-1],
-                "The camera was triggered by something else, or repeats frames. Check the trigger "
-                "cable and start again.",
-            )
+            todo = "Something else fired the camera, or it repeats frames."
+            raise self._shift(f"at most {pulses} frames with rising numbers", block_ids[-1], todo)
         # Ids that were skipped may have belonged to pulses before this run.
         start = max(0, skipped - self.unanswered)
         whole = start + after[-1] == pulses - 1 and (self.unanswered == 0 or start == 0)
@@ -138,43 +130,27 @@ class FrameAccount:
         self.unanswered = pulses - 1 - (places[-1] if places else after[-1])
         return places
 
-    def _skipped(self, block_id: int, pulses: int) -> int:
-        """How many block ids there were between the last frame and this one."""
-        before, most = self.last or 0, pulses + self.unanswered
-        skipped = (block_id - before) % self.wrap - 1
-        if not 1 <= block_id <= self.wrap or not 0 <= skipped < most:
-            raise self._shift(
-                f"block id {before % self.wrap + 1}",
-                block_id,
-                "Frames and pulses are out of step. Check the trigger cable and start again.",
-            )
-        return skipped
-
-    def _advance(self, block_id: int, most: int) -> None:
-        before = 0 if self.last is None else self.last
+    def _advance(self, block_id: int, most: int) -> int:
+        """How many ids this one is after the last frame's, 1 to `most`; it is the last one now."""
+        before = self.last or 0
         advance = (block_id - before) % self.wrap
         if not 1 <= block_id <= self.wrap or not 1 <= advance <= most:
             ids = [(before + k - 1) % self.wrap + 1 for k in (1, most)]
-            raise self._shift(
-                f"block id {ids[0]}" + (f" to {ids[1]}" if most > 1 else ""),
-                block_id,
-                "Frames and pulses are out of step. Check the trigger cable for doubled pulses "
-                "and start again.",
-            )
+            expected = f"block id {ids[0]}" + (f" to {ids[1]}" if most > 1 else "")
+            raise self._shift(expected, block_id, "Frames and pulses are out of step.")
         self.last = block_id
+        return advance
 
     def _stray(self, received: str) -> IndexShift:
         expected = "no frame beside those of our pulses"
-        todo = (
-            "The camera was triggered by something else: frames since the last check may "
-            "belong to other steps. Check the trigger cable and start again."
-        )
+        todo = "Something else fired the camera: frames since the last check may stand for other "
+        todo += "steps. Check the trigger cable and start again."
         return IndexShift(self.device, "matching frames to pulses", expected, received, todo)
 
-    def _shift(self, expected: str, block_id: int, todo: str) -> IndexShift:
-        return IndexShift(
-            self.device, "matching frames to pulses", expected, f"block id {block_id}", todo
-        )
+    def _shift(self, expected: str, block_id: int, why: str) -> IndexShift:
+        todo = f"{why} Check the trigger cable for doubled pulses and start again."
+        received = f"block id {block_id}"
+        return IndexShift(self.device, "matching frames to pulses", expected, received, todo)
 
 
 def _by_time(
@@ -183,8 +159,7 @@ def _by_time(
     """Places that fit block ids and, to half a step, the time from one frame to the next; None
     unless exactly one does. From one to the next: a box that is a little slower than its schedule
     is late by whole steps at the end of a long run."""
-    rising = all(a < b for a, b in pairwise(timestamps))
-    if len(after) < 2 or not rising:
+    if len(after) < 2 or any(a >= b for a, b in pairwise(timestamps)):
         return None
     slack = 0.5 * min(b - a for a, b in pairwise(schedule))
     fits = []

@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from reconstruction import Capture, CaptureWriter, Step
-from stage_service.acquisition.capture_status import CaptureStatus, read_status
-from stage_service.acquisition.flash_watch import FlashWatch
+from reconstruction import Capture, CaptureWriter
+from stage_service.acquisition.exposing import FlashWatch
 from stage_service.acquisition.sequencer import Sequencer
+from stage_service.acquisition.states import CaptureStatus, read_status
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
@@ -40,8 +40,9 @@ class CaptureRun:
         self._first = read_status(writer.path)
         living = plan.rig_file.safety.living_subject
         free = not living or (plan.plan.consent is not None and consented)
-        watch = _any_rate if free else FlashWatch()
-        self.sequencer = Sequencer(devices, writer, plan, watch=watch, notify=self._notify)
+        self.sequencer = Sequencer(
+            devices, writer, plan, watch=None if free else FlashWatch(), notify=self._notify
+        )
 
     def status(self) -> CaptureStatus:
         """Where it is now."""
@@ -71,14 +72,6 @@ def plan_of(capture: Capture, rig_file: RigFile) -> ResolvedPlan:
         raise PlanError([f"{rig_file.path}: the rig has changed since this capture: begin anew"])
     plan = resolve(CapturePlan.model_validate(capture.plan["plan"]), rig_file)
     if plan.steps != capture.steps:
-        raise PlanError(
-            [
-                f"{rig_file.path}: [capture] has changed since this capture, and with it the "
-                "plan's steps: begin anew"
-            ]
-        )
+        changed = "[capture] has changed since this capture, and with it the plan's steps"
+        raise PlanError([f"{rig_file.path}: {changed}: begin anew"])
     return plan
-
-
-def _any_rate(_step: Step) -> None:
-    """Flashes may have any rate: nobody is there, or whoever is has consented."""

@@ -6,7 +6,7 @@ import secrets
 import shutil
 import threading
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,9 @@ from reconstruction.arrays import Bools
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import RESERVE
 from stage_service.acquisition.capture_run import CaptureRun, plan_of
-from stage_service.acquisition.capture_status import CaptureStatus, read_status
 from stage_service.acquisition.latch import Latch
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
-from stage_service.acquisition.states import WrongState, possible
+from stage_service.acquisition.states import CaptureStatus, WrongState, possible, read_status
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.lights.limited import LitTimes
@@ -109,10 +108,8 @@ class CaptureManager:
         _check_flashing(resolved, armed_by)
         free = shutil.disk_usage(self.folder).free
         if cost.bytes + RESERVE > free:
-            need, have = cost.bytes / 1e9, free / 1e9
-            raise PlanError(
-                [f"the plan writes {need:.1f} GB, {self.folder} has {have:.1f} GB free"]
-            )
+            need, have = f"{cost.bytes / 1e9:.1f} GB", f"{free / 1e9:.1f} GB"
+            raise PlanError([f"the plan writes {need}, {self.folder} has {have} free"])
         with self._lock:
             self._check_free()
             now = datetime.now(UTC)
@@ -125,7 +122,7 @@ class CaptureManager:
                 "armed_by": armed_by,
                 "request": extra or {},
             }
-            devices = DeviceSet.of(self.rig_file, self._lit)
+            devices = self._devices()
             writer = CaptureWriter.create(
                 self.folder / capture_id, self.rig_file.rig, description, masks=masks, head=head
             )
@@ -142,7 +139,7 @@ class CaptureManager:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
             _check_flashing(plan, armed_by)
-            devices = DeviceSet.of(self.rig_file, self._lit)
+            devices = self._devices()
             self._begin(capture_id, plan, devices, CaptureWriter.reopen(path), armed_by)
             del self._done[capture_id]
 
@@ -164,9 +161,8 @@ class CaptureManager:
         armed_by: str | None,
     ) -> None:
         run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=bool(armed_by))
-        run.thread = threading.Thread(
-            target=self._run, args=(run,), name=f"capture-{capture_id}", daemon=True
-        )
+        name = f"capture-{capture_id}"
+        run.thread = threading.Thread(target=self._run, args=(run,), name=name, daemon=True)
         self._running = run
         run.thread.start()
 
@@ -226,31 +222,25 @@ class CaptureManager:
             if run is not None:
                 lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
                 return {**run.sequencer.devices.status(connect=False), "safety": lit}
-            devices = DeviceSet.of(self.rig_file, self._lit)
-            try:
+            with closing(self._devices()) as devices:
                 return {**devices.status(connect=True), "safety": self.darkness()}
-            finally:
-                devices.close()
+
+    def _devices(self) -> DeviceSet:
+        return DeviceSet.of(self.rig_file, self._lit)
 
     def darkness(self) -> dict[str, Any]:
         """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
-        last, latched = self._dark, self.latch.latched
+        last, latched = self._dark or Blackout(False, "no blackout yet"), self.latch.latched
         if latched is not None:
             return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
-        if last is None:
-            return {"state": "unknown, unsafe", "detail": "no blackout yet", "latched": None}
         return {"state": last.state, "detail": last.detail, "latched": None}
 
     def darken(self) -> None:
         """Put everything off that answers, as the service starts; what does not is latched."""
         if self.rig_file.devices is None:
             return
-        with self._talking:
-            devices = DeviceSet.of(self.rig_file, self._lit)
-            try:
-                self._learn(blackout(devices, attempts=1), devices)
-            finally:
-                devices.close()
+        with self._talking, closing(self._devices()) as devices:
+            self._learn(blackout(devices, attempts=1), devices)
 
     def blackout(self) -> dict[str, Any]:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
@@ -275,15 +265,10 @@ class CaptureManager:
         """The blackout with which the run has ended, or one of our own."""
         if run is not None and run.sequencer.blackout is not None:
             return run.sequencer.blackout
-        devices = (
-            run.sequencer.devices if run is not None else DeviceSet.of(self.rig_file, self._lit)
-        )
-        try:
+        with closing(self._devices() if run is None else run.sequencer.devices) as devices:
             result = blackout(devices)
             self._learn(result, devices)
             return result
-        finally:
-            devices.close()
 
     def close(self) -> None:
         """Stop what runs, lights off, wait for the thread; the manager starts nothing any more."""
@@ -348,9 +333,8 @@ class CaptureManager:
     def _learn(self, result: Blackout, devices: DeviceSet) -> None:
         """Keep what a blackout came to, and latch or unlatch."""
         beams = devices.projectors
-        reads_back = devices.lights.capabilities.reads_back and (
-            beams is None or beams.capabilities.reads_back
-        )
+        lamps = devices.lights.capabilities.reads_back
+        reads_back = lamps and (beams is None or beams.capabilities.reads_back)
         self._dark = result
         change = self.latch.learn(result, reads_back)
         if change is not None:

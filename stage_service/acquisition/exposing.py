@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from reconstruction import Step
 from stage_service.acquisition.timings import Timings
 from stage_service.devices.device_set import DeviceSet
-from stage_service.devices.errors import Cancelled, DeviceError
+from stage_service.devices.errors import Cancelled, DeviceError, SafetyRefusal
+from stage_service.plan.flash import FASTEST_HZ, SLOW_HZ, SLOWEST_HZ, Trains
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Exposing:
         timings: Timings,
         *,
         rate_hz: float | None,
-        watch: Callable[[Step], None],
+        watch: Callable[[Step], None] | None,
     ) -> None:
         self._watch = watch
         self._devices, self._lamp, self._cancel, self._timings = devices, lamp, cancel, timings
@@ -50,7 +51,8 @@ class Exposing:
         with timings.on("rate limit"):
             self._sleep(self._next - time.monotonic())
         self._next = time.monotonic() + self._period
-        self._watch(step)
+        if self._watch is not None:
+            self._watch(step)
         with timings.on("lights"):
             self._light(step)
         with timings.on("settle"):
@@ -107,27 +109,43 @@ class Exposing:
             return
         lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
         if lit != expected:
-            raise DeviceError(
-                lights.name,
-                f"looking after the exposure of step {step.index}",
-                expected=f"{expected} lamps lit",
-                received=f"{lit} lit",
-                todo="Watchdog, interlock or emergency stop put them off: clear the cause.",
-            )
+            doing = f"looking after the exposure of step {step.index}"
+            todo = "Watchdog, interlock or emergency stop put them off: clear the cause."
+            raise DeviceError(lights.name, doing, f"{expected} lamps lit", f"{lit} lit", todo)
 
     def _check_projectors(self, step: Step) -> None:
         """The same for projectors, which go dark when nobody feeds their watchdog."""
         beams = self._devices.projectors
         projected = step.kind in ("scanline", "tracking")
         if projected and beams is not None and beams.capabilities.reads_back and beams.is_dark():
-            raise DeviceError(
-                beams.name,
-                f"looking after the exposure of step {step.index}",
-                expected="the row shown",
-                received="darkness",
-                todo="Its watchdog put it dark, or it lost power: check its cable.",
-            )
+            doing = f"looking after the exposure of step {step.index}"
+            todo = "Its watchdog put it dark, or it lost power: check its cable."
+            raise DeviceError(beams.name, doing, "the row shown", "darkness", todo)
 
     def _sleep(self, seconds: float) -> None:
         if self._cancel.wait(max(0.0, seconds)):
             raise Cancelled("the capture is being stopped")
+
+
+class FlashWatch:
+    """Measures the flash rate while running. Call it as each step's light is about to go on.
+
+    Raises `SafetyRefusal` before the flash that makes the rate fall into the band.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._trains = Trains()
+        self._lock = threading.Lock()
+
+    def __call__(self, step: Step) -> None:
+        if step.kind == "dark":
+            return
+        with self._lock:
+            rate = self._trains.add(step, self._clock())
+        if rate is not None:
+            doing = f"lighting step {step.index} ({step.kind})"
+            slow, fast = f"slower than {SLOWEST_HZ:g}", f"faster than {FASTEST_HZ:g} Hz"
+            expected = f"flashes {slow} or {fast}: no consent is armed"
+            todo = f"Set rate_hz to {SLOW_HZ:g} in the plan, or record consent and arm it."
+            raise SafetyRefusal("stage", doing, expected, f"{rate:.1f} Hz", todo)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, groupby
 from typing import Literal
 
@@ -56,10 +56,7 @@ class HardwareRun:
             TableRow(1, _gate(s), settle, s.exposure, period_s(s, devices.config, rate_hz))
             for s in steps
         ]
-        self._rows = [
-            TableRow(len(list(same)), row.gates, row.settle_s, row.exposure_s, row.period_s)
-            for row, same in groupby(each)
-        ]
+        self._rows = [replace(row, repeat=len(list(same))) for row, same in groupby(each)]
         self.steady = not any("P" in r.gates for r in each)  # projectors hold the box up
         self.schedule = list(accumulate((r.period_s for r in each[:-1]), initial=0.0))
 
@@ -71,11 +68,8 @@ class HardwareRun:
         Raises `DeviceError` where a device fails, `IndexShift` where lamps or projectors did not
         step with the box; `Cancelled` where `cancel` was set.
         """
-        lights, beams, trigger = (
-            self._devices.lights,
-            self._devices.projectors,
-            self._devices.trigger,
-        )
+        lights, beams = self._devices.lights, self._devices.projectors
+        trigger = self._devices.trigger
         lit = [_entry(s, self._lamp) for s in self._steps if _gate(s) == "L"]
         shown = [_pattern(s) for s in self._steps if _gate(s) == "P"]
         if lit:
@@ -127,9 +121,8 @@ class HardwareRun:
             expected = "a watchdog that was fed"
             received = "a tripped one: frames of this run may be dark"
             todo = "Check the load of the host and the link; raise watchdog_s."
-            raise DeviceError(
-                lights.name, "looking after a hardware-stepped run", expected, received, todo
-            )
+            doing = "looking after a hardware-stepped run"
+            raise DeviceError(lights.name, doing, expected, received, todo)
         stepped: list[tuple[str, LightBank | ProjectorController]] = [("L", lights)] if lit else []
         if shown and beams is not None:
             stepped.append(("P", beams))
@@ -141,15 +134,11 @@ class HardwareRun:
                 least = most
             reached = device.position()
             if not least <= reached <= most:
-                raise IndexShift(
-                    device.name,
-                    "counting the steps of a hardware-stepped run",
-                    expected=f"{least} steps, as the trigger box's gate"
-                    + (f", or {most}" if most > least else ""),
-                    received=f"{reached}",
-                    todo="Check the gate's cable for lost or doubled edges. The frames of this "
-                    "run were dropped.",
-                )
+                doing = "counting the steps of a hardware-stepped run"
+                either = f", or {most}" if most > least else ""
+                expected = f"{least} steps, as the trigger box's gate{either}"
+                todo = "Check the gate's cable for lost or doubled edges. Its frames were dropped."
+                raise IndexShift(device.name, doing, expected, f"{reached}", todo)
 
     def _gates(self, gate: str, steps: int) -> int:
         """How many of the first `steps` steps open this gate."""
@@ -157,13 +146,10 @@ class HardwareRun:
 
     def _early(self, progress: TableProgress) -> DeviceError:
         kind = SafetyRefusal if progress.reason in ("interlock", "estop") else DeviceError
-        return kind(
-            self._devices.trigger.name,
-            f"running a table of {len(self._steps)} steps",
-            expected="all of them",
-            received=f"{progress.state} after {progress.pulses} pulses ({progress.reason})",
-            todo=_TODO.get(progress.reason, "Check the trigger box and its cable."),
-        )
+        doing = f"running a table of {len(self._steps)} steps"
+        received = f"{progress.state} after {progress.pulses} pulses ({progress.reason})"
+        todo = _TODO.get(progress.reason, "Check the trigger box and its cable.")
+        return kind(self._devices.trigger.name, doing, "all of them", received, todo)
 
 
 _TODO = {

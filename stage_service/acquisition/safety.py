@@ -109,14 +109,11 @@ def check_interlocks(devices: DeviceSet) -> None:
     if devices.lights.capabilities.reads_back:
         inputs.append((devices.lights.name, devices.lights.status()))
     for name, status in inputs:
-        for seen, text in (
-            (status.estop_pressed, "emergency stop pressed"),
-            (status.interlock_open, "interlock open"),
-        ):
-            if seen:
-                expected = "interlock closed and emergency stop released"
-                todo = "Clear it at the stage; the service never does."
-                raise SafetyRefusal("stage", "arming", expected, f"{name}: {text}", todo)
+        if status.estop_pressed or status.interlock_open:
+            text = "emergency stop pressed" if status.estop_pressed else "interlock open"
+            expected = "interlock closed and emergency stop released"
+            todo = "Clear it at the stage; the service never does."
+            raise SafetyRefusal("stage", "arming", expected, f"{name}: {text}", todo)
 
 
 def off_on_exit(close: Callable[[], None]) -> Callable[[], None]:

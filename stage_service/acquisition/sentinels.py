@@ -34,7 +34,7 @@ def check_sentinels(capture: Capture) -> dict[str, str]:
     unclear, wrong = {}, []
     for camera in capture.rig.cameras:
         try:
-            d0, b0, d1, b1 = (_grey(capture, s, camera.name) for s in (*_zip(dark, bright),))
+            d0, d1, b0, b1 = (_grey(capture, s, camera.name) for s in (*dark, *bright))
         except MissingFrame as error:
             unclear[camera.name] = f"a sentinel frame is missing: {error}"
             continue
@@ -51,24 +51,17 @@ def check_sentinels(capture: Capture) -> dict[str, str]:
                 "what all on was at the beginning)"
             )
     if wrong:
-        raise IndexShift(
-            "cameras",
-            "comparing the pictures at both ends of the capture",
-            expected="dark frames without light and all-on frames alike",
-            received="; ".join(wrong),
-            todo="Frames may stand for other steps, or lamps failed: check the trigger cables and "
-            "the lamps, and shoot this capture again.",
-        )
+        doing = "comparing the pictures at both ends of the capture"
+        expected = "dark frames without light and all-on frames alike"
+        todo = "Frames may stand for other steps, or lamps failed: check the trigger cables and "
+        todo += "the lamps, and shoot this capture again."
+        raise IndexShift("cameras", doing, expected, "; ".join(wrong), todo)
     return unclear
 
 
 def _ends(capture: Capture, kind: str) -> tuple[Step, Step] | None:
     steps = [s for s in capture.steps if s.kind == kind]
     return (steps[0], steps[-1]) if len(steps) > 1 else None
-
-
-def _zip(dark: tuple[Step, Step], bright: tuple[Step, Step]) -> tuple[Step, ...]:
-    return dark[0], bright[0], dark[1], bright[1]
 
 
 def _grey(capture: Capture, step: Step, camera: str) -> Floats:

@@ -59,7 +59,7 @@ class Sequencer:
         writer: CaptureWriter,
         plan: ResolvedPlan,
         *,
-        watch: Callable[[Step], None] = lambda _step: None,
+        watch: Callable[[Step], None] | None = None,
         notify: Notify = lambda _kind, _data: None,
     ) -> None:
         self.devices = devices
@@ -206,17 +206,12 @@ class Sequencer:
             devices.trigger.reset()
             cameras = FanOut(devices.cameras)
             stack.callback(cameras.close)
-            watched = [
-                device
-                for device in (devices.lights, devices.projectors)
-                if device is not None and device.capabilities.dead_man
-            ]
+            lit = (devices.lights, devices.projectors)
+            watched = [d for d in lit if d is not None and d.capabilities.dead_man]
             for device in watched:
                 device.set_watchdog(devices.config.watchdog_s)
-            beats = [
-                stack.enter_context(Heartbeat(device, devices.config.heartbeat_s))
-                for device in watched
-            ]
+            every = devices.config.heartbeat_s
+            beats = [stack.enter_context(Heartbeat(device, every)) for device in watched]
             self._exposing.dark()
             for run in self._runs:
                 todo = {s: w for s in run.steps if (w := self._wanted(s))}
@@ -237,12 +232,8 @@ class Sequencer:
 
     def _wanted(self, step: Step) -> set[str]:
         records = self._writer.records
-        names = (c.name for c in self.devices.cameras)
-        return {
-            name
-            for name in names
-            if (record := records.get((step.index, name))) is None or record.file is None
-        }
+        shot = ((c.name, records.get((step.index, c.name))) for c in self.devices.cameras)
+        return {name for name, record in shot if record is None or record.file is None}
 
     def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
         """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
@@ -261,15 +252,14 @@ class Sequencer:
         self._pulses.ran(shots.progress.pulses, self.devices.trigger.count())
         places = self._place(shots, run)
         for camera in self.devices.cameras:
-            for place, frame in zip(
-                places[camera.name] or (), shots.frames[camera.name], strict=False
-            ):
+            arrived = zip(places[camera.name] or (), shots.frames[camera.name], strict=False)
+            for place, frame in arrived:
                 # The frame of a pulse beyond the steps that were done was cut short.
                 if place >= shots.progress.steps or camera.name not in todo[steps[place]]:
                     continue
-                self._put(
-                    frames, Shot(steps[place], camera.name, frame, camera.info, first + place, 0)
-                )
+                pulse = first + place
+                shot = Shot(steps[place], camera.name, frame, camera.info, pulse, attempt=0)
+                self._put(frames, shot)
                 todo[steps[place]].discard(camera.name)
         self._doubtful = any(todo.values())
         if shots.error is not None:
@@ -301,9 +291,8 @@ class Sequencer:
                 frame = shot[camera.name]
                 self._account(camera, frame, pulse)
                 if frame is not None and camera.name in wanted:
-                    self._put(
-                        frames, Shot(step, camera.name, frame, camera.info, pulse.count, attempt)
-                    )
+                    taken = Shot(step, camera.name, frame, camera.info, pulse.count, attempt)
+                    self._put(frames, taken)
                     wanted.discard(camera.name)
             if not wanted:
                 return

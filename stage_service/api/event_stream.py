@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator
+from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request
@@ -45,6 +46,4 @@ async def _follow(
     while not await request.is_disconnected():
         for event in await asyncio.to_thread(events.wait, number, POLL_S):
             number = event.number
-            yield ServerSentEvent(
-                id=str(number), event=event.kind, data=json.dumps(event.to_dict())
-            )
+            yield ServerSentEvent(id=str(number), event=event.kind, data=json.dumps(asdict(event)))

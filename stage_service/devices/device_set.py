@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from reconstruction import Camera as Geometry
 from reconstruction.geometry.rig import RigError
@@ -36,6 +35,7 @@ from stage_service.devices.trigger.interface import TriggerBox
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
 Device = LightBank | TriggerBox | ProjectorController | Camera
+D = TypeVar("D", bound=Device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +61,14 @@ class DeviceSet:
         config, rig = rig_file.devices, rig_file.rig
         if config is None:
             raise RigError(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
+        lights = _light_bank(config.lights, len(rig.lights))
         projectors = None
         if config.projectors is not None and rig.projectors:
             names = tuple(p.name for p in rig.projectors)
             projectors = SerialProjectorController(config.projectors, names)
         return cls(
             config,
-            LimitedLightBank(
-                _light_bank(config.lights, len(rig.lights)), rig_file.safety, past=lit
-            ),
+            LimitedLightBank(lights, rig_file.safety, past=lit),
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(_camera(config.cameras, c) for c in rig.cameras),
@@ -95,9 +94,8 @@ class DeviceSet:
             if state is not Power.ON:
                 received = state.name.lower().replace("_", " ")
                 todo = "Switch it on, and wait until its lamp has warmed up."
-                raise DeviceError(
-                    projector.name, "looking before a sweep", "power on", received, todo
-                )
+                doing = "looking before a sweep"
+                raise DeviceError(projector.name, doing, "power on", received, todo)
 
     def close(self) -> None:
         """Close every link; lamps and projectors stay as they are."""
@@ -112,17 +110,17 @@ class DeviceSet:
         """
         lights, trigger, beams = self.lights, self.trigger, self.projectors
         out = {
-            "lights": _ask(lights, connect, lambda: _lamps(lights)),
+            "lights": _ask(lights, connect, _lamps),
             "trigger": _ask(
-                trigger, connect, lambda: {"pulses": trigger.count(), **asdict(trigger.status())}
+                trigger, connect, lambda box: {"pulses": box.count(), **asdict(box.status())}
             ),
         }
         if beams is not None:
             out["projectors"] = _ask(
-                beams, connect, lambda: {"dark": beams.is_dark(), "names": list(beams.names)}
+                beams, connect, lambda b: {"dark": b.is_dark(), "names": list(b.names)}
             )
         out["cameras"] = {
-            c.name: _ask(c, connect, partial(_info, c)) if connect else {"state": "in use"}
+            c.name: _ask(c, connect, lambda c: asdict(c.info)) if connect else {"state": "in use"}
             for c in self.cameras
         }
         out["projector_power"] = {p.projector: _power(p) for p in self.powers if connect}
@@ -175,14 +173,10 @@ def _lamps(lights: LightBank) -> dict[str, Any]:
     return {"count": lights.count, **known}
 
 
-def _info(camera: Camera) -> dict[str, Any]:
-    return asdict(camera.info)
-
-
-def _ask(device: Device, connect: bool, question: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _ask(device: D, connect: bool, question: Callable[[D], dict[str, Any]]) -> dict[str, Any]:
     try:
         if connect:
             device.connect()
-        return {"name": device.name, "state": "ok", **question()}
+        return {"name": device.name, "state": "ok", **question(device)}
     except DeviceError as error:
         return {"name": device.name, "state": "unreachable", "error": str(error)}

@@ -38,25 +38,17 @@ class SerialLines:
 
     def connect(self) -> re.Match[str]:
         """Open the port and return the match of the device's answer to `ID?`."""
+        config = self.config
         with self._lock:
             self.close()
             try:
                 port = serial.Serial(
-                    self.config.port,
-                    self.config.baud,
-                    timeout=self.config.timeout_s,
-                    write_timeout=self.config.timeout_s,
-                    exclusive=True,
+                    config.port, config.baud, write_timeout=config.timeout_s, exclusive=True
                 )
             except (OSError, serial.SerialException) as error:
-                raise DeviceUnreachable(
-                    self.name,
-                    "opening the serial port",
-                    expected="a free serial port",
-                    received=str(error),
-                    deadline_s=self.config.timeout_s,
-                    todo="Check the cable, the path in the rig file and who else has it open.",
-                ) from error
+                doing, expected = "opening the serial port", "a free serial port"
+                todo = "Check the cable, the path in the rig file and who else has it open."
+                raise self._error(DeviceUnreachable, doing, expected, str(error), todo) from error
             self._port = port
             port.reset_input_buffer()
             return self._identify()
@@ -81,8 +73,7 @@ class SerialLines:
             line = self._line(deadline, doing)
             while self._identity.fullmatch(line):  # came late, after its deadline
                 line = self._line(deadline, doing)
-            match = re.fullmatch(reply, line)
-            if match is not None:
+            if match := re.fullmatch(reply, line):
                 return match
             error = re.fullmatch(r"ERR (\d+) ?(.*)", line)
             if error is None:
@@ -91,29 +82,27 @@ class SerialLines:
             expected = f"an answer to {request!r}"
             received = f"a refusal: {error[2] or line}"
             todo = "Close the interlock and release the emergency stop at the stage."
-            raise SafetyRefusal(self.name, doing, expected, received, todo, self.config.timeout_s)
+            raise self._error(SafetyRefusal, doing, expected, received, todo)
         expected = f"an answer to {request!r} like {reply!r}"
         todo = "Check that the device follows docs/wire.md and that nobody else uses the port."
-        raise DeviceError(self.name, doing, expected, repr(line), todo, self.config.timeout_s)
+        raise self._error(DeviceError, doing, expected, repr(line), todo)
 
     def _identify(self) -> re.Match[str]:
+        doing = "identifying"
         # "?" ends what a device may hold of a request that was cut off; the two make no request.
-        self._send("?\nID?", "identifying")
+        self._send("?\nID?", doing)
         deadline = time.monotonic() + self.config.timeout_s
         seen: list[str] = []
         while True:
             try:
-                line = self._line(deadline, "identifying")
+                line = self._line(deadline, doing)
             except DeviceTimeout as error:
                 if not seen:
                     raise
                 expected = f"an identity like {self._identity.pattern!r}"
                 todo = "This is another device: check the ports in the rig file."
-                raise DeviceError(
-                    self.name, "identifying", expected, repr(seen[-1]), todo, self.config.timeout_s
-                ) from error
-            match = self._identity.fullmatch(line)
-            if match is not None:
+                raise self._error(DeviceError, doing, expected, repr(seen[-1]), todo) from error
+            if match := self._identity.fullmatch(line):
                 return match
             seen.append(line)
 
@@ -141,15 +130,18 @@ class SerialLines:
             self.close()
             received = repr(data.decode("ascii", "backslashreplace")) if data else "nothing"
             todo = "Check power and cable; the port is reopened at the next request."
-            raise DeviceTimeout(self.name, doing, "a line", received, todo, self.config.timeout_s)
+            raise self._error(DeviceTimeout, doing, "a line", received, todo)
         return data.decode("ascii", "backslashreplace").strip("\r\n")
 
-    def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
+    def _lost(self, doing: str, error: Exception) -> DeviceError:
         self.close()
         todo = "The device was unplugged or its port closed: plug it in and start again."
-        return DeviceUnreachable(
-            self.name, doing, "an open serial port", str(error), todo, self.config.timeout_s
-        )
+        return self._error(DeviceUnreachable, doing, "an open serial port", str(error), todo)
+
+    def _error(
+        self, kind: type[DeviceError], doing: str, expected: str, received: str, todo: str
+    ) -> DeviceError:
+        return kind(self.name, doing, expected, received, todo, self.config.timeout_s)
 
 
 def milliseconds(device: str, watchdog_s: float) -> int:

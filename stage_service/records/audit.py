@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import threading
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
-from typing import IO
 
 from pydantic import BaseModel
 
@@ -50,8 +49,9 @@ class AuditLog:
         try:
             with self._lock, self._path.open("ab+") as file:
                 # What a crash left of a line must not swallow this one.
-                if file.tell() and _last_byte(file) != b"\n":
-                    line = f"\n{line}"
+                if file.tell():
+                    file.seek(-1, os.SEEK_END)
+                    line = line if file.read(1) == b"\n" else f"\n{line}"
                 file.write(f"{line}\n".encode())
                 file.flush()
                 os.fsync(file.fileno())
@@ -62,16 +62,9 @@ class AuditLog:
         """The newest actions, oldest of them first; a torn line is left out."""
         if not self._path.exists():
             return []
-        newest: deque[Action] = deque(maxlen=limit)
+        newest = []
         with self._lock, self._path.open(errors="replace") as file:
             for line in deque(file, maxlen=limit):
-                try:
-                    newest.append(Action(**json.loads(line)))
-                except ValueError:
-                    continue
-        return list(newest)
-
-
-def _last_byte(file: IO[bytes]) -> bytes:
-    file.seek(-1, os.SEEK_END)
-    return file.read(1)
+                with suppress(ValueError):
+                    newest.append(Action.model_validate_json(line))
+        return newest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from reconstruction.capture.writer import utc_now
@@ -18,10 +18,6 @@ class Event:
     kind: str
     time: str
     data: dict[str, Any]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The event as JSON-ready data."""
-        return asdict(self)
 
 
 class EventLog:

@@ -16,7 +16,6 @@ from typing import Any
 from reconstruction import Camera as CameraGeometry
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras import pixel_formats
-from stage_service.devices.cameras.block_counter import BlockCounter
 from stage_service.devices.cameras.genicam_nodes import Nodes
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
@@ -101,7 +100,6 @@ class BaslerCamera:
             raise
 
     def close(self) -> None:
-        """Stop and let go of the camera."""
         if self._camera is not None:
             self._camera.Close()
         self._camera = None
@@ -285,7 +283,32 @@ class BaslerCamera:
         return DeviceUnreachable(self.device, doing, "the camera", received, todo)
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
-        return DeviceError(self.device, doing, expected=expected, received=received, todo=todo)
+        return DeviceError(self.device, doing, expected, received, todo)
+
+
+class BlockCounter:
+    """Counts frames from 1 by their block ids, across wraps and restarts.
+
+    Ids run from `first` to `last`, begin again at `first`, and also do so with every `restart`.
+    A gap of a whole round cannot be seen.
+    """
+
+    def __init__(self, first: int, last: int) -> None:
+        self.first, self.last = first, last
+        self.count = 0
+        self._before = first - 1
+
+    def restart(self) -> None:
+        """The next frame's id is `first`."""
+        self._before = self.first - 1
+
+    def take(self, block_id: int) -> int | None:
+        """The frame's number; an id that comes twice has the same twice. None: not an id."""
+        if not self.first <= block_id <= self.last:
+            return None
+        self.count += (block_id - self._before) % (self.last - self.first + 1)
+        self._before = block_id
+        return self.count
 
 
 def _pypylon(device: str) -> tuple[Any, Any]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from stage_service.devices.cameras.interface import Camera
 from stage_service.devices.errors import Cancelled
 
 T = TypeVar("T")
+Work = queue.SimpleQueue[tuple[Callable[[Camera], Any], Future[Any]] | None]
 
 
 class FanOut:
@@ -22,13 +24,10 @@ class FanOut:
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self.cameras = tuple(cameras)
-        self._work: list[queue.SimpleQueue[tuple[Any, ...] | None]] = []
-        for camera in self.cameras:
-            work: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
-            self._work.append(work)
-            threading.Thread(
-                target=_serve, args=(camera, work), name=f"camera-{camera.name}", daemon=True
-            ).start()
+        self._work: list[Work] = [queue.SimpleQueue() for _ in self.cameras]
+        for camera, work in zip(self.cameras, self._work, strict=True):
+            name = f"camera-{camera.name}"
+            threading.Thread(target=_serve, args=(camera, work), name=name, daemon=True).start()
 
     def __call__(self, call: Callable[[Camera], T]) -> dict[str, T]:
         """`call(camera)` for every camera, by name, when all are done.
@@ -36,23 +35,16 @@ class FanOut:
         Raises the error of the only camera that failed, or an `ExceptionGroup` of all that did;
         `Cancelled` only where nothing else went wrong.
         """
-        answers: queue.SimpleQueue[tuple[str, T | None, Exception | None]] = queue.SimpleQueue()
-        for work in self._work:
-            work.put((call, answers))
-        done: dict[str, T] = {}
-        errors: list[Exception] = []
-        for _ in self.cameras:
-            name, value, error = answers.get()
-            if error is not None:
-                errors.append(error)
-            else:
-                done[name] = value  # type: ignore[assignment]
+        answers: list[Future[T]] = [Future() for _ in self.cameras]
+        for work, answer in zip(self._work, answers, strict=True):
+            work.put((call, answer))
+        errors = [e for a in answers if isinstance(e := a.exception(), Exception)]
         errors = [e for e in errors if not isinstance(e, Cancelled)] or errors[:1]
         if len(errors) == 1:
             raise errors[0]
         if errors:
             raise ExceptionGroup("; ".join(str(e) for e in errors), errors)
-        return {c.name: done[c.name] for c in self.cameras}
+        return {c.name: a.result() for c, a in zip(self.cameras, answers, strict=True)}
 
     def close(self) -> None:
         """Let the threads end."""
@@ -60,10 +52,10 @@ class FanOut:
             work.put(None)
 
 
-def _serve(camera: Camera, work: queue.SimpleQueue[tuple[Any, ...] | None]) -> None:
+def _serve(camera: Camera, work: Work) -> None:
     while (item := work.get()) is not None:
-        call, answers = item
+        call, answer = item
         try:
-            answers.put((camera.name, call(camera), None))
+            answer.set_result(call(camera))
         except Exception as error:  # handed to the caller
-            answers.put((camera.name, None, error))
+            answer.set_exception(error)

@@ -39,7 +39,6 @@ class LinkCamera:
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera said of itself."""
         if self._info is None:
             raise RuntimeError(f"{self.device}: not connected")
         return self._info
@@ -52,51 +51,46 @@ class LinkCamera:
                 (self.config.host, self.config.port), timeout=self.config.timeout_s
             )
         except OSError as error:
-            received = str(error)
             todo = "Check power, network, and host and port in [devices.cameras]."
+            doing, deadline = "connecting", self.config.timeout_s
             raise DeviceUnreachable(
-                self.device, "connecting", "a TCP connection", received, todo, self.config.timeout_s
+                self.device, doing, "a TCP connection", str(error), todo, deadline
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        answer, _ = self._ask({"op": "hello", "camera": self.name}, "saying hello")
-        fields = ("width", "height", "full_scale", "black", "gain")
-        info = CameraInfo(*(self._number(answer, f, "saying hello") for f in fields))
-        info = CameraInfo(
-            int(info.width), int(info.height), int(info.full_scale), info.black, info.gain
-        )
+        doing = "saying hello"
+        answer, _ = self._ask({"op": "hello", "camera": self.name}, doing)
+        whole = (int(self._number(answer, f, doing)) for f in ("width", "height", "full_scale"))
+        info = CameraInfo(*whole, *(self._number(answer, f, doing) for f in ("black", "gain")))
         size = (self.geometry.width, self.geometry.height)
         if (info.width, info.height) != size:
             expected = f"{size[0]}x{size[1]} pixels as in the rig file"
             todo = "Set the camera's region of interest, or calibrate the rig for this size."
-            raise self._error("saying hello", expected, f"{info.width}x{info.height}", todo)
+            raise self._error(doing, expected, f"{info.width}x{info.height}", todo)
         if info.gain <= 0 or info.full_scale <= info.black:
             expected = "gain above 0 and full_scale above black"
             received = f"gain {info.gain}, full_scale {info.full_scale}, black {info.black}"
             todo = "Check the camera's configuration."
-            raise self._error("saying hello", expected, received, todo)
+            raise self._error(doing, expected, received, todo)
         self._info = info
 
     def close(self) -> None:
-        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
         self._socket = None
         self._armed = None
 
     def arm(self, exposure: float) -> None:
-        """Answer the next pulses with `exposure` seconds; frames not read are dropped."""
         self._ask({"op": "arm", "exposure": exposure}, f"arming for {exposure:g} s")
         self._armed = exposure
 
     def disarm(self) -> None:
-        """Answer no more pulses."""
         self._ask({"op": "disarm"}, "disarming")
         self._armed = None
 
     def read(self, cancel: threading.Event) -> Frame | None:
-        """The oldest frame not read, or None when no pulse reached the camera."""
         doing = "reading a frame"
-        deadline = time.monotonic() + self.config.busy_s
+        busy_s = self.config.busy_s
+        deadline = time.monotonic() + busy_s
         wait = POLL_S[0]
         while True:
             answer, payload = self._ask({"op": "read"}, doing)
@@ -110,9 +104,8 @@ class LinkCamera:
                 raise self._error(doing, "the status frame, busy or empty", repr(status), todo)
             if time.monotonic() > deadline:
                 todo = "Check the camera, or raise busy_s in [devices.cameras]."
-                raise DeviceTimeout(
-                    self.device, doing, "a frame", "busy all the time", todo, self.config.busy_s
-                )
+                received = "busy all the time"
+                raise DeviceTimeout(self.device, doing, "a frame", received, todo, busy_s)
             if cancel.wait(wait):
                 raise Cancelled(f"{self.device}: {doing} was given up")
             wait = min(2 * wait, POLL_S[1])
@@ -151,10 +144,11 @@ class LinkCamera:
                 received = "a closed one"
                 todo = "Connect again; what the camera held is lost."
                 raise DeviceUnreachable(self.device, doing, "an open connection", received, todo)
-            deadline = time.monotonic() + self.config.timeout_s
+            timeout_s = self.config.timeout_s
+            deadline = time.monotonic() + timeout_s
             try:
                 data = json.dumps(request).encode()
-                self._socket.settimeout(self.config.timeout_s)
+                self._socket.settimeout(timeout_s)
                 self._socket.sendall(struct.pack(">I", len(data)) + data)
                 (length,) = struct.unpack(">I", self._receive(4, deadline))
                 if length > LONGEST_HEADER:
@@ -166,17 +160,16 @@ class LinkCamera:
                 payload = self._receive(length, deadline)
             except TimeoutError as error:
                 self.close()
-                received = "nothing, or not all of it"
-                todo = "Check the camera's power and network."
+                came, todo = "nothing, or not all of it", "Check the camera's power and network."
                 raise DeviceTimeout(
-                    self.device, doing, "an answer", received, todo, self.config.timeout_s
+                    self.device, doing, "an answer", came, todo, timeout_s
                 ) from error
             except (OSError, EOFError) as error:
                 self.close()
-                received = str(error) or "a closed connection"
+                came = str(error) or "a closed connection"
                 todo = "Check the camera's power and network, and start again."
                 raise DeviceUnreachable(
-                    self.device, doing, "an answer", received, todo, self.config.timeout_s
+                    self.device, doing, "an answer", came, todo, timeout_s
                 ) from error
             except (ValueError, AttributeError) as error:
                 self.close()
@@ -203,4 +196,4 @@ class LinkCamera:
         return bytes(data)
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
-        return DeviceError(self.device, doing, expected=expected, received=received, todo=todo)
+        return DeviceError(self.device, doing, expected, received, todo)

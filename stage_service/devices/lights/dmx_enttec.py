@@ -25,12 +25,8 @@ import serial
 from reconstruction.geometry.rig import RigError
 from stage_service.config import DmxConfig
 from stage_service.devices.errors import DeviceTimeout, DeviceUnreachable
+from stage_service.devices.lights import limits
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
-from stage_service.devices.lights.limits import (
-    cannot,
-    refuse_lost_level,
-    refuse_unverified_blackout,
-)
 
 CHANNELS, FEWEST_CHANNELS = 512, 24
 GET_PARAMETERS, SEND_DMX = 3, 6
@@ -76,9 +72,8 @@ class DmxLightBank:
     def connect(self) -> None:
         """Open the port and check that a widget answers; `DeviceError` unless the rig file accepts
         that a blackout cannot be verified."""
-        refuse_unverified_blackout(
-            self.name, self.capabilities, self.config.accept_unverified_blackout
-        )
+        accepted = self.config.accept_unverified_blackout
+        limits.refuse_unverified_blackout(self.name, self.capabilities, accepted)
         with self._lock:
             self._open()
             self._ask_parameters("identifying")
@@ -91,56 +86,47 @@ class DmxLightBank:
             self._port = None
 
     def select(self, lamp: int) -> None:
-        """Have the widget send a frame with exactly this lamp on."""
         if not 0 <= lamp < self._lamps:
             raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {lamp}")
         self._show(range(lamp, lamp + 1), self._level, f"putting lamp {lamp} on")
 
     def all_on(self) -> None:
-        """Have the widget send a frame with every lamp on."""
         self._show(range(self._lamps), self._level, "putting all lamps on")
 
     def off(self) -> None:
-        """Have the widget send a dark frame."""
         self._show(range(0), self._level, "putting all lamps off")
 
     def set_level(self, level: float) -> None:
         """Set the level of the lamps that are on, and of those that come next."""
-        if not 0 <= level <= 1:
-            raise ValueError(f"{self.name}: a level is 0 to 1, got {level}")
         doing = f"setting the level to {level:g}"
-        refuse_lost_level(self.name, doing, level, self.config.level_steps())
+        limits.level_word(self.name, doing, level, self.config.level_steps())
         with self._lock:
             if self._on and level != self._level:
                 self._show(self._on, level, doing)
             self._level = level
 
     def set_watchdog(self, seconds: float) -> None:
-        """DMX has none: raises `DeviceError`."""
-        raise cannot(self.name, f"setting the watchdog to {seconds:g} s", "a watchdog")
+        raise limits.cannot(self.name, f"setting the watchdog to {seconds:g} s", "a watchdog")
 
     def heartbeat(self) -> None:
-        """DMX has no watchdog to feed: raises `DeviceError`."""
-        raise cannot(self.name, "sending a heartbeat", "a watchdog")
+        raise limits.cannot(self.name, "sending a heartbeat", "a watchdog")
 
     def status(self) -> LightStatus:
-        """Nothing comes back on DMX: raises `DeviceError`."""
-        raise cannot(self.name, "reading the status", "read-back")
+        raise limits.cannot(self.name, "reading the status", "read-back")
 
     def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
-        """DMX has no sequence table: raises `DeviceError`."""
-        raise cannot(self.name, f"loading a sequence of {len(entries)} steps", "a sequence table")
+        raise limits.cannot(
+            self.name, f"loading a sequence of {len(entries)} steps", "a sequence table"
+        )
 
     def position(self) -> int:
-        """DMX has no sequence table: raises `DeviceError`."""
-        raise cannot(self.name, "reading the position in the sequence", "a sequence table")
+        raise limits.cannot(self.name, "reading the position in the sequence", "a sequence table")
 
     def _show(self, on: range, level: float, doing: str) -> None:
-        channels = bytearray(max(FEWEST_CHANNELS, self.config.first_channel - 1 + self._lamps))
+        first = self.config.first_channel - 1
+        channels = bytearray(max(FEWEST_CHANNELS, first + self._lamps))
         for lamp in on:
-            channels[self.config.first_channel - 1 + lamp] = round(
-                level * self.config.level_steps()
-            )
+            channels[first + lamp] = round(level * self.config.level_steps())
         with self._lock:
             self._open()
             self._send(SEND_DMX, bytes([_START_CODE]) + channels, doing)

@@ -47,7 +47,6 @@ class LimitedLightBank:
 
     @property
     def count(self) -> int:
-        """Number of lamps."""
         return self._bank.count
 
     def connect(self) -> None:
@@ -66,13 +65,11 @@ class LimitedLightBank:
         self._bank.close()
 
     def select(self, lamp: int) -> None:
-        """Put exactly this lamp on."""
         with self._changed:
             self._allow((lamp,), f"putting lamp {lamp} on")
             self._bank.select(lamp)
 
     def all_on(self) -> None:
-        """Put every lamp on."""
         with self._changed:
             self._allow(range(self.count), "putting all lamps on")
             self._bank.all_on()
@@ -84,7 +81,6 @@ class LimitedLightBank:
             self._lit(())
 
     def set_level(self, level: float) -> None:
-        """Set the level of every lamp."""
         with self._changed:
             self._raise_refusal()
             self._check_power(len(self._since), level, f"setting the level to {level:g}")
@@ -92,7 +88,6 @@ class LimitedLightBank:
             self._level = level
 
     def set_watchdog(self, seconds: float) -> None:
-        """Set the bank's watchdog."""
         self._bank.set_watchdog(seconds)
 
     def heartbeat(self) -> None:
@@ -119,7 +114,6 @@ class LimitedLightBank:
             self._lit(())
 
     def position(self) -> int:
-        """How many steps of the armed sequence are over."""
         return self._bank.position()
 
     def enforce(self) -> float:
@@ -224,4 +218,4 @@ class LimitedLightBank:
                 self._changed.wait(wait)
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> SafetyRefusal:
-        return SafetyRefusal(self.name, doing, expected=expected, received=received, todo=todo)
+        return SafetyRefusal(self.name, doing, expected, received, todo)

@@ -8,14 +8,11 @@ from stage_service.devices.lights.interface import LightCapabilities
 
 def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool) -> None:
     """Raise `DeviceError` for a bank that cannot guarantee a blackout, unless that is accepted."""
-    lacking = [
-        text
-        for there, text in (
-            (can.reads_back, "no read-back: that the lamps are off is never known"),
-            (can.dead_man, "no dead-man: when the service or the cable dies, lit lamps stay lit"),
-        )
-        if not there
-    ]
+    lacking = []
+    if not can.reads_back:
+        lacking.append("no read-back: that the lamps are off is never known")
+    if not can.dead_man:
+        lacking.append("no dead-man: when the service or the cable dies, lit lamps stay lit")
     if lacking and not accepted:
         raise DeviceError(
             name,
@@ -27,12 +24,16 @@ def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool
         )
 
 
-def refuse_lost_level(name: str, doing: str, level: float, steps: int) -> None:
-    """Raise `DeviceError` for a level above 0 that a bank of `steps` levels above 0 makes 0."""
+def level_word(name: str, doing: str, level: float, steps: int) -> int:
+    """A level of 0 to 1 for a bank of `steps` levels above 0; raises `ValueError` beyond, and
+    `DeviceError` for a level above 0 that would become 0."""
+    if not 0 <= level <= 1:
+        raise ValueError(f"{name}: a level is 0 to 1, got {level}")
     if level > 0 and round(level * steps) == 0:
         expected = f"0, or more than {0.5 / steps:.3g}: it has {steps} levels above 0"
         todo = "Use a shorter exposure at a higher level."
         raise DeviceError(name, doing, expected, f"{level:g}", todo)
+    return round(level * steps)
 
 
 def cannot(name: str, doing: str, lacks: str) -> DeviceError:

@@ -10,13 +10,8 @@ from pymodbus import ModbusException
 
 from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
-from stage_service.devices.lights import modbus_answers
+from stage_service.devices.lights import limits, modbus_answers
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
-from stage_service.devices.lights.limits import (
-    cannot,
-    refuse_lost_level,
-    refuse_unverified_blackout,
-)
 from stage_service.devices.lights.modbus_links import ModbusLink, open_link
 
 ALL_ON, ALL_OFF = 65535, 0
@@ -60,21 +55,18 @@ class ModbusLightBank:
 
     @property
     def count(self) -> int:
-        """Number of lamps, as the rig file has it and `connect` has confirmed it."""
         return self._lamps
 
     def connect(self) -> None:
         """Connect; raises `DeviceError` where the peer is no light bank, has another size, or
         cannot guarantee a blackout though the rig file does not accept that."""
-        refuse_unverified_blackout(
-            self.name, self.capabilities, self.config.accept_unverified_blackout
-        )
+        accepted = self.config.accept_unverified_blackout
+        limits.refuse_unverified_blackout(self.name, self.capabilities, accepted)
         with self._lock:
             self._identified = False
             self._trust()
 
     def close(self) -> None:
-        """Close the connection; the lamps stay as they are."""
         with self._lock:
             if self._link is not None:
                 self._link.close()
@@ -82,17 +74,14 @@ class ModbusLightBank:
             self._identified = False
 
     def select(self, lamp: int) -> None:
-        """Put exactly lamp `lamp` on, and confirm that one lamp is lit where the bank can."""
         if not 0 <= lamp < self._lamps:
             raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {lamp}")
         self._command(lamp + 1, 1, f"putting lamp {lamp} on")
 
     def all_on(self) -> None:
-        """Put every lamp on, and confirm that all are lit where the bank can."""
         self._command(ALL_ON, self._lamps, "putting all lamps on")
 
     def off(self) -> None:
-        """Put every lamp off, leave a sequence, and confirm it where the bank can."""
         doing = "putting all lamps off"
         with self._lock:
             if not self._identified:
@@ -131,12 +120,10 @@ class ModbusLightBank:
         self._write([round(seconds * 1000)], register, doing)
 
     def heartbeat(self) -> None:
-        """Feed the watchdog."""
         doing = "sending a heartbeat"
         self._write([1], self._required(self._map.heartbeat, doing, "a heartbeat register"), doing)
 
     def status(self) -> LightStatus:
-        """Read status bits and the number of lamps that are lit."""
         doing = "reading the status"
         lit = self._required(self._map.lit, doing, "a register with the number of lit lamps")
         first = self._map.status
@@ -149,7 +136,6 @@ class ModbusLightBank:
         return LightStatus(bool(bits & 1), bool(bits & 2), bool(bits & 4), count)
 
     def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
-        """Upload the table, read it back, and arm it; dark until the gate opens."""
         doing = f"loading a sequence of {len(entries)} steps"
         table = self._required(self._map.table, doing, "a sequence table")
         sequence = self._required(self._map.sequence, doing, "a sequence register")
@@ -166,10 +152,10 @@ class ModbusLightBank:
                 got = self._read("read_holding_registers", table + start, len(wanted), doing)
                 if got != wanted:
                     at = next(i for i, (a, b) in enumerate(zip(wanted, got, strict=True)) if a != b)
+                    doing = f"{doing}: reading the table back"
                     expected = f"{wanted[at]} at register {table + start + at}"
-                    received = f"{got[at]}"
                     todo = "Load it again; if it stays, the bank's table or its map is wrong."
-                    raise self._error(f"{doing}: reading the table back", expected, received, todo)
+                    raise self._error(doing, expected, f"{got[at]}", todo)
             self._armed = None
             self._write([len(entries)], sequence, f"{doing}: arming it")
             self._armed = len(entries)
@@ -177,7 +163,6 @@ class ModbusLightBank:
                 self._confirm(0, f"{doing}: arming it")
 
     def position(self) -> int:
-        """How many steps of the armed sequence are over."""
         doing = "reading the position in the sequence"
         position = self._input(self._required(self._map.position, doing, "a position"), doing)
         if self._armed is not None and position > self._armed:
@@ -192,10 +177,7 @@ class ModbusLightBank:
         return selector or 0, self._level_word(level, "loading a sequence")
 
     def _level_word(self, level: float, doing: str) -> int:
-        if not 0 <= level <= 1:
-            raise ValueError(f"{self.name}: a level is 0 to 1, got {level}")
-        refuse_lost_level(self.name, doing, level, self._map.level_full)
-        return round(level * self._map.level_full)
+        return limits.level_word(self.name, doing, level, self._map.level_full)
 
     def _command(self, selector: int, lit: int, doing: str) -> None:
         with self._lock:
@@ -222,21 +204,15 @@ class ModbusLightBank:
         status = self.status()
         if status.lit == lit:
             return
-        causes = [
-            text
-            for seen, text in (
-                (status.watchdog_tripped, "its watchdog has tripped"),
-                (status.interlock_open, "the interlock is open"),
-                (status.estop_pressed, "the emergency stop is pressed"),
-            )
-            if seen
-        ]
-        received = f"{status.lit} lit" + "".join(f", {c}" for c in causes)
-        todo = (
-            "Clear the cause at the stage."
-            if causes
-            else "Check the lamp drivers' supply, and that nobody else writes to the bank."
+        causes = (
+            ", its watchdog has tripped" * status.watchdog_tripped
+            + ", the interlock is open" * status.interlock_open
+            + ", the emergency stop is pressed" * status.estop_pressed
         )
+        received = f"{status.lit} lit{causes}"
+        todo = "Check the lamp drivers' supply, and that nobody else writes to the bank."
+        if causes:
+            todo = "Clear the cause at the stage."
         raise self._error(doing, f"{lit} lamps lit", received, todo)
 
     def _write(self, values: list[int], first: int, doing: str) -> None:
@@ -297,9 +273,8 @@ class ModbusLightBank:
         if r.count is not None:
             lamps = self._exchange(doing, "read_input_registers", r.count, 1).registers[0]
             if lamps != self._lamps:
-                received = f"{lamps}"
-                todo = "Use the rig file of this stage."
-                raise self._error(doing, f"{self._lamps} lamps as in the rig file", received, todo)
+                expected = f"{self._lamps} lamps as in the rig file"
+                raise self._error(doing, expected, f"{lamps}", "Use the rig file of this stage.")
         if r.sequence is not None:
             answer = self._exchange(doing, "read_holding_registers", r.sequence, 1)
             self._armed = answer.registers[0]
@@ -355,8 +330,8 @@ class ModbusLightBank:
 
     def _required(self, address: int | None, doing: str, what: str) -> int:
         if address is None:
-            raise cannot(self.name, doing, what)
+            raise limits.cannot(self.name, doing, what)
         return address
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
-        return DeviceError(self.name, doing, expected=expected, received=received, todo=todo)
+        return DeviceError(self.name, doing, expected, received, todo)

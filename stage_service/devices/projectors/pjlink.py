@@ -100,33 +100,24 @@ class PjLinkProjector:
         except _Incomplete as cut:
             received = f"{cut}, and the connection was closed"
             todo = "The projector takes few connections at once: see who else uses it."
-            raise DeviceUnreachable(
-                self.name, doing, "an answer that ends in CR", received, todo, self.timeout_s
-            ) from cut
+            expected = "an answer that ends in CR"
+            raise self._error(DeviceUnreachable, doing, expected, received, todo) from cut
         except TimeoutError as error:
             todo = "Check the projector's network standby setting, cable and address."
-            raise DeviceTimeout(
-                self.name, doing, "an answer", str(error), todo, self.timeout_s
-            ) from error
+            raise self._error(DeviceTimeout, doing, "an answer", str(error), todo) from error
         except OSError as error:
             todo = "Check address, network and that PJLink is enabled in the projector."
-            raise DeviceUnreachable(
-                self.name, doing, "a connection", str(error), todo, self.timeout_s
-            ) from error
+            raise self._error(DeviceUnreachable, doing, "a connection", str(error), todo) from error
         if re.fullmatch("PJLINK ERRA", line, re.IGNORECASE):
             self._not_authenticated("ERRA: the password is wrong", doing)
         match = re.fullmatch(rf"%1{command[:4]}=({answer})", line, re.IGNORECASE)
         if match is not None:
             return match[1].upper()
-        error_match = re.fullmatch(rf"%1{command[:4]}=ERR([1-4])", line, re.IGNORECASE)
-        received, todo = (
-            _ERRORS[error_match[1]]
-            if error_match
-            else (repr(line), "Check that this is a PJLink port and nothing stands in between.")
-        )
-        kind = ProjectorBusy if error_match and error_match[1] == "3" else DeviceError
-        expected = f"an answer like %1{command[:4]}={answer}"
-        raise kind(self.name, doing, expected, received, todo, self.timeout_s)
+        number = re.fullmatch(rf"%1{command[:4]}=ERR([1-4])", line, re.IGNORECASE)
+        other = (repr(line), "Check that this is a PJLink port and nothing stands in between.")
+        received, todo = _ERRORS[number[1]] if number else other
+        kind = ProjectorBusy if number and number[1] == "3" else DeviceError
+        raise self._error(kind, doing, f"an answer like %1{command[:4]}={answer}", received, todo)
 
     def _digest(self, greeting: str, doing: str) -> str:
         """What goes in front of the first command: nothing, or the MD5 digest."""
@@ -136,7 +127,7 @@ class PjLinkProjector:
                 self._not_authenticated("ERRA", doing)
             expected = "a greeting like PJLINK 0 or PJLINK 1 and 8 hexadecimal digits"
             todo = "This is another service: check host and port."
-            raise DeviceError(self.name, doing, expected, repr(greeting), todo, self.timeout_s)
+            raise self._error(DeviceError, doing, expected, repr(greeting), todo)
         if match[1] is None:
             return ""
         password = self._password(doing)
@@ -158,7 +149,12 @@ class PjLinkProjector:
 
     def _not_authenticated(self, received: str, doing: str) -> NoReturn:
         todo = "Set the projector's PJLink password where the rig file says."
-        raise DeviceError(self.name, doing, "the right password", received, todo, self.timeout_s)
+        raise self._error(DeviceError, doing, "the right password", received, todo)
+
+    def _error(
+        self, kind: type[DeviceError], doing: str, expected: str, received: str, todo: str
+    ) -> DeviceError:
+        return kind(self.name, doing, expected, received, todo, self.timeout_s)
 
 
 class _Incomplete(Exception):

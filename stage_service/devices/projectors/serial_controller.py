@@ -27,7 +27,6 @@ class SerialProjectorController:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The projectors that the controller drives."""
         return self._names
 
     def connect(self) -> None:
@@ -44,25 +43,20 @@ class SerialProjectorController:
             raise DeviceError(self.name, "identifying", expected, received, todo)
 
     def close(self) -> None:
-        """Close the port; the projectors stay as they are."""
         self._lines.close()
 
     def line(self, projector: str, row: int, level: float) -> None:
-        """Show one row of one projector; the echo is checked."""
         shown = f"LINE {projector} {row} {_level(level)}"
         self._lines.ask(shown, re.escape(f"OK {shown}"), f"showing row {row} of {projector}")
 
     def all_on(self, level: float) -> None:
-        """Show every row of every projector; the echo is checked."""
         shown = f"ON {_level(level)}"
         self._lines.ask(shown, re.escape(f"OK {shown}"), "showing all rows")
 
     def off(self) -> None:
-        """Put every projector dark; the echo is checked."""
         self._lines.ask("OFF", "OK OFF", "putting the projectors dark")
 
     def is_dark(self) -> bool:
-        """Ask the controller what it shows."""
         return self._lines.ask("SHOW?", "SHOW (.+)", "reading what is shown")[1] == "OFF"
 
     def load_sequence(self, patterns: Sequence[Pattern]) -> None:

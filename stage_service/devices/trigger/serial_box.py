@@ -43,7 +43,6 @@ class SerialTriggerBox:
         self._table_rows = int(self._lines.connect()[1] or 0)
 
     def close(self) -> None:
-        """Close the port."""
         self._lines.close()
 
     def pulse(self, exposure_s: float) -> int:
@@ -52,15 +51,12 @@ class SerialTriggerBox:
         return int(self._lines.ask(f"PULSE {us}", r"OK (\d+)", "firing the cameras")[1])
 
     def count(self) -> int:
-        """Pulses since `reset` or power-up."""
         return int(self._lines.ask("COUNT?", r"COUNT (\d+)", "reading the pulse count")[1])
 
     def reset(self) -> None:
-        """Set the count to 0."""
         self._lines.ask("RESET", r"OK 0", "resetting the pulse count")
 
     def status(self) -> TriggerStatus:
-        """Read interlock and emergency stop."""
         reply = r"STATUS interlock=([01]) estop=([01])"
         match = self._lines.ask("STATUS?", reply, "reading the safety inputs")
         return TriggerStatus(match[1] == "1", match[2] == "1")
@@ -91,14 +87,12 @@ class SerialTriggerBox:
         self._lines.ask("GO", "OK GO", "starting the table")
 
     def progress(self) -> TableProgress:
-        """Ask where the table is; any request feeds the box's watchdog."""
         reply = rf"SEQ ({'|'.join(get_args(TableState))}) (\d+) (\d+) ([a-z-]+)"
         match = self._lines.ask("SEQ?", reply, "reading the table's progress")
         # The pattern admits these states only.
         return TableProgress(cast("TableState", match[1]), int(match[2]), int(match[3]), match[4])
 
     def stop(self) -> int:
-        """Close the gates at once; returns the steps that were done."""
         return int(self._lines.ask("STOP", r"OK STOP (\d+)", "stopping the table")[1])
 
     def _text(self, row: TableRow) -> str:

@@ -18,8 +18,7 @@ from reconstruction import Camera as CameraGeometry
 from simulators.frames.frames import Sensor
 from stage_service.acquisition.accounting import FrameAccount
 from stage_service.config import BaslerConfig
-from stage_service.devices.cameras.basler import BaslerCamera
-from stage_service.devices.cameras.block_counter import BlockCounter
+from stage_service.devices.cameras.basler import BaslerCamera, BlockCounter
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceUnreachable, IndexShift
 
 WIDTH, HEIGHT = 32, 24

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from reconstruction import Step
-from stage_service.acquisition.flash_watch import FlashWatch
+from stage_service.acquisition.exposing import FlashWatch
 from stage_service.config import RigFile, SafetyLimits, load_rig_file
 from stage_service.devices.errors import SafetyRefusal
 from stage_service.plan.capture_plan import CapturePlan
