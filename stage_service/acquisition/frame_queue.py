@@ -45,10 +45,8 @@ class FrameWriter:
         self._next_put = self._next_commit = 0
         self._lock = threading.Lock()
         self._committing = False
-        self._threads = [
-            threading.Thread(target=self._run, name=f"frame-writer-{i}", daemon=True)
-            for i in range(THREADS)
-        ]
+        names = (f"frame-writer-{i}" for i in range(THREADS))
+        self._threads = [threading.Thread(target=self._run, name=n, daemon=True) for n in names]
         for thread in self._threads:
             thread.start()
 

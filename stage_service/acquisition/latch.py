@@ -51,32 +51,26 @@ class Latch:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.Lock()
-        self._latched: Latched | None = None
+        self.latched: Latched | None = None
         if path.exists():
             try:
-                self._latched = Latched(**json.loads(path.read_text()))
+                self.latched = Latched(**json.loads(path.read_text()))
             except (OSError, ValueError, TypeError) as error:
-                self._latched = Latched(utc_now(), f"{path} cannot be read: {error}", True)
-
-    @property
-    def latched(self) -> Latched | None:
-        """What is latched."""
-        return self._latched
+                self.latched = Latched(utc_now(), f"{path} cannot be read: {error}", True)
 
     def check(self) -> None:
         """Raise `Unsafe` while it is set."""
-        latched = self._latched
-        if latched is not None:
+        if (latched := self.latched) is not None:
             raise Unsafe(latched)
 
     def learn(self, result: Blackout, reads_back: bool) -> str | None:
         """Take a blackout's result; returns "set" or "cleared" when that changes the latch."""
         with self._lock:
             if result.blocks:
-                was = self._latched
+                was = self.latched
                 self._set(Latched(was.since if was else utc_now(), result.detail, reads_back))
                 return None if was else "set"
-            if result.safe and self._latched is not None:
+            if result.safe and self.latched is not None:
                 self._clear()
                 return "cleared"
         return None
@@ -84,9 +78,9 @@ class Latch:
     def acknowledge(self) -> None:
         """Clear it on a person's word. Raises `CannotAcknowledge`."""
         with self._lock:
-            if self._latched is None:
+            if self.latched is None:
                 raise CannotAcknowledge("nothing is latched: there is nothing to acknowledge")
-            if self._latched.reads_back:
+            if self.latched.reads_back:
                 raise CannotAcknowledge(
                     "this light bank says itself whether its lamps are off: ask for a blackout "
                     "(POST /devices/blackout) once it answers"
@@ -94,7 +88,7 @@ class Latch:
             self._clear()
 
     def _set(self, latched: Latched) -> None:
-        self._latched = latched
+        self.latched = latched
         try:
             write_whole(self._path, json.dumps(asdict(latched)).encode())
         except OSError:  # a full disk must not keep anybody from a blackout
@@ -102,4 +96,4 @@ class Latch:
 
     def _clear(self) -> None:
         self._path.unlink(missing_ok=True)
-        self._latched = None
+        self.latched = None

@@ -117,7 +117,6 @@ class Sequencer:
             if self._clocked:
                 raise CannotPause(self._clocked)
             self._pause_asked = True
-            self._changed.notify_all()
 
     def resume(self) -> None:
         """Go on, or take back a pause that has not begun. Raises `WrongState`."""
@@ -155,11 +154,9 @@ class Sequencer:
             self._move("complete")
         except Cancelled:
             self._move("abort")
-        except Exception as error:
-            self._fail(error)
         except BaseException as error:
             self._fail(error)
-            leave = error
+            leave = None if isinstance(error, Exception) else error
         self._finish()
         if leave is not None:
             raise leave
@@ -315,12 +312,12 @@ class Sequencer:
             self._notify("capture.frame_missing", {**lost, "shot_again": again})
 
     def _account(self, camera: Camera, frame: Frame | None, pulse: Pulse) -> None:
+        account = self._accounts[camera.name]
         if frame is None:
             # It may still come, and must not pass for the next pulse's.
             self._doubtful = True
-            self._accounts[camera.name].missed()
+            account.missed()
         else:
-            account = self._accounts[camera.name]
             account.arrived(frame.block_id, frame.left)
             if camera.capabilities.timestamps and frame.timestamp:
                 account.timed(frame.timestamp, pulse.asked, pulse.answered)
@@ -381,6 +378,5 @@ class Sequencer:
     def _move(self, action: str) -> None:
         with self._changed:
             self._machine.do(action)
-            self._changed.notify_all()
         state = {"state": self.state, "outcome": self.outcome, "error": self.error}
         self._notify("capture.state", state)

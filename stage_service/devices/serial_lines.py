@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import threading
 import time
+import zlib
+from collections.abc import Sequence
 
 import serial
 
@@ -87,6 +89,37 @@ class SerialLines:
         todo = "Check that the device follows docs/wire.md and that nobody else uses the port."
         raise self._error(DeviceError, doing, expected, repr(line), todo)
 
+    def echo(self, request: str, doing: str) -> None:
+        """`ask` for what the device does and repeats."""
+        self.ask(request, re.escape(f"OK {request}"), doing)
+
+    def set_watchdog(self, seconds: float) -> None:
+        """Set the device's watchdog; raises `ValueError` beyond what devices take."""
+        low, high = WATCHDOG_S
+        if not low <= seconds <= high:
+            raise ValueError(
+                f"{self.name}: a watchdog time is {low:g} to {high:g} s, got {seconds}"
+            )
+        self.echo(f"WATCHDOG {round(seconds * 1000)}", "setting the watchdog")
+
+    def upload(
+        self, words: tuple[str, str, str], texts: Sequence[str], most: int, steps: int
+    ) -> None:
+        """Upload up to `most` texts and arm the device, which answers with our checksum and number
+        of steps. `words` are the requests for the whole and for one text, and the whole's name."""
+        begin, each, whole = words
+        if not 1 <= len(texts) <= most:
+            doing, received = f"uploading a {whole}", f"{len(texts)} of them"
+            expected = f"1 to {most} {each.lower()} lines, which it holds"
+            todo = "Shoot in shorter runs, or step by software."
+            raise DeviceError(self.name, doing, expected, received, todo)
+        self.echo(f"{begin} {len(texts)}", f"beginning a {whole}")
+        for i, text in enumerate(texts):
+            doing = f"uploading {each.lower()} {i} of the {whole}"
+            self.ask(f"{each} {i} {text}", f"OK {each} {i}", doing)
+        crc = zlib.crc32("".join(f"{text}\n" for text in texts).encode("ascii"))
+        self.ask("ARM", f"OK ARM {steps} {crc:08x}", f"arming the {whole}")
+
     def _identify(self) -> re.Match[str]:
         doing = "identifying"
         # "?" ends what a device may hold of a request that was cut off; the two make no request.
@@ -142,11 +175,3 @@ class SerialLines:
         self, kind: type[DeviceError], doing: str, expected: str, received: str, todo: str
     ) -> DeviceError:
         return kind(self.name, doing, expected, received, todo, self.config.timeout_s)
-
-
-def milliseconds(device: str, watchdog_s: float) -> int:
-    """A watchdog time for the wire; raises `ValueError` beyond what devices take."""
-    low, high = WATCHDOG_S
-    if not low <= watchdog_s <= high:
-        raise ValueError(f"{device}: a watchdog time is {low:g} to {high:g} s, got {watchdog_s}")
-    return round(watchdog_s * 1000)

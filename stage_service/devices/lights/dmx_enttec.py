@@ -55,7 +55,7 @@ class DmxLightBank:
             )
         self.name = f"light bank (DMX, {config.port})"
         self.config = config
-        self._lamps = lamps
+        self.count = lamps
         self._level = 1.0
         self._on: range = range(0)
         self._asked = 0  # bytes of user configuration, by the newest request
@@ -63,11 +63,6 @@ class DmxLightBank:
         self._late = False  # whether an answer is missing
         self._port: serial.Serial | None = None
         self._lock = threading.RLock()
-
-    @property
-    def count(self) -> int:
-        """Number of lamps, as the rig file has it; DMX cannot confirm it."""
-        return self._lamps
 
     def connect(self) -> None:
         """Open the port and check that a widget answers; `DeviceError` unless the rig file accepts
@@ -86,12 +81,12 @@ class DmxLightBank:
             self._port = None
 
     def select(self, lamp: int) -> None:
-        if not 0 <= lamp < self._lamps:
-            raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {lamp}")
+        if not 0 <= lamp < self.count:
+            raise ValueError(f"{self.name}: lamps are 0 to {self.count - 1}, got {lamp}")
         self._show(range(lamp, lamp + 1), self._level, f"putting lamp {lamp} on")
 
     def all_on(self) -> None:
-        self._show(range(self._lamps), self._level, "putting all lamps on")
+        self._show(range(self.count), self._level, "putting all lamps on")
 
     def off(self) -> None:
         self._show(range(0), self._level, "putting all lamps off")
@@ -124,7 +119,7 @@ class DmxLightBank:
 
     def _show(self, on: range, level: float, doing: str) -> None:
         first = self.config.first_channel - 1
-        channels = bytearray(max(FEWEST_CHANNELS, first + self._lamps))
+        channels = bytearray(max(FEWEST_CHANNELS, first + self.count))
         for lamp in on:
             channels[first + lamp] = round(level * self.config.level_steps())
         with self._lock:

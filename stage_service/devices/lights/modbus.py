@@ -44,7 +44,7 @@ class ModbusLightBank:
             dead_man=None not in (r.heartbeat, r.watchdog),
             table=TABLE_ENTRIES if config.sequences else 0,
         )
-        self._lamps = lamps
+        self.count = lamps
         self._level: int | None = None
         self._armed: int | None = None  # entries; None: not known
         self._link: ModbusLink | None = None
@@ -52,10 +52,6 @@ class ModbusLightBank:
         self._out_of_step = False
         self._falls = 0
         self._lock = threading.RLock()
-
-    @property
-    def count(self) -> int:
-        return self._lamps
 
     def connect(self) -> None:
         """Connect; raises `DeviceError` where the peer is no light bank, has another size, or
@@ -74,12 +70,12 @@ class ModbusLightBank:
             self._identified = False
 
     def select(self, lamp: int) -> None:
-        if not 0 <= lamp < self._lamps:
-            raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {lamp}")
+        if not 0 <= lamp < self.count:
+            raise ValueError(f"{self.name}: lamps are 0 to {self.count - 1}, got {lamp}")
         self._command(lamp + 1, 1, f"putting lamp {lamp} on")
 
     def all_on(self) -> None:
-        self._command(ALL_ON, self._lamps, "putting all lamps on")
+        self._command(ALL_ON, self.count, "putting all lamps on")
 
     def off(self) -> None:
         doing = "putting all lamps off"
@@ -110,7 +106,7 @@ class ModbusLightBank:
             if value == self._level:
                 return
             self._level = None
-            self._write([value] * self._lamps, first, doing)
+            self._write([value] * self.count, first, doing)
             self._level = value
 
     def set_watchdog(self, seconds: float) -> None:
@@ -171,8 +167,8 @@ class ModbusLightBank:
         return position
 
     def _entry(self, what: Lit, level: float) -> tuple[int, int]:
-        if isinstance(what, int) and not 0 <= what < self._lamps:
-            raise ValueError(f"{self.name}: lamps are 0 to {self._lamps - 1}, got {what}")
+        if isinstance(what, int) and not 0 <= what < self.count:
+            raise ValueError(f"{self.name}: lamps are 0 to {self.count - 1}, got {what}")
         selector = {"all": ALL_ON, "none": ALL_OFF}.get(what) if isinstance(what, str) else what + 1
         return selector or 0, self._level_word(level, "loading a sequence")
 
@@ -193,8 +189,8 @@ class ModbusLightBank:
         if self._map.selector is not None:
             self._exchange(doing, "write_register", self._map.selector, selector)
             return
-        on = [selector in (ALL_ON, lamp + 1) for lamp in range(self._lamps)]
-        starts = range(0, self._lamps, MOST_COILS)
+        on = [selector in (ALL_ON, lamp + 1) for lamp in range(self.count)]
+        starts = range(0, self.count, MOST_COILS)
         # Dark ones first: never two lamps where one is wanted.
         for start in sorted(starts, key=lambda s: any(on[s : s + MOST_COILS])):
             part = on[start : start + MOST_COILS]
@@ -255,10 +251,10 @@ class ModbusLightBank:
         doing = "falling into step"
         self._falls += 1
         if self._map.levels is not None:
-            count = 1 + self._falls % min(self._lamps, MOST_READ)
+            count = 1 + self._falls % min(self.count, MOST_READ)
             self._exchange(doing, "read_holding_registers", self._map.levels, count)
         else:
-            count = 1 + 8 * self._falls % min(self._lamps, MOST_COILS)
+            count = 1 + 8 * self._falls % min(self.count, MOST_COILS)
             self._exchange(doing, "read_coils", self._map.coils, count)
 
     def _identify(self) -> None:
@@ -272,8 +268,8 @@ class ModbusLightBank:
                 raise self._error(doing, expected, f"{got:#06x}", todo)
         if r.count is not None:
             lamps = self._exchange(doing, "read_input_registers", r.count, 1).registers[0]
-            if lamps != self._lamps:
-                expected = f"{self._lamps} lamps as in the rig file"
+            if lamps != self.count:
+                expected = f"{self.count} lamps as in the rig file"
                 raise self._error(doing, expected, f"{lamps}", "Use the rig file of this stage.")
         if r.sequence is not None:
             answer = self._exchange(doing, "read_holding_registers", r.sequence, 1)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Sequence
 
 from stage_service.config import SerialConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities
-from stage_service.devices.serial_lines import SerialLines, milliseconds
+from stage_service.devices.serial_lines import SerialLines
 
 FULL_LEVEL = 65535
 
@@ -21,24 +20,20 @@ class SerialProjectorController:
         identity = re.compile(r"HAIRSTAGE-PROJECTORS (?:2 (\d+) )?(\S*)")
         self._lines = SerialLines("projector controller", config, identity)
         self._expected = expected
-        self._names: tuple[str, ...] = ()
+        self.names: tuple[str, ...] = ()
         self.capabilities = ProjectorCapabilities(reads_back=True, dead_man=False, table=0)
         self.name = self._lines.name
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self._names
 
     def connect(self) -> None:
         """Open the port; raises `DeviceError` where a projector of the rig file is not driven."""
         identity = self._lines.connect()
         second = identity[1] is not None
         self.capabilities = ProjectorCapabilities(True, second, int(identity[1] or 0))
-        self._names = tuple(n for n in identity[2].split(",") if n)
-        absent = [n for n in self._expected if n not in self._names]
+        self.names = tuple(n for n in identity[2].split(",") if n)
+        absent = [n for n in self._expected if n not in self.names]
         if absent:
             expected = f"the projectors {', '.join(self._expected)}"
-            received = ", ".join(self._names) or "none"
+            received = ", ".join(self.names) or "none"
             todo = "Use the rig file of this stage."
             raise DeviceError(self.name, "identifying", expected, received, todo)
 
@@ -47,14 +42,13 @@ class SerialProjectorController:
 
     def line(self, projector: str, row: int, level: float) -> None:
         shown = f"LINE {projector} {row} {_level(level)}"
-        self._lines.ask(shown, re.escape(f"OK {shown}"), f"showing row {row} of {projector}")
+        self._lines.echo(shown, f"showing row {row} of {projector}")
 
     def all_on(self, level: float) -> None:
-        shown = f"ON {_level(level)}"
-        self._lines.ask(shown, re.escape(f"OK {shown}"), "showing all rows")
+        self._lines.echo(f"ON {_level(level)}", "showing all rows")
 
     def off(self) -> None:
-        self._lines.ask("OFF", "OK OFF", "putting the projectors dark")
+        self._lines.echo("OFF", "putting the projectors dark")
 
     def is_dark(self) -> bool:
         return self._lines.ask("SHOW?", "SHOW (.+)", "reading what is shown")[1] == "OFF"
@@ -63,18 +57,8 @@ class SerialProjectorController:
         """Upload in runs of rows, compare checksum and number of patterns with our own, and leave
         the controller armed."""
         entries = [_text(run) for run in _runs(patterns)]
-        if not 1 <= len(entries) <= self.capabilities.table:
-            expected = f"1 to {self.capabilities.table} entries, which the controller holds"
-            received = f"{len(entries)} entries"
-            todo = "Shoot in shorter runs, or step by software."
-            raise DeviceError(self.name, "uploading a sequence", expected, received, todo)
-        count = len(entries)
-        self._lines.ask(f"SEQ {count}", f"OK SEQ {count}", "beginning a sequence")
-        for i, entry in enumerate(entries):
-            doing = f"uploading entry {i} of the sequence"
-            self._lines.ask(f"ENTRY {i} {entry}", f"OK ENTRY {i}", doing)
-        crc = zlib.crc32("".join(f"{entry}\n" for entry in entries).encode("ascii"))
-        self._lines.ask("ARM", f"OK ARM {len(patterns)} {crc:08x}", "arming the sequence")
+        words = ("SEQ", "ENTRY", "sequence")
+        self._lines.upload(words, entries, self.capabilities.table, len(patterns))
 
     def position(self) -> int:
         """How often the gate has closed since the sequence was armed."""
@@ -93,8 +77,7 @@ class SerialProjectorController:
 
     def set_watchdog(self, seconds: float) -> None:
         """Set the watchdog time, 0.1 to 60 s; version 1 of the controller refuses it."""
-        request = f"WATCHDOG {milliseconds(self.name, seconds)}"
-        self._lines.ask(request, f"OK {request}", "setting the watchdog")
+        self._lines.set_watchdog(seconds)
 
     def heartbeat(self) -> None:
         """Any request counts; this one changes nothing."""

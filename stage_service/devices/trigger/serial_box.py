@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -11,7 +10,7 @@ from typing import cast, get_args
 
 from stage_service.config import SerialConfig
 from stage_service.devices.errors import DeviceError
-from stage_service.devices.serial_lines import SerialLines, milliseconds
+from stage_service.devices.serial_lines import SerialLines
 from stage_service.devices.trigger.interface import (
     Gates,
     TableProgress,
@@ -30,17 +29,12 @@ class SerialTriggerBox:
     def __init__(self, config: SerialConfig) -> None:
         identity = re.compile(r"HAIRSTAGE-TRIGGER (?:1|2 (\d+))")
         self._lines = SerialLines("trigger box", config, identity)
-        self._table_rows = 0
+        self.table_rows = 0  # version 1 of the box has none
         self.name = self._lines.name
-
-    @property
-    def table_rows(self) -> int:
-        """Rows of its table; version 1 of the box has none."""
-        return self._table_rows
 
     def connect(self) -> None:
         """Open the port; raises `DeviceError` where no trigger box answers."""
-        self._table_rows = int(self._lines.connect()[1] or 0)
+        self.table_rows = int(self._lines.connect()[1] or 0)
 
     def close(self) -> None:
         self._lines.close()
@@ -64,27 +58,18 @@ class SerialTriggerBox:
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
         """Upload, compare checksum and number of steps with our own, and leave the box armed."""
         texts = [self._text(row) for row in _joined(rows)]
-        if self._table_rows == 0:
+        if self.table_rows == 0:
             expected = "a box that runs tables"
             received = "one without (version 1, or 0 rows)"
             todo = "Set hardware_stepping = false in [devices], or update the box's firmware."
             raise DeviceError(self.name, "uploading a table", expected, received, todo)
-        if not 1 <= len(texts) <= self._table_rows:
-            expected = f"1 to {self._table_rows} rows, which the box holds"
-            todo = "Shoot in shorter runs, or step by software."
-            raise DeviceError(self.name, "uploading a table", expected, f"{len(texts)} rows", todo)
-        watchdog = f"WATCHDOG {milliseconds(self.name, watchdog_s)}"
-        self._lines.ask(watchdog, f"OK {watchdog}", "setting the watchdog")
-        self._lines.ask(f"TABLE {len(texts)}", f"OK TABLE {len(texts)}", "beginning a table")
-        for i, text in enumerate(texts):
-            self._lines.ask(f"ROW {i} {text}", f"OK ROW {i}", f"uploading row {i} of the table")
-        crc = zlib.crc32("".join(f"{text}\n" for text in texts).encode("ascii"))
-        armed = f"OK ARM {sum(row.repeat for row in rows)} {crc:08x}"
-        self._lines.ask("ARM", armed, "arming the table")
+        self._lines.set_watchdog(watchdog_s)
+        words, steps = ("TABLE", "ROW", "table"), sum(row.repeat for row in rows)
+        self._lines.upload(words, texts, self.table_rows, steps)
 
     def go(self) -> None:
         """Run the armed table; raises `SafetyRefusal` where the box refuses to."""
-        self._lines.ask("GO", "OK GO", "starting the table")
+        self._lines.echo("GO", "starting the table")
 
     def progress(self) -> TableProgress:
         reply = rf"SEQ ({'|'.join(get_args(TableState))}) (\d+) (\d+) ([a-z-]+)"
