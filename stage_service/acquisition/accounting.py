@@ -165,9 +165,8 @@ def _by_time(
     fits = []
     for first in range(start, len(schedule) - after[-1]):
         found = [first]
-        for (stamp, later), (number, next_number) in zip(
-            pairwise(timestamps), pairwise(after), strict=True
-        ):
+        steps = zip(pairwise(timestamps), pairwise(after), strict=True)
+        for (stamp, later), (number, next_number) in steps:
             due = schedule[found[-1]] + later - stamp
             nearest = min(range(len(schedule)), key=lambda i: abs(schedule[i] - due))
             at_least = found[-1] + next_number - number

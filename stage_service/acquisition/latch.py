@@ -19,11 +19,9 @@ class Unsafe(RuntimeError):
     """Captures are refused: the last blackout could not be verified."""
 
     def __init__(self, latched: Latched) -> None:
-        way_out = (
-            "until POST /devices/blackout reads it back dark"
-            if latched.reads_back
-            else "until somebody has looked and says so with POST /devices/acknowledge"
-        )
+        way_out = "until somebody has looked and says so with POST /devices/acknowledge"
+        if latched.reads_back:
+            way_out = "until POST /devices/blackout reads it back dark"
         detail = latched.detail.rstrip(".")
         super().__init__(f"since {latched.since}: {detail}. Nothing is lit {way_out}.")
 

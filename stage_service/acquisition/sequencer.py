@@ -267,12 +267,11 @@ class Sequencer:
 
     def _place(self, shots: Shots, run: HardwareRun) -> dict[str, list[int] | None]:
         schedule = run.schedule[: shots.progress.pulses]
-        return {
-            name: self._accounts[name].place(
-                [f.block_id for f in frames], [f.timestamp for f in frames], schedule, run.steady
-            )
-            for name, frames in shots.frames.items()
-        }
+        places = {}
+        for name, frames in shots.frames.items():
+            ids, times = [f.block_id for f in frames], [f.timestamp for f in frames]
+            places[name] = self._accounts[name].place(ids, times, schedule, run.steady)
+        return places
 
     def _shoot(self, step: Step, wanted: set[str], cameras: FanOut, frames: FrameWriter) -> None:
         """One step; cameras without a frame get more pulses, only their frames are kept then."""
@@ -294,11 +293,10 @@ class Sequencer:
             if not wanted:
                 return
             self._tell_missing(step, wanted, attempt)
+        given_up = {"pulse": pulse.count, "attempt": self._retries}
+        reason = f"no frame from the camera after {self._retries + 1} pulses"
         for name in sorted(wanted):
-            reason = f"no frame from the camera after {self._retries + 1} pulses"
-            self._writer.record_missing(
-                step, name, reason=reason, pulse=pulse.count, attempt=self._retries
-            )
+            self._writer.record_missing(step, name, reason=reason, **given_up)
 
     def _put(self, frames: FrameWriter, shot: Shot) -> None:
         with self._timings.on("storage"):

@@ -14,12 +14,7 @@ Outcome = Literal["completed", "aborted", "failed", "interrupted"]
 
 TRANSITIONS: dict[State, dict[str, State]] = {
     "idle": {"start": "running", "abort": "finishing", "fail": "finishing"},
-    "running": {
-        "pause": "paused",
-        "complete": "finishing",
-        "abort": "finishing",
-        "fail": "finishing",
-    },
+    "running": {"pause": "paused", **dict.fromkeys(("complete", "abort", "fail"), "finishing")},
     "paused": {"resume": "running", "abort": "finishing", "fail": "finishing"},
     "finishing": {"finish": "done", "fail": "finishing"},
     "done": {"continue": "running"},

@@ -112,13 +112,12 @@ class DeviceSet:
         out = {
             "lights": _ask(lights, connect, _lamps),
             "trigger": _ask(
-                trigger, connect, lambda box: {"pulses": box.count(), **asdict(box.status())}
+                trigger, connect, lambda t: {"pulses": t.count(), **asdict(t.status())}
             ),
         }
         if beams is not None:
-            out["projectors"] = _ask(
-                beams, connect, lambda b: {"dark": b.is_dark(), "names": list(b.names)}
-            )
+            shown = _ask(beams, connect, lambda b: {"dark": b.is_dark(), "names": list(b.names)})
+            out["projectors"] = shown
         out["cameras"] = {
             c.name: _ask(c, connect, lambda c: asdict(c.info)) if connect else {"state": "in use"}
             for c in self.cameras

@@ -23,12 +23,8 @@ class DeviceError(RuntimeError):
         super().__init__(
             f"{device}: {operation}: expected {expected}{within}, received {received}. {todo}"
         )
-        self.device = device
-        self.operation = operation
-        self.expected = expected
-        self.received = received
-        self.todo = todo
-        self.deadline_s = deadline_s
+        self.device, self.operation, self.deadline_s = device, operation, deadline_s
+        self.expected, self.received, self.todo = expected, received, todo
 
 
 class DeviceTimeout(DeviceError):

@@ -27,9 +27,8 @@ class Heartbeat:
         self._interval = interval_s
         self._stop = threading.Event()
         self._error: Exception | None = None
-        self._thread = threading.Thread(
-            target=self._run, name=f"heartbeat of {device.name}", daemon=True
-        )
+        name = f"heartbeat of {device.name}"
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def __enter__(self) -> Self:
         self._device.heartbeat()

@@ -189,10 +189,8 @@ class BaslerCamera:
         expected = (self.geometry.width, self.geometry.height)
         if size != expected:
             wanted = f"{expected[0]}x{expected[1]} pixels as in the rig file"
-            todo = (
-                "Set OffsetX, OffsetY, Width and Height in [devices.cameras.features], or "
-                "calibrate the rig for this size."
-            )
+            todo = "Set OffsetX, OffsetY, Width and Height in [devices.cameras.features], or "
+            todo += "calibrate the rig for this size."
             raise self._error(doing, wanted, f"{size[0]}x{size[1]}", todo)
         self.capabilities = replace(self.capabilities, timestamps=self._ticks_per_s > 0)
         full_scale = pixel_formats.full_scale(config.pixel_format)

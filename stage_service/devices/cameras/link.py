@@ -46,15 +46,14 @@ class LinkCamera:
     def connect(self) -> None:
         """Connect and say hello; raises `DeviceError` for a camera of another size."""
         self.close()
+        address, timeout_s = (self.config.host, self.config.port), self.config.timeout_s
         try:
-            self._socket = socket.create_connection(
-                (self.config.host, self.config.port), timeout=self.config.timeout_s
-            )
+            self._socket = socket.create_connection(address, timeout_s)
         except OSError as error:
+            doing, expected = "connecting", "a TCP connection"
             todo = "Check power, network, and host and port in [devices.cameras]."
-            doing, deadline = "connecting", self.config.timeout_s
             raise DeviceUnreachable(
-                self.device, doing, "a TCP connection", str(error), todo, deadline
+                self.device, doing, expected, str(error), todo, timeout_s
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         doing = "saying hello"
@@ -122,13 +121,10 @@ class LinkCamera:
             todo = "A frame from before arming was in the queue, or the camera cannot expose so."
             raise self._error(doing, f"an exposure of {self._armed} s as armed", received, todo)
         counts = np.frombuffer(payload, "<u2").reshape(info.height, info.width, 3)
-        return Frame(
-            counts.astype(np.uint16, copy=False),
-            int(self._number(answer, "block_id", doing)),
-            self._number(answer, "timestamp", doing),
-            exposure,
-            int(self._number({"left": 0, **answer}, "left", doing)),
-        )
+        block_id, timestamp = (self._number(answer, f, doing) for f in ("block_id", "timestamp"))
+        left = int(self._number({"left": 0, **answer}, "left", doing))
+        counts = counts.astype(np.uint16, copy=False)
+        return Frame(counts, int(block_id), timestamp, exposure, left)
 
     def _number(self, answer: dict[str, Any], field: str, doing: str) -> Any:
         value = answer.get(field)
@@ -158,19 +154,13 @@ class LinkCamera:
                 if not 0 <= length <= LONGEST_PAYLOAD:
                     raise ValueError(f"a payload of {length} bytes")
                 payload = self._receive(length, deadline)
-            except TimeoutError as error:
-                self.close()
-                came, todo = "nothing, or not all of it", "Check the camera's power and network."
-                raise DeviceTimeout(
-                    self.device, doing, "an answer", came, todo, timeout_s
-                ) from error
             except (OSError, EOFError) as error:
                 self.close()
-                came = str(error) or "a closed connection"
+                late = isinstance(error, TimeoutError)
+                kind = DeviceTimeout if late else DeviceUnreachable
+                came = "nothing, or not all of it" if late else str(error) or "a closed connection"
                 todo = "Check the camera's power and network, and start again."
-                raise DeviceUnreachable(
-                    self.device, doing, "an answer", came, todo, timeout_s
-                ) from error
+                raise kind(self.device, doing, "an answer", came, todo, timeout_s) from error
             except (ValueError, AttributeError) as error:
                 self.close()
                 todo = "Check the port in [devices.cameras]: this is another device."

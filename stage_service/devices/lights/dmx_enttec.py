@@ -32,6 +32,7 @@ CHANNELS, FEWEST_CHANNELS = 512, 24
 GET_PARAMETERS, SEND_DMX = 3, 6
 _START, _END, _START_CODE = 0x7E, 0xE7, 0
 _MOST_USER_DATA = 32
+_STILL_LIT = "Its lamps may still be lit."
 SLOWEST_FRAME_S = 0.023
 """A frame of 512 channels at full speed (ANSI E1.11)."""
 _PARAMETERS = struct.Struct("<HBBB")  # firmware, break, mark after break, frames a second
@@ -110,9 +111,8 @@ class DmxLightBank:
         raise limits.cannot(self.name, "reading the status", "read-back")
 
     def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
-        raise limits.cannot(
-            self.name, f"loading a sequence of {len(entries)} steps", "a sequence table"
-        )
+        doing = f"loading a sequence of {len(entries)} steps"
+        raise limits.cannot(self.name, doing, "a sequence table")
 
     def position(self) -> int:
         raise limits.cannot(self.name, "reading the position in the sequence", "a sequence table")
@@ -158,22 +158,17 @@ class DmxLightBank:
         self._asked = self._asked % _MOST_USER_DATA + 1
         self._late = True
         self._send(GET_PARAMETERS, struct.pack("<H", self._asked), doing)
-        deadline = time.monotonic() + self.config.timeout_s
+        timeout_s = self.config.timeout_s
+        deadline = time.monotonic() + timeout_s
         came = b""
         try:
             while (rate := self._frames_per_second(came)) is None:
                 wait = deadline - time.monotonic()
                 if wait <= 0 or not select.select([self._port], [], [], wait)[0]:
                     self.close()
-                    raise DeviceTimeout(
-                        self.name,
-                        doing,
-                        expected="the widget's parameters",
-                        received=came[:32].hex(" ") or "nothing",
-                        deadline_s=self.config.timeout_s,
-                        todo="Its lamps may still be lit. Check the widget's USB cable, and that "
-                        "this port is an Enttec USB Pro.",
-                    )
+                    got = came[:32].hex(" ") or "nothing"
+                    todo = f"{_STILL_LIT} Check its USB cable, and that it is an Enttec USB Pro."
+                    raise DeviceTimeout(self.name, doing, "its parameters", got, todo, timeout_s)
                 came += self._port.read(max(1, self._port.in_waiting))
         except OSError as error:
             raise self._lost(doing, error) from error
@@ -197,12 +192,9 @@ class DmxLightBank:
 
     def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
         self.close()
-        todo = (
-            "Its lamps may still be lit. Plug the widget in and check the port in [devices.lights]."
-        )
-        return DeviceUnreachable(
-            self.name, doing, "an open serial port", str(error), todo, self.config.timeout_s
-        )
+        todo = f"{_STILL_LIT} Plug the widget in and check the port in [devices.lights]."
+        expected, timeout_s = "an open serial port", self.config.timeout_s
+        return DeviceUnreachable(self.name, doing, expected, str(error), todo, timeout_s)
 
 
 def _answers(data: bytes) -> Iterator[tuple[int, int]]:

@@ -183,10 +183,9 @@ class LimitedLightBank:
             expected = f"at most {limits.max_on_s:g} s (max_on_s in [safety])"
             todo = "It was put off. Shorten the exposure; a device that answers late keeps it lit."
             return self._error(doing, expected, f"lit for {on:.3g} s", todo)
-        expected = (
-            f"at most {limits.max_duty * limits.duty_window_s:.3g} s of {limits.duty_window_s:g} s "
-            "(max_duty in [safety])"
-        )
+        window = limits.duty_window_s
+        share = f"{limits.max_duty * window:.3g} s of {window:g} s"
+        expected = f"at most {share} (max_duty in [safety])"
         todo = "Let the lamp cool, then continue; a lower rate_hz gives it time."
         return self._error(doing, expected, f"lit for {self._used(lamp, now):.3g} s", todo)
 

@@ -14,14 +14,10 @@ def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool
     if not can.dead_man:
         lacking.append("no dead-man: when the service or the cable dies, lit lamps stay lit")
     if lacking and not accepted:
-        raise DeviceError(
-            name,
-            "checking that a blackout can be guaranteed",
-            expected="read-back and a dead-man",
-            received="; ".join(lacking),
-            todo="Wire the emergency stop and a timer into the lamps' supply, then set "
-            "accept_unverified_blackout = true in [devices.lights].",
-        )
+        doing, expected = "checking that a blackout can be guaranteed", "read-back and a dead-man"
+        todo = "Wire the emergency stop and a timer into the lamps' supply, then set "
+        todo += "accept_unverified_blackout = true in [devices.lights]."
+        raise DeviceError(name, doing, expected, "; ".join(lacking), todo)
 
 
 def level_word(name: str, doing: str, level: float, steps: int) -> int:

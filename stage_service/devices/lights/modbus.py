@@ -317,10 +317,8 @@ class ModbusLightBank:
         if got != wanted:
             self.close()
             self._out_of_step = True
-            todo = (
-                "Answers were out of step; the next request opens the link anew. If it "
-                "happens again, look for a second master."
-            )
+            todo = "Answers were out of step; the next request opens the link anew. If it "
+            todo += "happens again, look for a second master."
             raise _OutOfStep(self.name, doing, f"the answer {wanted}", f"{got}", todo)
         return answer
 
