@@ -66,7 +66,12 @@ class Latch:
         with self._lock:
             if result.blocks:
                 was = self.latched
-                self._set(Latched(was.since if was else utc_now(), result.detail, reads_back))
+                since = was.since if was else utc_now()
+                self.latched = Latched(since, result.detail, reads_back)
+                try:
+                    write_whole(self._path, json.dumps(asdict(self.latched)).encode())
+                except OSError:  # a full disk must not keep anybody from a blackout
+                    log.exception("%s cannot be written: it ends with this process", self._path)
                 return None if was else "set"
             if result.safe and self.latched is not None:
                 self._clear()
@@ -84,13 +89,6 @@ class Latch:
                     "(POST /devices/blackout) once it answers"
                 )
             self._clear()
-
-    def _set(self, latched: Latched) -> None:
-        self.latched = latched
-        try:
-            write_whole(self._path, json.dumps(asdict(latched)).encode())
-        except OSError:  # a full disk must not keep anybody from a blackout
-            log.exception("%s cannot be written: the latch ends with this process", self._path)
 
     def _clear(self) -> None:
         self._path.unlink(missing_ok=True)

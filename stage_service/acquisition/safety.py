@@ -12,12 +12,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import DeviceError, SafetyRefusal
-from stage_service.devices.lights.interface import LightCapabilities, LightStatus
-from stage_service.devices.projectors.interface import ProjectorCapabilities
+from stage_service.devices.lights.interface import LightBank, LightStatus
+from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.trigger.interface import TriggerStatus
 
 ATTEMPTS = 3
@@ -51,12 +51,6 @@ class Blackout:
         return {"safe": self.safe, "state": self.state, "detail": self.detail}
 
 
-class _Dark(Protocol):
-    name: str
-
-    def off(self) -> None: ...
-
-
 def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
     """Put lamps and projectors off and read it back; never raises for a device.
 
@@ -65,11 +59,12 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
     """
     lights, beams, config = devices.lights, devices.projectors, devices.config
     problems = unread = ""
-    lit: list[tuple[_Dark, LightCapabilities | ProjectorCapabilities, Callable[[], bool]]]
-    lit = [(lights, lights.capabilities, lambda: lights.status().lit == 0)]
+    lit: list[tuple[LightBank | ProjectorController, Callable[[], bool]]]
+    lit = [(lights, lambda: lights.status().lit == 0)]
     if beams is not None:
-        lit.append((beams, beams.capabilities, beams.is_dark))
-    for device, can, is_dark in lit:
+        lit.append((beams, beams.is_dark))
+    for device, is_dark in lit:
+        can = device.capabilities
         problem = _darken(device, is_dark if can.reads_back else None, attempts)
         if problem and can.dead_man:
             problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
@@ -83,7 +78,9 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
     return Blackout(False, f"unknown, unsafe: {(problems + unread).strip()}", accepted)
 
 
-def _darken(device: _Dark, is_dark: Callable[[], bool] | None, attempts: int) -> str:
+def _darken(
+    device: LightBank | ProjectorController, is_dark: Callable[[], bool] | None, attempts: int
+) -> str:
     """Empty when the device is dark as far as it can tell, else what went wrong the last time."""
     problem = ""
     for attempt in range(attempts):

@@ -6,17 +6,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Self, TypeVar
 
-from reconstruction import Camera as Geometry
 from reconstruction.geometry.rig import RigError
 from stage_service.config import (
     BaslerConfig,
-    CamerasConfig,
     DevicesConfig,
     DmxConfig,
-    LightBankConfig,
-    LinkCamerasConfig,
-    ModbusRtuConfig,
-    ModbusTcpConfig,
     RigFile,
 )
 from stage_service.devices.cameras.basler import BaslerCamera
@@ -61,7 +55,14 @@ class DeviceSet:
         config, rig = rig_file.devices, rig_file.rig
         if config is None:
             raise RigError(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
-        lights = _light_bank(config.lights, len(rig.lights))
+        if isinstance(config.lights, DmxConfig):
+            lights: LightBank = DmxLightBank(config.lights, len(rig.lights))
+        else:
+            lights = ModbusLightBank(config.lights, len(rig.lights))
+        if isinstance(config.cameras, BaslerConfig):
+            cameras: list[Camera] = [BaslerCamera(config.cameras, c) for c in rig.cameras]
+        else:
+            cameras = [LinkCamera(config.cameras, c) for c in rig.cameras]
         projectors = None
         if config.projectors is not None and rig.projectors:
             names = tuple(p.name for p in rig.projectors)
@@ -71,7 +72,7 @@ class DeviceSet:
             LimitedLightBank(lights, rig_file.safety, past=lit),
             SerialTriggerBox(config.trigger),
             projectors,
-            tuple(_camera(config.cameras, c) for c in rig.cameras),
+            tuple(cameras),
             _powers(rig_file, config),
         )
 
@@ -128,22 +129,6 @@ class DeviceSet:
     def _all(self) -> tuple[Device, ...]:
         beams = (self.projectors,) if self.projectors is not None else ()
         return (self.lights, *beams, self.trigger, *self.cameras)
-
-
-def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
-    match config:
-        case ModbusTcpConfig() | ModbusRtuConfig():
-            return ModbusLightBank(config, lamps)
-        case DmxConfig():
-            return DmxLightBank(config, lamps)
-
-
-def _camera(config: CamerasConfig, geometry: Geometry) -> Camera:
-    match config:
-        case LinkCamerasConfig():
-            return LinkCamera(config, geometry)
-        case BaslerConfig():
-            return BaslerCamera(config, geometry)
 
 
 def _powers(rig_file: RigFile, config: DevicesConfig) -> tuple[PjLinkProjector, ...]:

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import threading
-from typing import Protocol, Self
+from typing import Self
 
-
-class Fed(Protocol):
-    """A device with a watchdog."""
-
-    name: str
-
-    def heartbeat(self) -> None:
-        """Tell the watchdog that somebody is there."""
+from stage_service.devices.lights.interface import LightBank
+from stage_service.devices.projectors.interface import ProjectorController
 
 
 class Heartbeat:
@@ -22,7 +16,7 @@ class Heartbeat:
     device needs its own: one that does not answer must not keep the others waiting.
     """
 
-    def __init__(self, device: Fed, interval_s: float) -> None:
+    def __init__(self, device: LightBank | ProjectorController, interval_s: float) -> None:
         self._device = device
         self._interval = interval_s
         self._stop = threading.Event()

@@ -43,13 +43,8 @@ class EventLog:
             self._changed.notify_all()
             return event
 
-    def since(self, number: int) -> list[Event]:
-        """The kept events after `number`, oldest first."""
-        with self._changed:
-            return [e for e in self._events if e.number > number]
-
     def wait(self, number: int, timeout: float) -> list[Event]:
-        """`since(number)`, waiting up to `timeout` seconds while that is empty."""
+        """The kept events after `number`, oldest first; waits up to `timeout` seconds for one."""
         with self._changed:
             self._changed.wait_for(lambda: self._last > number, timeout)
             return [e for e in self._events if e.number > number]

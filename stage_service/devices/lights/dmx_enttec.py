@@ -1,14 +1,11 @@
 """A light bank on DMX through an Enttec DMX USB Pro (its API specification 1.44).
 
-The widget keeps sending the newest frame by itself, forty times a second: it is no dead-man, and
-nothing comes back from the lamps. After each frame the widget is asked for its parameters: its
-answer says that the frame has reached the widget, not that a lamp followed, and how long it takes
-until the frame is out, which every command waits for. No other request is
-ever sent: the widget stops its output for all but these two.
-
-Answers carry no number, but as many bytes of user configuration as were asked for: each request
-asks for another number, and only that many is its answer. Widgets of other makers ignore the
-number; with them what comes late is waited for and dropped.
+The widget repeats the newest frame by itself: it is no dead-man, and nothing comes back from the
+lamps. After each frame it is asked for its parameters: the answer says that the frame has reached
+the widget, and how long it takes until it is out, which every command waits for. No other request
+is ever sent, as the widget stops its output for it. An answer is known by its bytes of user
+configuration, another number for each request; widgets of other makers ignore the number, and what
+comes late from them is waited for and dropped.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class ModbusLightBank:
     def close(self) -> None:
         with self._lock:
             if self._link is not None:
-                self._link.close()
+                self._link.close()  # type: ignore[no-untyped-call]  # pymodbus's own
             self._link = self._level = self._armed = None
             self._identified = False
 

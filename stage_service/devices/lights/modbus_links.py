@@ -7,7 +7,7 @@ import select
 import socket
 import termios
 import time
-from typing import Any, Protocol
+from typing import Any
 
 import serial
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
@@ -17,28 +17,6 @@ from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
 _FASTEST_FIXED = 19200
 _SILENCE_S = 1.75e-3
 _MOST_DRAINED = 100
-
-
-class ModbusLink(Protocol):
-    """What the bank uses of a client. `received` is what came since the last request."""
-
-    received: bytes
-
-    def connect(self) -> bool:
-        """Open; raises `OSError`."""
-
-    def close(self) -> None:
-        """Close."""
-
-    def drain(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for `quiet_s`; raises `OSError`."""
-
-
-def open_link(config: ModbusTcpConfig | ModbusRtuConfig) -> ModbusLink:
-    """An open link; raises `OSError` with the reason."""
-    link = _RtuLink(config) if isinstance(config, ModbusRtuConfig) else _TcpLink(config)
-    link.connect()
-    return link
 
 
 def silence_s(config: ModbusRtuConfig) -> float:
@@ -56,6 +34,7 @@ def character_s(config: ModbusRtuConfig) -> float:
 
 class _Deadline:
     """Receiving for pymodbus, which itself polls with sleeps of a millisecond and may wait twice.
+    `received` is what came since the last request.
 
     retries=0: a command that is repeated unseen would hide a failing link, and the default of
     three multiplies every deadline by four.
@@ -136,6 +115,7 @@ class _RtuLink(_Deadline, ModbusSerialClient):
         return len(request)
 
     def drain(self, quiet_s: float) -> None:
+        """Drop what comes until nothing has come for `quiet_s`; raises `OSError`."""
         for _ in range(_MOST_DRAINED):
             self._sent(quiet_s)
             if not self.recv(None):
@@ -145,3 +125,13 @@ class _RtuLink(_Deadline, ModbusSerialClient):
         data = super().recv(size)
         self._quiet_since = time.monotonic()
         return data
+
+
+ModbusLink = _TcpLink | _RtuLink
+
+
+def open_link(config: ModbusTcpConfig | ModbusRtuConfig) -> ModbusLink:
+    """An open link; raises `OSError` with the reason."""
+    link = _RtuLink(config) if isinstance(config, ModbusRtuConfig) else _TcpLink(config)
+    link.connect()
+    return link

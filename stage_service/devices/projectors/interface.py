@@ -19,11 +19,6 @@ class ProjectorCapabilities:
     dead_man: bool
     table: int
 
-    @property
-    def sequences(self) -> bool:
-        """Whether it steps with the trigger box."""
-        return self.table > 0
-
 
 @dataclass(frozen=True)
 class Pattern:

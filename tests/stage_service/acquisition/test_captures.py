@@ -61,7 +61,7 @@ def test_a_capture_from_start_to_follow_up(manager, world, completed):
     assert completed == [status]
     assert manager.list() == [status]
     assert verify(manager.path(capture_id)) == []
-    states = [e.data["state"] for e in manager.events.since(0) if e.kind == "capture.state"]
+    states = [e.data["state"] for e in manager.events.wait(0, 0) if e.kind == "capture.state"]
     assert states == ["running", "finishing", "done"]
 
 

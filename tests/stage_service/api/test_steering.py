@@ -253,7 +253,7 @@ def interrupted(http: Client) -> str:
     """A capture that was aborted after some frames."""
     capture: str = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
     events = http.service.events
-    while not any(e.kind == "capture.step" for e in events.since(0)):
+    while not any(e.kind == "capture.step" for e in events.wait(0, 0)):
         assert events.wait(events.last, 10.0)
     http.post(f"/captures/{capture}/abort")
     return capture
