@@ -73,7 +73,7 @@ def test_it_shows_and_goes_dark(driver):
 
 def test_version_1_has_neither_sequences_nor_a_dead_man(serve):
     driver = First(serve).driver
-    assert not driver.capabilities.sequences
+    assert driver.capabilities.table == 0
     assert not driver.capabilities.dead_man
     with pytest.raises(DeviceError, match=r"expected 1 to 0 entries.*step by software"):
         driver.load_sequence(rows(1))
