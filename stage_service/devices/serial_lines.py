@@ -103,14 +103,14 @@ class SerialLines:
         self.echo(f"WATCHDOG {round(seconds * 1000)}", "setting the watchdog")
 
     def upload(
-        self, words: tuple[str, str, str], texts: Sequence[str], most: int, steps: int
+        self, words: tuple[str, str, str, str], texts: Sequence[str], most: int, steps: int
     ) -> None:
         """Upload up to `most` texts and arm the device, which answers with our checksum and number
-        of steps. `words` are the requests for the whole and for one text, and the whole's name."""
-        begin, each, whole = words
+        of steps. `words` are the requests for the whole and for one text, and what they are called."""
+        begin, each, whole, parts = words
         if not 1 <= len(texts) <= most:
-            doing, received = f"uploading a {whole}", f"{len(texts)} of them"
-            expected = f"1 to {most} {each.lower()} lines, which it holds"
+            doing, received = f"uploading a {whole}", f"{len(texts)} {parts}"
+            expected = f"1 to {most} {parts}, which it holds"
             todo = "Shoot in shorter runs, or step by software."
             raise DeviceError(self.name, doing, expected, received, todo)
         self.echo(f"{begin} {len(texts)}", f"beginning a {whole}")

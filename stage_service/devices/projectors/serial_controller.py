@@ -57,7 +57,7 @@ class SerialProjectorController:
         """Upload in runs of rows, compare checksum and number of patterns with our own, and leave
         the controller armed."""
         entries = [_text(run) for run in _runs(patterns)]
-        words = ("SEQ", "ENTRY", "sequence")
+        words = ("SEQ", "ENTRY", "sequence", "entries")
         self._lines.upload(words, entries, self.capabilities.table, len(patterns))
 
     def position(self) -> int:

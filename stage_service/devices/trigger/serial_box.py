@@ -64,7 +64,7 @@ class SerialTriggerBox:
             todo = "Set hardware_stepping = false in [devices], or update the box's firmware."
             raise DeviceError(self.name, "uploading a table", expected, received, todo)
         self._lines.set_watchdog(watchdog_s)
-        words, steps = ("TABLE", "ROW", "table"), sum(row.repeat for row in rows)
+        words, steps = ("TABLE", "ROW", "table", "rows"), sum(row.repeat for row in rows)
         self._lines.upload(words, texts, self.table_rows, steps)
 
     def go(self) -> None:
