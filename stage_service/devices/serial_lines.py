@@ -106,7 +106,7 @@ class SerialLines:
         self, words: tuple[str, str, str, str], texts: Sequence[str], most: int, steps: int
     ) -> None:
         """Upload up to `most` texts and arm the device, which answers with our checksum and number
-        of steps. `words` are the requests for the whole and for one text, and what they are called."""
+        of steps. `words`: the requests for the whole and for one text, and their names."""
         begin, each, whole, parts = words
         if not 1 <= len(texts) <= most:
             doing, received = f"uploading a {whole}", f"{len(texts)} {parts}"
