@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -13,11 +13,19 @@ from appearance.observations import HeldOut, Observed, observe
 from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
-from reconstruction import Capture, Model
+from reconstruction import Capture, Model, Rig
 from reconstruction.arrays import Array, Bools, Floats
 
 MAGNIFIED = 4.0
 """Factor on the differences of displayed values in error maps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A scene, and the rig whose lights it is rendered under: calibrated, or as found."""
+
+    scene: HairScene
+    rig: Rig
 
 
 def held_out_frames(capture: Capture, model: Model, held_out: HeldOut, most: int) -> list[Observed]:
@@ -39,22 +47,28 @@ def held_out_frames(capture: Capture, model: Model, held_out: HeldOut, most: int
 def judge(
     model: Model,
     frames: Sequence[Observed],
-    scenes: Mapping[str, HairScene],
+    fits: Mapping[str, Judged],
     exposure: Exposure,
     sampling: Sampling,
 ) -> dict[str, dict[str, float]]:
-    """Mean `metrics.scores` and "relative_error" of each of `scenes` over lit `frames`; {} of none.
+    """Mean `metrics.scores` and "relative_error" of each of `fits` over lit `frames`; {} of none.
 
-    Writes the model's `inverse_rendering.png`: each frame as captured, as each scene renders it,
-    and the last one's error map.
+    Writes the model's `inverse_rendering.png`: each frame as captured, as each fit renders it, and
+    the last one's error map.
     """
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in scenes}
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in fits}
     rows: list[Row] = []
     for k, o in enumerate(frames):
         spent = asdict(replace(sampling, seed=(sampling.seed << 8) + 91 + k))
         rendered = {
-            name: render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent)
-            for name, scene in scenes.items()
+            name: render_olat(
+                fit.scene,
+                o.camera,
+                [fit.rig.light(light.name) for light in o.lights],
+                pixels=o.pixels,
+                **spent,
+            )
+            for name, fit in fits.items()
         }
         mask = np.zeros((o.camera.height, o.camera.width), bool)
         mask.reshape(-1)[o.pixels] = True
@@ -76,7 +90,7 @@ def judge(
     if not rows:
         return {}
     with model.writing("inverse_rendering.png") as part:
-        comparison_picture(part, rows, ["captured", *scenes, "error"])
+        comparison_picture(part, rows, ["captured", *fits, "error"])
     return {name: mean_scores(images) for name, images in found.items()}
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.found_lights import save_lights
-from appearance.inverse_rendering.held_out import held_out_frames, judge
+from appearance.inverse_rendering.found_lights import lights_as_found, save_lights
+from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import Monitor, Outcome, run
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
 from appearance.inverse_rendering.problem import Problem
@@ -79,12 +79,16 @@ def fit_maps(
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
-            scenes = {
-                name: mapped.with_maps(maps).with_skin(fitted.skin)
-                for name, maps in (("start", start), ("inverse_rendering", outcome.maps))
+            lights = tuple(lights_as_found(model, capture.rig.lights))
+            fits = {
+                name: Judged(mapped.with_maps(maps).with_skin(fitted.skin), rig)
+                for name, maps, rig in (
+                    ("start", start, capture.rig),
+                    ("inverse_rendering", outcome.maps, replace(capture.rig, lights=lights)),
+                )
             }
             judging = Sampling(request.judged_spp, depth, seed)
-            result["held_out"] = judge(model, frames, scenes, fitted.exposure, judging)
+            result["held_out"] = judge(model, frames, fits, fitted.exposure, judging)
             result |= scores_unavailable()
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     model.write_report(report)

@@ -38,15 +38,20 @@ def recoloured(
 ) -> HairMaps:
     """`maps` with the absorption under the `brush (w, h)` in [0, 1] mixed with `sigma_a (3,)`.
 
-    `along` is the part of the strands that is dyed, 0 the root and 1 the tip. Maps with fewer cells
-    than the brush get as many. Mixed in the square root of the absorption, in which colours are
-    about evenly spaced. Raises `ValueError` for a brush or an absorption out of range.
+    `along` is the part of the strands that is dyed, 0 the root and 1 the tip; a layer is dyed by
+    the share of its span that this covers. Maps with fewer cells than the brush get as many. Mixed
+    in the square root of the absorption, in which colours are about evenly spaced. Raises
+    `ValueError` for a brush, an absorption or a part out of range.
     """
     paint, wanted = np.asarray(brush, float), np.asarray(sigma_a, float)
     if paint.ndim != 2 or not ((paint >= 0) & (paint <= 1)).all():
         raise ValueError(f"the brush must be (w, h) in [0, 1], got shape {paint.shape}")
     if wanted.shape != (3,) or not (wanted >= 0).all():
         raise ValueError(f"sigma_a must be 3 numbers of 0 or more, got {wanted}")
+    if not 0 <= along[0] < along[1] <= 1:
+        raise ValueError(
+            f"along is a part of the strands from a to b with 0 <= a < b <= 1, got {along}"
+        )
     layers, columns, rows = maps.shape
     shape = (layers, max(columns, paint.shape[0]), max(rows, paint.shape[1]))
     fine = maps if shape == maps.shape else maps.resized(shape)
@@ -54,9 +59,7 @@ def recoloured(
         np.minimum(np.arange(n) * m // n, m - 1)
         for n, m in zip(shape[1:], paint.shape, strict=True)
     )
-    at = np.linspace(0, 1, layers) if layers > 1 else np.array([0.5])
-    dyed = (at >= along[0]) & (at <= along[1])
-    share = dyed[:, None, None, None] * paint[np.ix_(u, v)][None, :, :, None]
+    share = _covered(along, layers)[:, None, None, None] * paint[np.ix_(u, v)][None, :, :, None]
     root = np.sqrt(fine.sigma_a)
     mixed = (root + share * (np.sqrt(wanted) - root)) ** 2
     return replace(fine, sigma_a=np.where(share > 0, mixed, fine.sigma_a))
@@ -101,6 +104,17 @@ def _cell_of(root_uv: Array, cells: tuple[int, int]) -> Ints:
     """The cell `(S,)` of each root, v running fastest."""
     column, row = np.minimum((root_uv * cells).astype(int), np.array(cells) - 1).T
     return np.asarray(column * cells[1] + row)
+
+
+def _covered(along: tuple[float, float], layers: int) -> Array:
+    """The share `(layers,)` of each layer's span that lies in `along`.
+
+    A layer reaches half a step to either side of its place on the strands.
+    """
+    middle, half = np.linspace(0, 1, layers), 0.5 / max(layers - 1, 0.5)
+    low, high = np.maximum(middle - half, 0), np.minimum(middle + half, 1)
+    inside = np.minimum(high, along[1]) - np.maximum(low, along[0])
+    return np.maximum(inside, 0) / (high - low)
 
 
 def _cut(strands: Strands, length: float) -> Strands:

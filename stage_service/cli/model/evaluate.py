@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from stage_service.cli.support.commands import (
     BadArgument,
@@ -14,6 +15,8 @@ from stage_service.cli.support.commands import (
     add_group,
     progress_bar,
 )
+
+_DEMO_FIELDS = ("subject", "seed", "geometry", "baselines", "images", "appearance")
 
 
 def add(commands: Commands) -> None:
@@ -105,13 +108,22 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
     """
     from stage_service.cli.support.tables import markdown_table
 
-    rows = {}
-    for path in args.results:
+    found = [(path, _demo_results(path)) for path in args.results]
+    names = [f"{results['subject']}, seed {results['seed']}" for _, results in found]
+    results = {
+        name if names.count(name) == 1 else f"{name} ({path})": one
+        for name, (path, one) in zip(names, found, strict=True)
+    }
+    output.result({"results": results}, markdown_table(results))
+
+
+def _demo_results(path: Path) -> dict[str, Any]:
+    try:
         results = json.loads(path.read_text())
-        absent = {"geometry", "baselines", "images", "appearance"} - set(results)
-        if absent:
-            raise BadArgument(
-                f"{path} has no {', '.join(sorted(absent))}: not a demo's results.json"
-            )
-        rows[f"{results['subject']}, seed {results['seed']}"] = results
-    output.result({"rows": rows}, markdown_table(rows))
+    except ValueError as e:
+        raise BadArgument(f"{path} is not JSON: {e}") from e
+    if not isinstance(results, dict):
+        raise BadArgument(f"{path} is not a JSON object: not a demo's results.json")
+    if absent := [field for field in _DEMO_FIELDS if field not in results]:
+        raise BadArgument(f"{path} has no {', '.join(absent)}: not a demo's results.json")
+    return results

@@ -11,6 +11,9 @@ import pytest
 
 from appearance import Exposure, HairAppearance, HeldOut, InverseRenderingRequest, fit_maps
 from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering import pipeline
+from appearance.inverse_rendering.loop import Outcome
+from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import BadOptions, Capture, CaptureWriter, Model, Rig, Step, parse_options
 
@@ -101,6 +104,27 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
         "inverse rendering, original",
         "inverse rendering, correctives",
     ]
+
+
+def test_held_out_cameras_are_judged_under_the_lights_as_found(made, tufted, tmp_path, monkeypatch):
+    """With the true hair under lights found to be twice as bright, a picture is all wrong."""
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    truth = HairMaps.of(tufted.truth)
+
+    def found(problem, *args, **more):
+        lights = LightDeviations.calibrated(len(problem.lights))
+        twice = replace(lights, gain=np.full(len(problem.lights), 2.0))
+        return Outcome(truth, twice, "converged", 0.0, 0.0, 1, [])
+
+    monkeypatch.setattr(pipeline, "run", found)
+    request = replace(REQUEST, judged_spp=256)
+    judged = fit_maps(capture, other, held_out=HeldOut(cameras=("c1",)), request=request)[
+        "held_out"
+    ]
+    assert judged["inverse_rendering"]["relative_error"] == pytest.approx(1, abs=0.2)
+    assert judged["start"]["relative_error"] < 0.8
 
 
 def test_unknown_fields_of_the_fit_are_refused_by_name():

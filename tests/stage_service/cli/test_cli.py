@@ -271,10 +271,21 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     assert "| held-out camera: three nearest lights | 21.4 dB / 0.71 |" in rest
     assert "| β_M (true) | 0.89 (0.28) |" in rest
     assert rest[-1] == "[1] fit: the roughness is at its bound"
-    del results["images"]
-    file.write_text(json.dumps(results))
-    code, data = run(capsys, "evaluate", "table", file)
-    assert (code, "has no images" in data["error"]["detail"]) == (3, True)
+    again = tmp_path / "again.json"
+    again.write_text(json.dumps(results))
+    code, data = run(capsys, "evaluate", "table", file, again)
+    assert (code, list(data["results"])) == (0, [f"curly, seed 3 ({f})" for f in (file, again)])
+    del results["subject"]
+    for text, said in (
+        (json.dumps(results), "has no subject"),
+        ("[]", "not a JSON object"),
+        ("{", "not JSON"),
+    ):
+        file.write_text(text)
+        code, data = run(capsys, "evaluate", "table", file)
+        assert code == 3
+        assert str(file) in data["error"]["detail"]
+        assert said in data["error"]["detail"]
 
 
 def test_a_service_from_the_command_line(capsys, rig_file, world, tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import redirect_stdout
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,11 +96,18 @@ def error_of_render(made, capsys) -> float:
     return float(np.linalg.norm(read_exr(out)[0][mask] - truth) / np.linalg.norm(truth))
 
 
-def test_a_render_of_fitted_maps_is_nearer_to_a_frame_that_no_fit_has_seen(made, capsys):
-    """Inverse rendering runs Sun's fit first, which leaves one material for all hair."""
+@pytest.fixture(scope="module")
+def fitted(made):
+    """What `hairstage fit` printed; the model of `made` then has maps and lights."""
     words = ["fit", made.capture, made.model, "--method", "inverse_rendering", "--json"]
-    assert main([str(w) for w in (*words, "--options", json.dumps(INVERSE))]) == 0
-    found = json.loads(capsys.readouterr().out)
+    with redirect_stdout(StringIO()) as printed:
+        assert main([str(w) for w in (*words, "--options", json.dumps(INVERSE))]) == 0
+    return json.loads(printed.getvalue())
+
+
+def test_a_render_of_fitted_maps_is_nearer_to_a_frame_that_no_fit_has_seen(made, fitted, capsys):
+    """Inverse rendering runs Sun's fit first, which leaves one material for all hair."""
+    found = fitted
     assert found["appearance"] == made.model.json("appearance.json")
     assert found["error"] < found["start_error"]
     assert len(made.model.json("lights.json")) == 23
@@ -115,8 +124,8 @@ def run(capsys, *words) -> tuple[int, dict]:
     return code, json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.usefixtures("fitted")
 def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
-    """After the test above: of a model with maps."""
     before = FittedModel.load(made.model)
     write_strands(tmp_path / "other.npz", tuft(50, seed=3))
     code, _ = run(
@@ -140,14 +149,25 @@ def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
     dyed = (np.abs(wisp.sigma_a - before.maps.resized(wisp.shape).sigma_a) > 1e-4).any(-1)
     assert not dyed[: len(dyed) // 2].any()
     assert 0.0 < dyed[-1].mean() < 0.1
+    code, _ = run(
+        *(capsys, "edit", made.model, "--out", tmp_path / "band", "--recolour", "0.9,0.1,0.1"),
+        *("--along", "0.3,0.4"),
+    )
+    assert code == 0
+    band = FittedModel.load(Model(tmp_path / "band")).maps
+    dyed = (np.abs(band.sigma_a - before.maps.resized(band.shape).sigma_a) > 1e-4).any((1, 2, 3))
+    assert dyed.tolist() == [False, False, True, True, False, False, False, False]
     code, _ = run(capsys, "render", tmp_path / "wisp", "--spp", 1, "--out", tmp_path / "x.png")
     assert code == 0
 
 
+@pytest.mark.usefixtures("fitted")
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ((), "--recolour"),
+        (("--recolour", "1,1,1", "--along", "0.8,0.2"), "0 <= a < b <= 1"),
+        (("--recolour", "1,1,1", "--along", "2,3"), "0 <= a < b <= 1"),
         (("--wisp", "0,0,1"), "--recolour"),
         (("--cut", "-1"), "above 0"),
         (("--roughen", "100"), "beta_m"),
@@ -164,6 +184,7 @@ def test_edits_that_cannot_be_made_are_one_sentence(made, capsys, tmp_path, word
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("fitted")
 def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     for kind, name in (("usd", "h.usdc"), ("hair", "h.hair"), ("abc", "h.abc")):
         code, found = run(capsys, "export", made.model, "--to", kind, "--out", tmp_path / name)
