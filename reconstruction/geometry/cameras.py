@@ -219,25 +219,25 @@ class Camera(Pinhole):
     @cached_property
     def _reach(self) -> float:
         """Radius before the lens of the image's furthest corner, and a tenth more."""
-        u, v = self._border()
+        u, v = undistorted(self.distortion, *self._border())
         return 1.1 * float(np.hypot(u, v).max())
 
     def _border(self) -> tuple[Array, Array]:
-        """Slopes before the lens all over the image, its edges included."""
+        """Slopes behind the lens `(17, 17)` all over the image, its edges included."""
         column, row = np.meshgrid(
             np.linspace(-0.5, self.width - 0.5, 17), np.linspace(-0.5, self.height - 0.5, 17)
         )
         y = (row - self.K[1, 2]) / self.K[1, 1]
         x = (column - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
-        return undistorted(self.distortion, x, y)
+        return x, y
 
     def _check_lens(self) -> None:
         with np.errstate(all="ignore"):  # a lens that cannot be inverted overflows here
-            u, v = self._border()
+            x, y = self._border()
+            u, v = undistorted(self.distortion, x, y)
             a, b, (axx, axy, ayy) = _bent(self.distortion, u, v)
-            again = undistorted(self.distortion, a, b)
             upright = (axx > 0) & (ayy > 0) & (axx * ayy > axy * axy)
-            same = np.hypot(again[0] - u, again[1] - v) < 1e-9
+            same = np.hypot(a - x, b - y) < 1e-9
             radius = np.hypot(u, v).max() * np.linspace(0, 1.1, 45)
             zero = np.zeros_like(radius)
             outwards = _bent(self.distortion * (1, 1, 0, 0, 1), radius, zero)[2][0] > 0

@@ -12,7 +12,8 @@ HEAVY = {"numpy", "scipy", "cv2", "drjit", "OpenEXR", "pxr"}
 
 def test_every_public_name_is_there() -> None:
     for name in reconstruction.__all__:
-        assert getattr(reconstruction, name).__name__ == name
+        found = getattr(reconstruction, name)
+        assert name == "Progress" or found.__name__ == name  # the one that is a type's alias
     assert {"Capture", "Model", "reconstruct", "Strands"} <= set(reconstruction.__all__)
 
 

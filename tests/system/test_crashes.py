@@ -80,7 +80,7 @@ def test_inverse_rendering_goes_on_where_its_worker_was_killed(stage):
     fit = {
         "variant": "correctives",
         "shape": [2, 2, 2],
-        "steps": 200,
+        "steps": 80,
         "check_every": 5,
         "halvings": 99,
     }

@@ -230,7 +230,7 @@ def test_one_line_of_voxels_grows_one_strand() -> None:
     inside[1, 1] = True
     grid = VoxelGrid(np.array([-1e-3, -1e-3, 0.0]), 1e-3, inside)
     points = np.array([[0.0, 0.0, 5e-3], [0.0, 0.0, 35e-3]])
-    field, _ = solve_field(grid, points, np.array([[0, 0, 1.0], [0, 0, -1.0]]), np.ones(2), None)
+    field, _ = solve_field(grid, points, np.array([[0, 0, 1.0], [0, 0, -1.0]]), np.ones(2))
     paths = grow_from_roots(
         field, np.zeros((1, 3)), np.array([[0, 0, 1.0]]), Tracing(max_length=0.1)
     )
@@ -245,7 +245,7 @@ def test_orthogonal_tensors_leave_no_direction_and_no_strand_through() -> None:
     low, high = np.array([1e-3, 1e-3, 0.0]), np.array([1e-3, 1e-3, 11e-3])
     points = np.stack([low, low, high, high])
     directions = np.array([[1.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, 1]])
-    field, _ = solve_field(grid, points, directions, np.ones(4), None)
+    field, _ = solve_field(grid, points, directions, np.ones(4))
     assert field.degenerate.any()
     assert np.isfinite(field.directions).all()
     assert not field.directions[field.degenerate].any()
