@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -21,6 +20,7 @@ from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.hair_features import (
     FAINTEST_LINES,
     light_contrast,
@@ -164,7 +164,7 @@ def _decide(
 ) -> HairMask:
     """A mask from where points lie on the head, and from the light where they lie on it."""
     contrast = light_contrast(capture, camera.name, subject)
-    covered = head_coverage(head, camera)
+    covered = np.isfinite(mesh_depth(camera, head))
     hair, skin = subject & ~ndimage.binary_dilation(covered), np.zeros_like(subject)
     if points is not None and off is not None:
         standing, lying = _votes(points, camera, off)
@@ -192,17 +192,16 @@ def _votes(points: PointCloud, camera: Camera, off: Array) -> tuple[Array, Array
     """
     own = points.cameras.index(camera.name) if camera.name in points.cameras else -1
     mine = points.camera == own
-    pixels, depth = camera.project(points.points[mine])
-    seen = (depth > 0) & camera.inside(pixels)
-    x, y = np.rint(pixels[seen]).astype(int).T
-    shape = (camera.height, camera.width)
-    flat = np.clip(y, 0, shape[0] - 1) * shape[1] + np.clip(x, 0, shape[1] - 1)
-    weight = points.weight[mine][seen].astype(np.float64)
-    standing = off[mine][seen] > STANDS_OFF
-    votes = [np.zeros(shape[0] * shape[1]) for _ in range(2)]
-    np.add.at(votes[0], flat[standing], weight[standing])
-    np.add.at(votes[1], flat[~standing], weight[~standing])
-    return votes[0].reshape(shape), votes[1].reshape(shape)
+    seen, x, y, _ = camera.pixels_of(points.points[mine])
+    flat = (y * camera.width + x)[seen]
+    weight, standing = points.weight[mine][seen], off[mine][seen] > STANDS_OFF
+
+    def votes(which: Bools) -> Array:
+        size = camera.height, camera.width
+        total: Array = np.bincount(flat[which], weight[which], size[0] * size[1]).astype(float)
+        return total.reshape(size)
+
+    return votes(standing), votes(~standing)
 
 
 def distance_to(head: Mesh, points: Array) -> Array:
@@ -232,20 +231,6 @@ def _samples(head: Mesh, step: float) -> tuple[Array, Array]:
         points.append(np.einsum("kc,fci->fki", weights, corners[of]).reshape(-1, 3))
         faces.append(np.repeat(of, len(weights)))
     return np.concatenate(points), normals[np.concatenate(faces)]
-
-
-def head_coverage(head: Mesh, camera: Camera) -> Bools:
-    """Pixels `(H, W)` whose ray meets `head`."""
-    shift = 4  # OpenCV's fixed-point bits below the pixel
-    image = np.zeros((camera.height, camera.width), np.uint8)
-    pixels, depth = camera.project(head.vertices)
-    front = (depth[head.faces] > 1e-3).all(axis=1)
-    limit = 30.0 * max(camera.width, camera.height)  # keeps the fixed-point numbers in range
-    triangles = pixels[head.faces[front]]
-    triangles = triangles[(np.abs(triangles) < limit).all(axis=(1, 2))]
-    for triangle in np.rint(triangles * (1 << shift)).astype(np.int32):
-        cv2.fillConvexPoly(image, triangle, 1, lineType=cv2.LINE_8, shift=shift)
-    return np.asarray(image > 0)
 
 
 def _threshold(contrast: Array, subject: Bools, hair: Bools, skin: Bools) -> float:

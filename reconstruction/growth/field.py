@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +44,6 @@ def principal(tensors: Array) -> tuple[Array, Array]:
     return vectors[:, :, 2], values[:, ::-1]
 
 
-def _within(index: Ints, shape: tuple[int, ...]) -> Bools:
-    """Which of the voxels `index (N, 3)` lie on a grid of `shape`."""
-    return np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))
-
-
 @dataclass(frozen=True, eq=False)
 class OrientationField:
     """Undirected orientations on the voxels of an envelope.
@@ -66,22 +62,24 @@ class OrientationField:
     measured: Bools
     empty: Bools
     degenerate: Bools
-    _padded: NDArray[np.int32] = field(init=False)
-    _table: Floats = field(init=False)
-    _corners: Ints = field(init=False)
 
-    def __post_init__(self) -> None:
-        # Two voxels of nothing on each side, so that eight corners are looked up at once without
-        # asking whether they are on the grid; nothing is the row of zeros after the last voxel.
+    # Two voxels of nothing on each side, so that eight corners are looked up at once without
+    # asking whether they are on the grid; nothing is the row of zeros after the last voxel.
+    @cached_property
+    def _padded(self) -> NDArray[np.int32]:
         count = len(self.directions)
         padded = np.full(np.array(self.grid.inside.shape) + 2 * _PAD, count, np.int32)
-        inner = padded[_PAD:-_PAD, _PAD:-_PAD, _PAD:-_PAD]
-        inner[self.grid.inside] = np.arange(count)
-        corners = np.array(list(np.ndindex(2, 2, 2))) @ self._strides(padded.shape)
-        object.__setattr__(self, "_padded", padded)
-        object.__setattr__(self, "_corners", corners)
-        table = np.concatenate([self.directions, np.zeros((1, 3))]).astype(np.float32)
-        object.__setattr__(self, "_table", table)
+        padded[_PAD:-_PAD, _PAD:-_PAD, _PAD:-_PAD][self.grid.inside] = np.arange(count)
+        return padded
+
+    @cached_property
+    def _table(self) -> Floats:
+        return np.concatenate([self.directions, np.zeros((1, 3))]).astype(np.float32)
+
+    @cached_property
+    def _strides(self) -> Ints:
+        _, rows, columns = self._padded.shape
+        return np.array([rows * columns, columns, 1])
 
     @property
     def valid(self) -> Bools:
@@ -114,7 +112,8 @@ class OrientationField:
         high = (q - base).astype(np.float32)
         low = 1 - high
         flat = self._flat(base.astype(np.int64))
-        d = self._table[self._padded.ravel()[flat[:, None] + self._corners]]
+        corners = np.array(list(np.ndindex(2, 2, 2))) @ self._strides
+        d = self._table[self._padded.ravel()[flat[:, None] + corners]]
         # (N, 8) in the order of `ndindex`: the last axis of the grid runs fastest
         x, y, z = (np.stack([low[:, k], high[:, k]], axis=1) for k in range(3))
         weight = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(-1, 8)
@@ -126,13 +125,8 @@ class OrientationField:
 
     def _flat(self, index: Ints) -> Ints:
         """Places `(N,)` in the padded volume; voxels far off the grid fall on its rim."""
-        shape = self._padded.shape
-        inside = np.clip(index + _PAD, 0, np.array(shape) - 2)
-        return np.asarray(inside @ self._strides(shape))
-
-    @staticmethod
-    def _strides(shape: tuple[int, ...]) -> Ints:
-        return np.array([shape[1] * shape[2], shape[2], 1])
+        inside = np.clip(index + _PAD, 0, np.array(self._padded.shape) - 2)
+        return np.asarray(inside @ self._strides)
 
 
 LEAST_COHERENCE = 0.5
@@ -154,7 +148,7 @@ def gather(
     best, distance = np.full(len(index), -1, np.int64), np.full(len(index), np.inf)
     for shift in np.ndindex(3, 3, 3):
         moved = index + np.array(shift) - 1
-        on = _within(moved, number.shape)
+        on = ((moved >= 0) & (moved < np.array(number.shape))).all(axis=1)
         n = np.where(on, number[tuple(np.where(on[:, None], moved, 0).T)], -1)
         far = np.linalg.norm(q - moved, axis=1)
         nearer = (n >= 0) & (far < distance)

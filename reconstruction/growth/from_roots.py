@@ -41,18 +41,10 @@ class Tracing:
             raise ValueError(f"need 0 < step <= max_length, got {self.step} and {self.max_length}")
 
 
-@dataclass(frozen=True, eq=False)
-class TracedPaths:
-    """Traced polylines as columns: `points (T, N, 3) float32`, of which path i has `counts[i]`."""
-
-    points: Floats
-    counts: Ints
-
-
 def trace(
     field: OrientationField, starts: AnyFloats, along: AnyFloats, tracing: Tracing = Tracing()
-) -> TracedPaths:
-    """Follow the field from `starts (N, 3)`, setting out on the side of `along (N, 3)`.
+) -> list[Floats]:
+    """Paths `(T, 3)` along the field from `starts (N, 3)`, setting out along `along (N, 3)`.
 
     At every step the line's sign is the one that turns least. A path ends where it leaves the
     envelope or the field has no orientation.
@@ -76,7 +68,8 @@ def trace(
         row[active] = p
         rows.append(row)
         counts[active] += 1
-    return TracedPaths(np.stack(rows), counts)
+    columns = np.stack(rows, axis=1)
+    return [columns[i, :n] for i, n in enumerate(counts)]
 
 
 def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> Array:
@@ -94,12 +87,6 @@ def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> A
         return k2
     k3 = ahead(0.5 * step * k2)
     return (d + 2 * k2 + 2 * k3 + ahead(step * k3)) / 6
-
-
-def to_polylines(paths: TracedPaths) -> list[Floats]:
-    """The points `(N, 3)` of each path."""
-    columns = np.ascontiguousarray(paths.points.transpose(1, 0, 2))
-    return [columns[i, :n] for i, n in enumerate(paths.counts)]
 
 
 def grow_from_roots(
@@ -135,7 +122,7 @@ def grow_from_roots(
         which = np.flatnonzero(found)
         traced = trace(field, starts[which], n[which], tracing)
         out = []
-        for root, path in zip(p[which].astype(np.float32), to_polylines(traced), strict=True):
+        for root, path in zip(p[which].astype(np.float32), traced, strict=True):
             if (len(path) - 1) * step < _SHORTEST_FROM_ROOT:
                 continue
             near = np.linalg.norm(root - path[0]) < step
@@ -198,7 +185,7 @@ def fill_gaps(
         spent[chosen] = True
         starts = centers[chosen] + field.grid.spacing * rng.uniform(-0.4, 0.4, (len(chosen), 3))
         d = field.directions[chosen]
-        paths = to_polylines(trace(field, np.tile(starts, (2, 1)), np.vstack([d, -d]), tracing))
+        paths = trace(field, np.tile(starts, (2, 1)), np.vstack([d, -d]), tracing)
         for a, b in zip(paths[: len(chosen)], paths[len(chosen) :], strict=True):
             path = np.concatenate([b[:0:-1], a])
             if (len(path) - 1) * tracing.step >= _SHORTEST_THROUGH_GAP:

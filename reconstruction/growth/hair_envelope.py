@@ -52,7 +52,8 @@ def build_envelope(
         depth = np.where(mask.hair, depth_map(camera, own), 0.0)
         first = np.where(mask.hair, depth, np.where(np.isfinite(bare), bare, 0.0))
         surfaces[camera.name], depths[camera.name] = first, depth
-        hairs.append(own[_on(mask.hair, camera, own)])
+        seen, x, y, _ = camera.pixels_of(own)
+        hairs.append(own[seen & mask.hair[y, x]])
     carved = space_carve(hull, cameras, surfaces, margin)
     held = hull.inside & _holding(hull, np.concatenate(hairs))
     inside = (carved.inside | held) & ~inside_mesh(hull, head)
@@ -79,12 +80,6 @@ def build_envelope(
             f"{masked.capture.path}: no volume is left for hair: check masks, head.obj and poses"
         )
     return envelope, depths
-
-
-def _on(mask: Bools, camera: Camera, points: Array) -> Bools:
-    """Which of `points (N, 3)` fall on `mask (H, W)`."""
-    seen, x, y, _ = camera.pixels_of(points)
-    return np.asarray(seen & mask[y, x])
 
 
 def _holding(grid: VoxelGrid, points: Array) -> Bools:

@@ -16,6 +16,7 @@ from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
+    condition_lines,
     decide,
     half_sphere,
     line_scores,
@@ -24,7 +25,6 @@ from reconstruction.tangents.line_evidence import (
     seen_by,
 )
 from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
-from reconstruction.tangents.tangent_conditioning import condition_lines
 
 CANDIDATES = 500  # directions that are scored at each point
 

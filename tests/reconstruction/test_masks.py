@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from reconstruction import Camera, Capture, Light, Mesh
 from reconstruction.geometry.lights import dome_positions
+from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.hair_features import light_contrast, line_strength, otsu, tell_apart
 from reconstruction.images.silhouettes import NoSilhouette, background_noise, silhouette
 from reconstruction.light_planes import PointCloud, triangulate
@@ -18,7 +19,6 @@ from reconstruction.masks import (
     _threshold,
     distance_to,
     hair_masks,
-    head_coverage,
 )
 
 RADIUS = 0.1
@@ -169,7 +169,7 @@ def test_distances_to_a_ball() -> None:
 
 def test_the_head_covers_its_outline(stage_camera: Callable[..., Camera]) -> None:
     device = stage_camera("c", 0.0)
-    assert iou(head_coverage(ball(0.1, 40), device), upper(device)[0]) > 0.93
+    assert iou(np.isfinite(mesh_depth(device, ball(0.1, 40))), upper(device)[0]) > 0.93
 
 
 def test_hair_that_lies_flat_on_the_head_is_hair_where_the_light_says_so():

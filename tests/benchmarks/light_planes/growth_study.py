@@ -48,13 +48,13 @@ def compare_growth(
                 begin = time.perf_counter()
                 paths = trace(field, starts, along, Tracing(step, max_length, method))
                 seconds = min(seconds, time.perf_counter() - begin)
-            there = truth.points[:: stride * finer]
-            last = np.minimum(paths.counts, (truth.counts - 1) // (stride * finer) + 1)
-            rows = min(len(there), len(paths.points))
-            both = np.arange(rows)[:, None] < last
-            off = np.linalg.norm(paths.points[:rows].astype(float) - there[:rows], axis=2)
-            errors = np.where(both, off, 0).sum(axis=0)[last > 1] / (last[last > 1] - 1)
-            if len(errors):
+            errors = []
+            for path, line in zip(paths, truth, strict=True):
+                there = line[:: stride * finer]
+                if (n := min(len(path), len(there))) > 1:
+                    off = np.linalg.norm(path[:n].astype(float) - there[:n], axis=1)
+                    errors.append(off.sum() / (n - 1))
+            if errors:
                 series.points.append((seconds, float(np.quantile(errors, quantile))))
         out.append(series)
     return out

@@ -17,10 +17,9 @@ from reconstruction.light_planes import (
     sweep_peaks,
     triangulate,
 )
-from reconstruction.light_planes.consensus import flatten, supported
 from reconstruction.light_planes.peaks import REACH, fit_stripes
 from reconstruction.light_planes.plane_conditioning import condition, ray_plane_angles, row_pitch
-from reconstruction.light_planes.triangulation import fuse
+from reconstruction.light_planes.triangulation import flatten, fuse, supported
 
 Shoot = Callable[..., Capture]
 RADIUS = 0.1

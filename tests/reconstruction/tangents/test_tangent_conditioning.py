@@ -13,8 +13,7 @@ from reconstruction.geometry.lights import dome_positions
 from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.tangents.estimate import measure_tangents
-from reconstruction.tangents.line_evidence import LineEvidence
-from reconstruction.tangents.tangent_conditioning import condition_lines
+from reconstruction.tangents.line_evidence import LineEvidence, condition_lines
 
 UP = np.array([0.0, 0.0, 1.0])
 BINS = 36
