@@ -6,13 +6,12 @@ says in the report.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
 
-from reconstruction.arrays import AnyFloats
+from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
@@ -165,24 +164,14 @@ class _Stages:
         return cloud
 
     def _triangulated(self, capture: Capture, motion: Motion | None, stage: Stage) -> PointCloud:
-        peaks = sweep_peaks(capture, progress=self.progress)
+        tell, asked = self.progress, self.options.motion
+        peaks = sweep_peaks(capture, tell)
         if motion is None:
             first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
             with self.report.stage("motion") as solving:
-                motion = solve_motion(
-                    capture,
-                    first,
-                    options=self.options.motion,
-                    progress=self.progress,
-                    stage=solving,
-                )
-        return triangulate(
-            capture,
-            motion=None if motion.still else motion,
-            peaks=peaks,
-            progress=self.progress,
-            stage=stage,
-        )
+                motion = solve_motion(capture, first, options=asked, progress=tell, stage=solving)
+        known = None if motion.still else motion
+        return triangulate(capture, motion=known, peaks=peaks, progress=tell, stage=stage)
 
     def masks(
         self, whole: Capture, capture: Capture, cloud: PointCloud, head: FittedHead | None
@@ -208,17 +197,10 @@ class _Stages:
 
     def lines(
         self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
-    ) -> tuple[list[AnyFloats], Segments]:
+    ) -> tuple[list[Array], Segments]:
         """Polylines `(N, 3)` from line stereo, and the segments that they come from."""
-        polylines, segments = line_strands(
-            masked,
-            None if head is None else head.mesh,
-            self.report,
-            method=method,
-            options=self.options.light_codes,
-            progress=self.progress,
-        )
-        return list(polylines), segments
+        o, mesh, tell = self.options.light_codes, None if head is None else head.mesh, self.progress
+        return line_strands(masked, mesh, self.report, method=method, options=o, progress=tell)
 
     def seen_strands(
         self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
@@ -226,9 +208,8 @@ class _Stages:
         """Strands from line stereo alone: only what is seen, none of them rooted."""
         polylines, _ = self.lines(masked, head, method)
         with self.report.stage("strands") as stage:
-            strands = Strands.from_list(
-                [p.astype(np.float32) for p in polylines], self._radius(len(polylines))
-            )
+            radius = self._radius(len(polylines))
+            strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
             stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
             stage.leave_out(
                 "roots",
@@ -296,11 +277,7 @@ class _Stages:
         return field
 
     def strands(
-        self,
-        field: OrientationField,
-        scalp: Scalp,
-        seen: Sequence[AnyFloats],
-        flat: ScalpMap | None,
+        self, field: OrientationField, scalp: Scalp, seen: list[AnyFloats], flat: ScalpMap | None
     ) -> None:
         """Strands from the scalp, then through the gaps that those leave, all of them rooted.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from reconstruction.capture.folder import Capture, FrameRecord
 from reconstruction.capture.writer import sha256
@@ -26,56 +26,49 @@ def verify(path: str | Path, progress: Progress = silent) -> list[str]:
         capture = Capture(path)
     except (ValueError, KeyError, OSError) as error:
         return [f"The capture cannot be read: {error}"]
-    problems = _journal(path) + _manifest(capture)
+    problems = [*_journal(path / "journal.jsonl"), *_manifest(capture)]
     recorded = [r for r in capture.records.values() if r.file is not None]
     for i, record in enumerate(recorded):
         problems += _frame(capture, _now(capture, record))
         progress("verifying frames", (i + 1) / len(recorded))
-    return problems + _absent(capture) + _left_over(path)
+    return [*problems, *_absent(capture), *_left_over(path)]
 
 
-def _journal(path: Path) -> list[str]:
-    journal = path / "journal.jsonl"
+def _journal(journal: Path) -> Iterator[str]:
     if not journal.is_file():
-        return ["journal.jsonl is missing: no frame can be accounted for."]
-    data = journal.read_bytes()
-    if data and not data.endswith(b"\n"):
-        return [
+        yield "journal.jsonl is missing: no frame can be accounted for."
+    elif not (b"\n" + journal.read_bytes()).endswith(b"\n"):
+        yield (
             "journal.jsonl ends in a torn line, as a crash while shooting leaves it: the frame it "
             "was about is not accounted for."
-        ]
-    return []
+        )
 
 
-def _manifest(capture: Capture) -> list[str]:
+def _manifest(capture: Capture) -> Iterator[str]:
     try:
         manifest = capture.manifest
     except json.JSONDecodeError as error:
-        return [f"manifest.json is not JSON: {error}."]
+        yield f"manifest.json is not JSON: {error}."
+        return
     if manifest is None:
-        return ["manifest.json is missing: the capture was not finished."]
-    problems = []
-    if manifest.get("outcome") != "completed":
-        problems.append(f"The capture's outcome is {manifest.get('outcome')!r}, not 'completed'.")
-    files: dict[str, str] = manifest.get("files", {})
-    for name, expected in files.items():
+        yield "manifest.json is missing: the capture was not finished."
+        return
+    if (outcome := manifest.get("outcome")) != "completed":
+        yield f"The capture's outcome is {outcome!r}, not 'completed'."
+    for name, expected in manifest.get("files", {}).items():
         file = capture.path / name
         if not file.is_file():
-            problems.append(f"{name} is missing; the manifest lists it.")
+            yield f"{name} is missing; the manifest lists it."
         elif sha256(file) != expected:
-            problems.append(f"{name} does not match its checksum in the manifest.")
-    return problems + _journal_checksum(capture.path / "journal.jsonl", manifest.get("journal", {}))
-
-
-def _journal_checksum(journal: Path, known: dict[str, Any]) -> list[str]:
+            yield f"{name} does not match its checksum in the manifest."
+    journal, known = capture.path / "journal.jsonl", manifest.get("journal", {})
     if not journal.is_file():
-        return []
-    data = journal.read_bytes()
-    if len(data) < known.get("bytes", 0):
-        return [f"journal.jsonl has {len(data)} bytes, fewer than the manifest's {known['bytes']}."]
-    if hashlib.sha256(data[: known.get("bytes", 0)]).hexdigest() != known.get("sha256"):
-        return ["journal.jsonl does not match its checksum in the manifest."]
-    return []
+        return
+    data, count = journal.read_bytes(), known.get("bytes", 0)
+    if len(data) < count:
+        yield f"journal.jsonl has {len(data)} bytes, fewer than the manifest's {count}."
+    elif hashlib.sha256(data[:count]).hexdigest() != known.get("sha256"):
+        yield "journal.jsonl does not match its checksum in the manifest."
 
 
 def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
@@ -87,25 +80,24 @@ def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
     return record if now.file is None else now
 
 
-def _left_over(path: Path) -> list[str]:
+def _left_over(path: Path) -> Iterator[str]:
     """Files that an interrupted write or compression left; none can be told while one goes on."""
     journal = path / "journal.jsonl"
     if not journal.is_file():
-        return []
+        return
     with journal.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            return []
+            return
         known = {path / r.file for r in Capture(path).records.values() if r.file is not None}
         found = {p for p in path.glob("frames/**/*") if p.is_file()}
     strangers = sorted(str(p.relative_to(path)) for p in found - known)
-    if not strangers:
-        return []
-    return [
-        f"{len(strangers)} files among the frames are in no line of the journal, left by a write "
-        f"or a compression that was interrupted; the first is {strangers[0]}."
-    ]
+    if strangers:
+        yield (
+            f"{len(strangers)} files among the frames are in no line of the journal, left by a "
+            f"write or a compression that was interrupted; the first is {strangers[0]}."
+        )
 
 
 def _frame(capture: Capture, record: FrameRecord) -> list[str]:
@@ -124,14 +116,13 @@ def _frame(capture: Capture, record: FrameRecord) -> list[str]:
         image, _ = read_exr(file)
     except ValueError as error:
         return [f"{what} does not decode: {error}."]
-    if image.shape != (camera.height, camera.width, 3):
-        expected = (camera.height, camera.width, 3)
+    if image.shape != (expected := (camera.height, camera.width, 3)):
         return [f"{what} has the shape {image.shape}, its camera's is {expected}."]
     return []
 
 
-def _absent(capture: Capture) -> list[str]:
-    problems, never = [], []
+def _absent(capture: Capture) -> Iterator[str]:
+    never = []
     for step in capture.steps:
         for camera in capture.rig.cameras:
             if capture.has(step, camera.name):
@@ -140,13 +131,10 @@ def _absent(capture: Capture) -> list[str]:
             if record is None:
                 never.append((step, camera.name))
             else:
-                problems.append(
-                    f"Step {step.index} ({step.kind}), {camera.name} is missing: {record.reason}."
-                )
+                yield f"Step {step.index} ({step.kind}), {camera.name} is missing: {record.reason}."
     if never:
         step, name = never[0]
-        problems.append(
+        yield (
             f"{len(never)} planned frames were never shot; the first is step {step.index} "
             f"({step.kind}), {name}."
         )
-    return problems

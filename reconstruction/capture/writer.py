@@ -149,9 +149,8 @@ class CaptureWriter:
         radiance of one count (0: not quantised). Raises `CaptureError` for a frame of the wrong
         size, with numbers that are not finite, of an unknown step, or written before.
         """
-        record = self.store_frame(
-            step, camera, radiance, full_scale=full_scale, count_scale=count_scale
-        )
+        scales = {"full_scale": full_scale, "count_scale": count_scale}
+        record = self.store_frame(step, camera, radiance, **scales)
         self.commit([record])
         return record
 
@@ -220,15 +219,8 @@ class CaptureWriter:
     ) -> FrameRecord:
         """Journal that a frame did not come and why; a later `write_frame` of it still counts."""
         self._check(step, camera)
-        record = FrameRecord(
-            step.index,
-            camera,
-            None,
-            pulse=pulse,
-            attempt=attempt,
-            recorded=utc_now(),
-            reason=reason,
-        )
+        record = FrameRecord(step.index, camera, None, pulse=pulse, attempt=attempt, reason=reason)
+        record = replace(record, recorded=utc_now())
         self.commit([record])
         return record
 

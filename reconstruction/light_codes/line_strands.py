@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -17,7 +18,7 @@ from reconstruction.light_codes.code_views import View, views_of
 from reconstruction.light_codes.depth_range import depth_range, hair_volume
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.lmvs import LmvsSearch
-from reconstruction.light_codes.search import DepthSearch
+from reconstruction.light_codes.search import DepthMap, DepthSearch
 from reconstruction.light_codes.segments import Segments, count_supports, thinned_lines, to_segments
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import LightCodeOptions
@@ -67,53 +68,46 @@ def build_views(
     return views, volume
 
 
-def measure_segments(
-    masked: MaskedCapture,
-    head: Mesh | None,
+def _depth_maps(
+    views: list[View],
+    volume: VoxelGrid,
     report: Report,
-    *,
-    method: Literal["photometric", "lmvs"] = "photometric",
-    options: LightCodeOptions = LightCodeOptions(),
-    progress: Progress = silent,
-) -> tuple[list[View], Segments]:
-    """The views, and the segments that `least_views` of them (all, if there are fewer) agree on.
-
-    Adds the stages `lightcodes`, `depth` and `segments` to the report. Raises `CaptureError` where
-    there are no two views of hair, or no segment is left.
-    """
-    views, volume = build_views(masked, head, report, options=options, progress=progress)
-    center = volume.centers().mean(axis=0)
+    method: Literal["photometric", "lmvs"],
+    options: LightCodeOptions,
+    progress: Progress,
+) -> list[DepthMap]:
+    """What the search finds in each view; adds the stage `depth` to the report."""
     with report.stage("depth") as stage:
-        search = (
-            DepthSearch(views, center, options.search)
-            if method == "photometric"
-            else LmvsSearch(views, center, options.search)
-        )
+        kind = DepthSearch if method == "photometric" else LmvsSearch
+        search = kind(views, volume.centers().mean(axis=0), options.search)
         maps = []
         for k, view in enumerate(views):
             progress("searching depths", k / len(views))
-            near, far = depth_range(view.camera, volume, options.deepest)
-            maps.append(search.run(k, near, far))
-        found = {v.camera.name: len(m.x) for v, m in zip(views, maps, strict=True)}
-        spreads = np.concatenate([m.spread for m in maps])
-        misfits = np.concatenate([m.misfit for m in maps])
-        agreements = np.concatenate([m.agreement for m in maps])
+            maps.append(search.run(k, *depth_range(view.camera, volume, options.deepest)))
         seen = np.concatenate([m.seen_by for m in maps])
         stage.figures.update(
-            segments=found,
+            segments={v.camera.name: len(m.x) for v, m in zip(views, maps, strict=True)},
             reference_pixels={v.camera.name: int(v.mask.sum()) for v in views},
             visible_neighbours=float(seen.mean()) if len(seen) else 0.0,
-            agreement=_percentiles(agreements),
-            spread=_percentiles(spreads),
-            misfit=_percentiles(misfits),
         )
+        for name in ("agreement", "spread", "misfit"):
+            stage.figures[name] = _percentiles(np.concatenate([getattr(m, name) for m in maps]))
+    return maps
+
+
+def _agreed_segments(
+    views: list[View], maps: list[DepthMap], least: int, report: Report, path: Path
+) -> Segments:
+    """Those that `least` views agree on; adds the stage `segments` to the report."""
     with report.stage("segments") as stage:
-        segments = to_segments(views, maps)
         segments = count_supports(
-            views, maps, segments, distance=SUPPORT_DISTANCE, angle_deg=SUPPORT_ANGLE_DEG
+            views,
+            maps,
+            to_segments(views, maps),
+            distance=SUPPORT_DISTANCE,
+            angle_deg=SUPPORT_ANGLE_DEG,
         )
         supports = np.bincount(segments.supports, minlength=len(views) + 1)
-        least = min(options.least_views, len(views))
         kept = segments.subset(segments.supports >= least)
         stage.figures.update(
             found=len(segments),
@@ -122,11 +116,11 @@ def measure_segments(
         )
         if not len(kept):
             raise CaptureError(
-                f"{masked.capture.path}: no segment of {len(segments)} is found alike in "
-                f"{least} of {len(views)} views: more cameras with overlapping "
-                "views, sharper or finer pictures, or a lower least_views may help"
+                f"{path}: no segment of {len(segments)} is found alike in {least} of {len(views)} "
+                "views: more cameras with overlapping views, sharper or finer pictures, or a lower "
+                "least_views may help"
             )
-    return views, kept
+    return kept
 
 
 def connect_segments(views: list[View], segments: Segments, report: Report) -> list[Array]:
@@ -163,11 +157,14 @@ def line_strands(
     """Polylines `(N, 3)` from line stereo, the end that is nearer to the head first.
 
     Without a head it is the higher end. None of them is rooted. Also the segments that they come
-    from. Raises `CaptureError` as `measure_segments` does.
+    from: those that `least_views` of the views (all, if there are fewer) agree on. Adds the stages
+    `lightcodes`, `depth`, `segments` and `connection` to the report. Raises `CaptureError` where
+    there are no two views of hair, or no segment is left.
     """
-    views, segments = measure_segments(
-        masked, head, report, method=method, options=options, progress=progress
-    )
+    views, volume = build_views(masked, head, report, options=options, progress=progress)
+    maps = _depth_maps(views, volume, report, method, options, progress)
+    least = min(options.least_views, len(views))
+    segments = _agreed_segments(views, maps, least, report, masked.capture.path)
     return _roots_first(connect_segments(views, segments, report), head), segments
 
 

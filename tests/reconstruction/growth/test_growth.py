@@ -50,8 +50,7 @@ def drift(method: Method, step: float) -> float:
     """How far a strand strays from its circle of 12 mm radius over half a turn, metres."""
     field = analytic(circles, (61, 61, 5), 5e-4)
     start, along = np.array([[12e-3, 0, 0]]), np.array([[0, 1.0, 0]])
-    paths = trace(field, start, along, Tracing(step, np.pi * 12e-3, method))
-    end = paths.points[paths.counts[0] - 1, 0]
+    end = trace(field, start, along, Tracing(step, np.pi * 12e-3, method))[0][-1]
     assert paths.counts[0] > 5
     return abs(float(np.linalg.norm(end[:2])) - 12e-3)
 
