@@ -28,9 +28,8 @@ from reconstruction.head.capture_head import (
     fit_capture_head,
     skin_points,
 )
-from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
-from reconstruction.head.scalp_map import ScalpMap
+from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.line_strands import line_strands, merge
 from reconstruction.light_codes.segments import Segments

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.calibration.calibration_error import CalibrationError
 
-PER_SQUARE = 64
-"""Pixels along a square of the print that pictures are compared with."""
+PER_SQUARE = 64  # pixels along a square of the print that pictures are compared with
+
+
+class CalibrationError(ValueError):
+    """Captures that do not determine what is asked; says which, why, and what to shoot."""
 
 
 @dataclass(frozen=True, eq=False)

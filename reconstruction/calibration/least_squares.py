@@ -37,8 +37,7 @@ class Solution:
         return np.sqrt(np.diag(self.covariance))
 
 
-OPEN = 1e-12
-"""A conditioning below which a direction counts as open."""
+OPEN = 1e-12  # a conditioning below which a direction counts as open
 
 
 def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:

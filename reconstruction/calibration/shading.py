@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.calibration.least_squares import minimise
 from reconstruction.calibration.solve_lights import LOOSE, CalibratedLight
 from reconstruction.geometry.lights import Light

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import Board, CalibrationError, Sighting
 from reconstruction.calibration.shading import refine_centres, shaded_light, with_intensity
 from reconstruction.calibration.solve_cameras import CameraSolution, calibrate_cameras
 from reconstruction.calibration.solve_lights import CalibratedLight, mirrored_lights

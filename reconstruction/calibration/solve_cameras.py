@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 
 from reconstruction.arrays import Array, Ints
-from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import Board, CalibrationError, Sighting
 from reconstruction.calibration.least_squares import Solution, minimise
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rigid_motion import Rigid, align_devices

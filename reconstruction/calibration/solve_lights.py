@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from reconstruction.arrays import Array
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.calibration.least_squares import Solution, minimise
 from reconstruction.calibration.spheres import Highlight, crossing, mirrored
 from reconstruction.geometry.cameras import Camera

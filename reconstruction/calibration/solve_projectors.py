@@ -16,15 +16,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.calibration.boards import Board
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import Board, CalibrationError
 from reconstruction.calibration.least_squares import Linearised, Solution, minimise, numeric
-from reconstruction.calibration.light_response import dark_response
 from reconstruction.calibration.solve_cameras import CameraSolution
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rigid_motion import Rigid
+from reconstruction.images.silhouettes import dark_response
 from reconstruction.light_planes.peaks import find_peaks
 
 MOST = 20_000  # points: more do not make it better

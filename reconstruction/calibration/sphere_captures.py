@@ -8,14 +8,18 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from reconstruction.arrays import Array, Ints
-from reconstruction.calibration.calibration_error import CalibrationError
-from reconstruction.calibration.light_response import light_response
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.calibration.shading import Shading
 from reconstruction.calibration.solve_lights import Glint
 from reconstruction.calibration.spheres import find_highlight, find_outline, sphere_centre
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
-from reconstruction.images.silhouettes import NoSilhouette, background_noise, lit_image
+from reconstruction.images.silhouettes import (
+    NoSilhouette,
+    background_noise,
+    light_response,
+    lit_image,
+)
 
 Samples = tuple[Array, Array, Ints, Array, Array]
 

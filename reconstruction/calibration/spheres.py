@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.calibration.least_squares import minimise, numeric
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import background_noise

@@ -26,11 +26,8 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.report.report import Progress, silent
 
-ROOTED = 5e-3
-"""Metres: a strand that ends this near the scalp reaches it."""
-
-OTHER_UNITS = 10.0
-"""Sizes that differ by this factor are hardly those of one head."""
+ROOTED = 5e-3  # metres: a strand that ends this near the scalp reaches it
+OTHER_UNITS = 10.0  # sizes that differ by this factor are hardly those of one head
 
 
 class Nearest:

@@ -19,23 +19,16 @@ from reconstruction.arrays import Floats, Ints
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.strands import Resampling, Strands
 
-STEP = 1e-3
-"""Metres between the points."""
-
-BLOCK = 250_000
-"""Points that are made together, whole strands: a longer one makes a longer block."""
-
+STEP = 1e-3  # metres between the points
+BLOCK = 250_000  # points that are made together, whole strands: a longer one makes a longer block
 MOST_POINTS = 300_000_000
 """Four times what 150,000 strands of half a metre have: more is another unit of length."""
 
-MOST_OF_ONE = 1_000_000
-"""Points of one strand, which are in memory together."""
-
+MOST_OF_ONE = 1_000_000  # points of one strand, which are in memory together
 MOST_PAIRS = 4_000_000
 """Neighbour pairs that are looked at together: bounds the memory, not the answer."""
 
-OVERSAMPLING = 5
-"""Points that are tested for visibility, for each visible one that is wanted."""
+OVERSAMPLING = 5  # points that are tested for visibility, for each visible one that is wanted
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,7 @@ from reconstruction.head.scalp_map import sphere_center
 
 SCALP = ("front", "top", "sides", "back", "nape")
 DEPTHS = ("outer", "inner")
-
-INNER = 5e-3
-"""Metres below the hair's surface where the inner hair begins."""
-
+INNER = 5e-3  # metres below the hair's surface where the inner hair begins
 _VOXEL = 2e-3
 MOST_VOXELS = 8_000_000
 _CLOSED = 2.5

@@ -12,9 +12,7 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.strands import Resampling, Strands
 
-NARROWEST, WIDEST = 5e-4, 1e-3
-"""Limits, in metres, of the width that a strand hides with."""
-
+NARROWEST, WIDEST = 5e-4, 1e-3  # limits, in metres, of the width that a strand hides with
 MOST_PIXELS = 64_000_000
 CHUNK = 200_000
 

@@ -11,12 +11,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-PART = ".part-"
-"""What the names of files begin with that are not whole yet."""
-
-PAGE = 4096
-"""Bytes; what goes past the page cache starts and ends on a multiple of it."""
-
+PART = ".part-"  # what the names of files begin with that are not whole yet
+PAGE = 4096  # bytes; what goes past the page cache starts and ends on a multiple of it
 RESERVE = 256 << 20
 """Bytes that stay free: for what is under way on other threads, the manifest, the jobs' records."""
 

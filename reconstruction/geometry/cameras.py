@@ -98,10 +98,7 @@ class Pinhole:
         xy = local[..., :2] / np.where(np.abs(z) < 1e-12, 1e-12, z)[..., None]
         x, y = self._through_lens(xy[..., 0], xy[..., 1])
         pixels = np.stack(
-            [
-                self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2],
-                self.K[1, 1] * y + self.K[1, 2],
-            ],
+            [self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]],
             axis=-1,
         )
         return pixels, z

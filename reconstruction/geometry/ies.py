@@ -230,12 +230,7 @@ def _type_c(
 
 
 def _type_a_or_b(
-    name: str,
-    vertical: Array,
-    horizontal: Array,
-    values: Array,
-    photometry: Photometry,
-    unit: Unit,
+    name: str, vertical: Array, horizontal: Array, values: Array, photometry: Photometry, unit: Unit
 ) -> LightProfile:
     """Both sides of the vertical plane where only one is given; dark beyond the table."""
     if horizontal[0] == 0:

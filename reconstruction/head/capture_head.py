@@ -21,14 +21,11 @@ from reconstruction.masks import MaskedCapture, distance_to
 from reconstruction.report.report import Stage
 from reconstruction.tangents.reflection import surface_normals
 
-FEWEST_SKIN = 300
-"""Cells with a point of skin under which a head is not guessed from them."""
-
+FEWEST_SKIN = 300  # cells with a point of skin under which a head is not guessed from them
 _CELL = 3e-3
 _INSIDE = 4e-3
 _AMBIGUOUS = 0.2
-_HAIR = 0.015
-"""Metres of hair over the scalp, roughly."""
+_HAIR = 0.015  # metres of hair over the scalp, roughly
 _CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
 """Metres: a crown that shows where the head is; from hair to mouth or chin; half a head's depth."""
 

@@ -24,8 +24,7 @@ from reconstruction.head.pose import (
 )
 from reconstruction.head.shape import deform
 
-FEWEST = 10
-"""Points under which no head is fitted: a pose alone has seven unknowns."""
+FEWEST = 10  # points under which no head is fitted: a pose alone has seven unknowns
 
 Part = Literal["head", "above chin", "scalp"]
 _SCALES = (0.7, 1.4)
@@ -196,9 +195,7 @@ def _faces(template: Mesh, part: str) -> Bools:
 
 
 def _with(
-    points: Array,
-    normals: Array | None,
-    guides: tuple[AnyFloats, AnyFloats] | None,
+    points: Array, normals: Array | None, guides: tuple[AnyFloats, AnyFloats] | None
 ) -> tuple[Array, Array | None]:
     if guides is None:
         return points, normals

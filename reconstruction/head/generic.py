@@ -16,9 +16,7 @@ from reconstruction.geometry.signed_distance import blend, capsule, carve, ellip
 HEAD_BOX = np.array([[-0.15, -0.19, -0.20], [0.15, 0.19, 0.19]])
 """Corners `(2, 3)` of a box, metres, that holds the head with room around it."""
 
-NECK_END = -0.165
-"""Height, metres, at which the neck is cut flat."""
-
+NECK_END = -0.165  # height, metres, at which the neck is cut flat
 _CELL = 0.005  # mesh cells: ears and lips survive, and a ray tracer is spared needless triangles
 # Height of the hairline over the front-back coordinate: forehead, temple, sideburn, ear, nape.
 _HAIRLINE = PchipInterpolator(

@@ -22,17 +22,12 @@ from reconstruction.head.pose import SurfaceSamples, tukey
 _NEAR = 8
 
 
-HANDLES = 200
-"""That carry the displacement."""
-
+HANDLES = 200  # that carry the displacement
 STIFFNESS = (10.0, 1.0, 0.1, 0.01)
 """Penalties on the difference of neighbouring handles against the mean squared distance."""
 
-ROUNDS = 4
-"""Of finding nearest points, under each stiffness."""
-
-ANCHOR = 1e-3
-"""Penalty on displacement as such, which fades it out where there are no points."""
+ROUNDS = 4  # of finding nearest points, under each stiffness
+ANCHOR = 1e-3  # penalty on displacement as such, which fades it out where there are no points
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +63,7 @@ class Handles:
         return sparse.csr_array((w.ravel(), (row, near.ravel())), shape=(len(points), len(self.at)))
 
 
-def deform(
-    mesh: Mesh,
-    faces: Bools,
-    points: Array,
-    normals: Array | None,
-    size: float,
-) -> Mesh:
+def deform(mesh: Mesh, faces: Bools, points: Array, normals: Array | None, size: float) -> Mesh:
     """The posed `mesh` deformed smoothly: its `faces (F,) bool` lie on `points (N, 3)`.
 
     `size` is the head's radius in the points' unit.

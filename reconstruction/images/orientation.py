@@ -13,12 +13,10 @@ from scipy import fft, ndimage
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.reconstruct_options import LogGaborBank
 
-_FAINTEST = 1e-5
-"""Relative detail that is rounding in single precision and not texture."""
+_FAINTEST = 1e-5  # relative detail that is rounding in single precision and not texture
 
 
-BANDWIDTH = float(np.log(2))
-"""σ_λ of every filter, natural logarithm."""
+BANDWIDTH = float(np.log(2))  # σ_λ of every filter, natural logarithm
 
 
 def filters(bank: LogGaborBank, height: int, width: int) -> Iterator[Floats]:
@@ -86,8 +84,7 @@ def _answer(bank: LogGaborBank, image: Floats, out: Floats) -> None:
         np.abs(answer, out=out[k])
 
 
-_NEGLIGIBLE = 1e-6
-"""Of a filter's peak: what lies below is single precision's rounding."""
+_NEGLIGIBLE = 1e-6  # of a filter's peak: what lies below is single precision's rounding
 
 
 @lru_cache(maxsize=4)
@@ -135,9 +132,7 @@ def texture(image: AnyFloats, mask: Bools, scale: float = 4.0) -> Floats:
 
 
 def orientations(
-    images: AnyFloats,
-    mask: Bools,
-    bank: LogGaborBank = LogGaborBank(),
+    images: AnyFloats, mask: Bools, bank: LogGaborBank = LogGaborBank()
 ) -> OrientationMap:
     """The orientation at every pixel of `mask (H, W)` from `images (N, H, W)`, one per lighting.
 

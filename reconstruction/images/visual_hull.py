@@ -13,9 +13,7 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.voxels import VoxelGrid
 
-BLOCK = 8
-"""Voxels along the edge of the blocks that are carved as a whole before single voxels are."""
-
+BLOCK = 8  # voxels along the edge of the blocks that are carved as a whole before single voxels are
 MOST_VOXELS = 400_000_000
 
 

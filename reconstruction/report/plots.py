@@ -155,11 +155,7 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
     for axes in grid[len(kinds) :]:
         axes.remove()
     figure.suptitle(
-        f"{_words(stage)}: error against run time",
-        x=0.01,
-        ha="left",
-        fontsize=11,
-        **_BOLD,
+        f"{_words(stage)}: error against run time", x=0.01, ha="left", fontsize=11, **_BOLD
     )
     return figure
 

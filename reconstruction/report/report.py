@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from reconstruction.files.durable import write_json
-from reconstruction.report.memory import peak_memory
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share that is done, 0 to 1."""
@@ -20,6 +19,43 @@ Progress = Callable[[str, float], None]
 
 def silent(_what: str, _share: float) -> None:
     """A `Progress` that tells nobody."""
+
+
+_RESET, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+
+
+@dataclass(eq=False)
+class Peak:
+    """`gb`: resident memory of the whole process at its peak, GB; None where it is not known."""
+
+    gb: float | None = None
+
+
+_open: list[Peak] = []
+
+
+@contextmanager
+def peak_memory() -> Iterator[Peak]:
+    """Measure the block; blocks may hold others, but not run on several threads."""
+    _note()  # what came before belongs to the blocks around this one
+    peak = Peak()
+    _open.append(peak)
+    with suppress(OSError):
+        _RESET.write_text("5")
+    try:
+        yield peak
+    finally:
+        _note()
+        _open.remove(peak)
+
+
+def _note() -> None:
+    with suppress(OSError):
+        for line in _STATUS.read_text().splitlines() if _open else ():
+            if line.startswith("VmHWM"):
+                now = int(line.split()[1]) * 1024 / 1e9
+                for peak in _open:
+                    peak.gb = max(peak.gb or 0.0, now)
 
 
 @dataclass

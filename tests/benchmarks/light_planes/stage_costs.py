@@ -15,7 +15,7 @@ from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.light_planes import TriangulateOptions, sweep_peaks, triangulate
-from reconstruction.report.memory import peak_memory
+from reconstruction.report.report import peak_memory
 from reconstruction.tangents.estimate import Measured
 
 

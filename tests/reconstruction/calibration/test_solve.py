@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from reconstruction import Capture, Rig
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.calibration.solve import TargetCaptures, calibrate
 from stage_service.cli import main
 from stage_service.config import load_rig_file

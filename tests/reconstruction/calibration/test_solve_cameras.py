@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruction import Camera, Rig
-from reconstruction.calibration.boards import Board, Sighting
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import Board, CalibrationError, Sighting
 from reconstruction.calibration.rig_comparison import compare_rigs
 from reconstruction.calibration.solve_cameras import calibrate_cameras
 from reconstruction.geometry.cameras import facing

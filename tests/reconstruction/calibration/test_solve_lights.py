@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reconstruction import Capture, Rig
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.calibration.shading import Shading, refine_centres, shaded_light
 from reconstruction.calibration.solve_lights import Glint, mirrored_lights
 from reconstruction.calibration.sphere_captures import gather_shading, glints_of

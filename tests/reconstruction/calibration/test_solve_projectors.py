@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from reconstruction import Capture, Projector, Rig
-from reconstruction.calibration.boards import Board
-from reconstruction.calibration.calibration_error import CalibrationError
+from reconstruction.calibration.boards import Board, CalibrationError
 from reconstruction.calibration.solve_cameras import CameraSolution
 from reconstruction.calibration.solve_projectors import (
     DecodedRows,

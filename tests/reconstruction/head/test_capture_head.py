@@ -30,9 +30,8 @@ from reconstruction.head.capture_head import (
 )
 from reconstruction.head.fit import HeadFitError
 from reconstruction.head.generic import generic_head
-from reconstruction.head.root_map import write_root_map
 from reconstruction.head.scalp import find_scalp, sample_roots
-from reconstruction.head.scalp_map import ScalpMap
+from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.head.template import template
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask, MaskedCapture
