@@ -45,8 +45,7 @@ class Board:
     dictionary: str = "DICT_4X4_50"
 
     def __post_init__(self) -> None:
-        number = getattr(cv2.aruco, self.dictionary, None)
-        if not self.dictionary.startswith("DICT_") or number is None:
+        if not (self.dictionary.startswith("DICT_") and hasattr(cv2.aruco, self.dictionary)):
             raise CalibrationError(
                 f"board: OpenCV has no dictionary {self.dictionary!r}; one is 'DICT_4X4_50'"
             )
@@ -55,11 +54,11 @@ class Board:
                 f"board: expected 3 × 3 squares or more, markers smaller than squares, got "
                 f"{self.columns} × {self.rows}, squares {self.square} m, markers {self.marker} m"
             )
-        most = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
-        if self.columns * self.rows // 2 > most:
+        most, need = len(self._dictionary.bytesList), self.columns * self.rows // 2
+        if need > most:
             raise CalibrationError(
-                f"board: {self.columns} × {self.rows} squares need {self.columns * self.rows // 2} "
-                f"markers, {self.dictionary} has {most}"
+                f"board: {self.columns} × {self.rows} squares need {need} markers, "
+                f"{self.dictionary} has {most}"
             )
 
     @cached_property
@@ -79,37 +78,37 @@ class Board:
 
     def ink(self, points: ArrayLike) -> Bools:
         """Whether board points `(..., 2)` are inked; beyond the picture they are not."""
-        picture = self.picture()
-        at = np.floor(np.asarray(points, float) * (PER_SQUARE / self.square)).astype(int)
-        inside = np.asarray(((at >= 0) & (at < picture.shape[::-1])).all(axis=-1))
-        at = np.where(inside[..., None], at, 0)
-        return np.asarray(inside) & (picture[at[..., 1], at[..., 0]] < 128)
+        return self._look_up(self.picture() < 128, points, 0)
 
     def plain(self, points: ArrayLike, margin: float) -> Bools:
         """Whether board points `(..., 2)` are `margin` metres or more inside one colour."""
         ink = (self.picture() < 128).astype(np.uint8)
         reach = int(np.ceil(margin * PER_SQUARE / self.square))
         kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-        one = cv2.dilate(ink, kernel) == cv2.erode(ink, kernel)
+        return self._look_up(cv2.dilate(ink, kernel) == cv2.erode(ink, kernel), points, reach)
+
+    def _look_up(self, picture: Bools, points: ArrayLike, border: int) -> Bools:
+        """`picture (H, W)` at board points `(..., 2)`; false within `border` pixels of its edge."""
         at = np.floor(np.asarray(points, float) * (PER_SQUARE / self.square)).astype(int)
-        inside = np.asarray(((at >= reach) & (at < np.array(ink.shape[::-1]) - reach)).all(axis=-1))
+        end = np.array(picture.shape[::-1]) - border
+        inside = np.asarray(((at >= border) & (at < end)).all(axis=-1))
         at = np.where(inside[..., None], at, 0)
-        return np.asarray(inside & one[at[..., 1], at[..., 0]])
+        return np.asarray(inside & picture[at[..., 1], at[..., 0]])
 
     def find(self, image: ArrayLike) -> Sighting:
         """The corners seen in a linear grey `image (H, W)`; none where the board is not seen."""
         grey = np.asarray(image, np.float64)
+        none = Sighting(np.zeros(0, np.int64), np.zeros((0, 2)))
         white = float(np.percentile(grey, 99.5))
         if not white > 0:
-            return Sighting(np.zeros(0, np.int64), np.zeros((0, 2)))
+            return none
         # a square root spreads the dark squares' noise less than the eye's gamma would
         eight = np.rint(255 * np.sqrt(np.clip(grey / white, 0, 1))).astype(np.uint8)
         corners, ids, _, _ = self._detector.detectBoard(eight)
         if ids is None or not len(ids):
-            return Sighting(np.zeros(0, np.int64), np.zeros((0, 2)))
-        rough = Sighting(
-            np.asarray(ids, np.int64).ravel(), np.asarray(corners, np.float64).reshape(-1, 2)
-        )
+            return none
+        ids, corners = np.asarray(ids, np.int64).ravel(), np.asarray(corners, np.float64)
+        rough = Sighting(ids, corners.reshape(-1, 2))
         return self._refined(grey / white, rough) if len(rough) >= 6 else rough
 
     def _refined(self, image: Array, rough: Sighting) -> Sighting:
@@ -155,20 +154,21 @@ class Board:
         good &= np.linalg.norm(at - rough.pixels, axis=1) < 1.5
         return Sighting(rough.ids[good], at[good])
 
+    @property
+    def _dictionary(self) -> Any:
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+
     @cached_property
     def _opencv(self) -> Any:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard(
-            (self.columns, self.rows), self.square, self.marker, dictionary
-        )
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square, self.marker, self._dictionary)
 
     @cached_property
     def _detector(self) -> Any:
         markers = cv2.aruco.DetectorParameters()
         markers.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        return cv2.aruco.CharucoDetector(
-            self._opencv, cv2.aruco.CharucoParameters(), markers, cv2.aruco.RefineParameters()
-        )
+        others = cv2.aruco.CharucoParameters(), markers, cv2.aruco.RefineParameters()
+        return cv2.aruco.CharucoDetector(self._opencv, *others)
 
 
 def _mapped(H: Array, points: Array) -> Array:

@@ -57,19 +57,11 @@ def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:
                 last[key] = function(x)
         return last[key]
 
-    found = least_squares(
-        lambda x: at(x)[0],
-        x,
-        jac=lambda x: at(x)[1],
-        x_scale="jac",
-        loss="huber",
-        f_scale=huber,
-        ftol=1e-12,
-        xtol=1e-12,
-        gtol=1e-12,
-        max_nfev=200,
-        tr_options={"atol": 1e-12, "btol": 1e-12} if sparse.issparse(at(x)[1]) else {},
-    )
+    limits: dict[str, Any] = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12, "max_nfev": 200}
+    if sparse.issparse(at(x)[1]):
+        limits["tr_options"] = {"atol": 1e-12, "btol": 1e-12}
+    scaled = {"x_scale": "jac", "loss": "huber", "f_scale": huber}
+    found = least_squares(lambda x: at(x)[0], x, jac=lambda x: at(x)[1], **scaled, **limits)
     return _solution(found.x, *at(found.x), huber)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from reconstruction.arrays import Array
 from reconstruction.calibration.least_squares import minimise, numeric
@@ -30,12 +31,13 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
         off = np.linalg.norm(ours.project(ball)[0] - true.project(ball)[0], axis=1)
         cameras[c.name] = {
             "reprojection_px": [float(off.mean()), float(off.max())],
-            **_pose(ours, true),
+            "centre_mm": 1e3 * float(np.linalg.norm(ours.center - true.center)),
+            "turn_deg": _turn_deg(ours, true),
         }
-    projectors = {}
-    for p in found.projectors:
-        mine, its = frame.inverse().seen_by(p), truth.projector(p.name)
-        projectors[p.name] = _rows(mine, its, ball)
+    projectors = {
+        p.name: _rows(frame.inverse().seen_by(p), truth.projector(p.name), ball)
+        for p in found.projectors
+    }
     lights = {}
     for light in found.lights:
         place, real = frame(light.position), truth.light(light.name)
@@ -70,19 +72,8 @@ def _ball() -> Array:
     return np.asarray(0.1 * rng.uniform(size=(500, 1)) ** (1 / 3) * way)
 
 
-def _pose(ours: Pinhole, true: Pinhole) -> dict[str, float]:
-    return {
-        "centre_mm": 1e3 * float(np.linalg.norm(ours.center - true.center)),
-        "turn_deg": _turn_deg(ours, true),
-    }
-
-
 def _turn_deg(ours: Pinhole, true: Pinhole) -> float:
-    skew = ours.R @ true.R.T
-    sine = np.linalg.norm(
-        [skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]
-    )
-    return float(np.degrees(np.arctan2(sine, np.trace(skew) - 1)))
+    return float(np.degrees(Rotation.from_matrix(ours.R @ true.R.T).magnitude()))
 
 
 def _rows(ours: Projector, true: Projector, ball: Array) -> dict[str, float]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.boards import CalibrationError
-from reconstruction.calibration.least_squares import minimise
+from reconstruction.calibration.least_squares import minimise, numeric
 from reconstruction.calibration.solve_lights import LOOSE, CalibratedLight
 from reconstruction.geometry.lights import Light
 
@@ -61,11 +61,8 @@ class Shading:
 
     def thinned(self, every: int) -> Shading:
         """One in `every` pixels."""
-        picked = {
-            f: getattr(self, f)[::every]
-            for f in ("eyes", "rays", "sphere", "radiance", "deviation")
-        }
-        return replace(self, **picked)
+        fields = ("eyes", "rays", "sphere", "radiance", "deviation")
+        return replace(self, **{f: getattr(self, f)[::every] for f in fields})
 
     def form(self, light: Light) -> Array:
         """Radiance `(N,)` that `light` would give at an intensity of 1."""
@@ -186,17 +183,9 @@ def _derivatives(shading: Shading, light: Light) -> tuple[Array, Array]:
         moved = replace(shading, centres=centres)
         return strength * moved.form(replace(light, position=place))[use] / error
 
-    columns = []
-    for step in 1e-6 * np.eye(3):
-        ahead = model(light.position + step, shading.centres)
-        columns.append((ahead - model(light.position - step, shading.centres)) / 2e-6)
-    now = model(light.position, shading.centres)
-    columns.append(now)
-    for step in 1e-6 * np.eye(shading.centres.size):
-        d = step.reshape(-1, 3)
-        ahead = model(light.position, shading.centres + d)
-        columns.append((ahead - model(light.position, shading.centres - d)) / 2e-6)
-    return now - grey / error, np.stack(columns, axis=1)
+    here = np.concatenate([light.position, shading.centres.ravel()])
+    now, J = numeric(lambda x: model(x[:3], x[3:].reshape(-1, 3)))(here)
+    return now - grey / error, np.column_stack([J[:, :3], now, J[:, 3:]])
 
 
 def _direction(shading: Shading, lit: Bools) -> Array:

@@ -181,14 +181,14 @@ def _lights(
     progress: Progress,
 ) -> tuple[Light, ...]:
     undetermined: dict[str, str] = {}
-    names = [x.name for x in nominal.lights]
+    by_name = {x.name: x for x in nominal.lights}
+    names = list(by_name)
     shadings = {}
     if captures.diffuse:
         progress("diffuse sphere", 0.7)
-        shadings = gather_shading(
-            captures.diffuse, cameras, targets.diffuse_radius, targets.diffuse_albedo, names
-        )
-        shadings = refine_centres({x.name: x for x in nominal.lights}, shadings)
+        sphere = targets.diffuse_radius, targets.diffuse_albedo
+        shadings = gather_shading(captures.diffuse, cameras, *sphere, names)
+        shadings = refine_centres(by_name, shadings)
         stage.figures["diffuse_centres"] = next(iter(shadings.values())).centres.tolist()
     found: dict[str, CalibratedLight] = {}
     for name, shading in shadings.items():
@@ -204,9 +204,7 @@ def _lights(
                 "mirror sphere: no camera sees a highlight of any single light: are there OLAT "
                 "frames, and is the sphere in view?"
             )
-        by_mirror, centres, rms = mirrored_lights(
-            {x.name: x for x in nominal.lights}, glints, targets.mirror_radius, found
-        )
+        by_mirror, centres, rms = mirrored_lights(by_name, glints, targets.mirror_radius, found)
         for name, one in by_mirror.items():
             found[name] = with_intensity(one, shadings[name]) if name in found else one
         stage.figures.update(

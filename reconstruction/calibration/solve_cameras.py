@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
 
 from reconstruction.arrays import Array, Ints
 from reconstruction.calibration.boards import Board, CalibrationError, Sighting
-from reconstruction.calibration.least_squares import Solution, minimise
+from reconstruction.calibration.least_squares import Solution, minimise, numeric
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rigid_motion import Rigid, align_devices
 
@@ -106,13 +105,12 @@ class _Lens:
 
 def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Lens:
     """The lens with as many numbers as the sightings bear out (Bayesian information criterion)."""
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_LU
     corners = [board.corners[s.ids].astype(np.float32) for s in seen.values()]
     pixels = [s.pixels.astype(np.float32) for s in seen.values()]
     count = 2 * sum(len(p) for p in pixels)
     best: tuple[float, _Lens] | None = None
     for lens in LENSES:
-        fixed = flags
+        fixed = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_LU
         fixed |= 0 if 0 in lens else cv2.CALIB_FIX_K1
         fixed |= 0 if 1 in lens else cv2.CALIB_FIX_K2
         fixed |= 0 if 2 in lens else cv2.CALIB_ZERO_TANGENT_DIST
@@ -143,22 +141,9 @@ def _open_lens(name: str, poses: int, deviation: float) -> CalibrationError:
 
 def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid:
     """Board to camera."""
-    _, turn, shift = cv2.solvePnP(
-        board.corners[sighting.ids],
-        sighting.pixels,
-        lens.matrix(),
-        lens.values[4:],
-        flags=cv2.SOLVEPNP_IPPE,
-    )
-    _, turn, shift = cv2.solvePnP(
-        board.corners[sighting.ids],
-        sighting.pixels,
-        lens.matrix(),
-        lens.values[4:],
-        turn,
-        shift,
-        useExtrinsicGuess=True,
-    )
+    seen = board.corners[sighting.ids], sighting.pixels, lens.matrix(), lens.values[4:]
+    _, turn, shift = cv2.solvePnP(*seen, flags=cv2.SOLVEPNP_IPPE)
+    _, turn, shift = cv2.solvePnP(*seen, turn, shift, useExtrinsicGuess=True)
     return Rigid(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
@@ -278,16 +263,12 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
     found = []
     for k, c in enumerate(nominal):
         lens, pose = bundle.lens(x, k), bundle.camera_pose(x, k)
-        more: dict[str, Any] = {"distortion": lens.values[4:], "filter_sigma": c.filter_sigma}
+        K, R, t = lens.matrix(), pose.rotation, pose.translation
         try:
-            camera = Camera(
-                c.name, c.width, c.height, lens.matrix(), pose.rotation, pose.translation, **more
-            )
+            found.append(replace(c, K=K, R=R, t=t, distortion=lens.values[4:]))
         except ValueError as error:
-            raise CalibrationError(
-                f"{error}: shoot the board into the corners of its picture"
-            ) from error
-        found.append(camera)
+            advice = "shoot the board into the corners of its picture"
+            raise CalibrationError(f"{error}: {advice}") from error
     frame = align_devices(found, nominal)
     residuals, row = {}, 0
     for name in bundle.names:
@@ -312,11 +293,6 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
 
 def _position_deviation(solution: Solution, at: Ints) -> float:
     """Metres, from the covariance of rotation vector and translation."""
-    x, C = solution.x[at], solution.covariance[np.ix_(at, at)]
-    step = 1e-6 * np.eye(6)
-
-    def centre(v: Array) -> Array:
-        return Rigid.from_vector(v).inverse().translation
-
-    J = np.stack([(centre(x + d) - centre(x - d)) / 2e-6 for d in step], axis=1)
+    C = solution.covariance[np.ix_(at, at)]
+    _, J = numeric(lambda v: Rigid.from_vector(v).inverse().translation)(solution.x[at])
     return float(np.sqrt(np.trace(J @ C @ J.T)))

@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.calibration.boards import Board, CalibrationError
-from reconstruction.calibration.least_squares import Linearised, Solution, minimise, numeric
+from reconstruction.calibration.least_squares import Solution, minimise, numeric
 from reconstruction.calibration.solve_cameras import CameraSolution
 from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
@@ -44,9 +44,8 @@ class DecodedRows:
         """All of them; at most `MOST`, evenly taken."""
         if not parts:
             return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-        joined = [
-            np.concatenate([getattr(p, f) for p in parts]) for f in ("points", "row", "deviation")
-        ]
+        columns = zip(*((p.points, p.row, p.deviation) for p in parts), strict=True)
+        joined = [np.concatenate(c) for c in columns]
         every = max(1, -(-len(joined[0]) // MOST))
         return cls(*(a[::every] for a in joined))
 
@@ -112,8 +111,13 @@ def calibrate_projector(nominal: Projector, rows: DecodedRows) -> ProjectorSolut
             f"{where}: {len(rows.row)} points of the board decode, 50 are needed: is the sweep in "
             "the board captures, and does its light reach the board's printed side?"
         )
-    start = _linear(nominal, rows)
-    solution = minimise(_linearised(nominal, rows), start)
+
+    def residual(x: Array) -> Array:
+        p = _projector(nominal, x)
+        local = rows.points @ p.R.T + p.t
+        return (p.K[1, 1] * local[:, 1] / local[:, 2] + p.K[1, 2] - rows.row) / rows.deviation
+
+    solution = minimise(numeric(residual), _linear(nominal, rows))
     loose = _plane_deviation(nominal, solution, rows.points.mean(axis=0))
     if not loose < LOOSE:
         raise CalibrationError(
@@ -122,15 +126,10 @@ def calibrate_projector(nominal: Projector, rows: DecodedRows) -> ProjectorSolut
             f"{LOOSE * 1e3:g} mm): {_shape(rows.points)}; shoot the sweep on boards at several "
             "distances and tilts"
         )
-    weighted = solution.residual * rows.deviation
-    return ProjectorSolution(
-        _projector(nominal, solution.x),
-        len(rows.row),
-        float(np.sqrt(np.mean(weighted**2))),
-        loose,
-        float(solution.deviation[3:5].max()),
-        float(solution.deviation[:3].max()),
-    )
+    rms = float(np.sqrt(np.mean((solution.residual * rows.deviation) ** 2)))
+    axis, turn = (float(solution.deviation[k].max()) for k in (np.s_[3:5], np.s_[:3]))
+    found = _projector(nominal, solution.x)
+    return ProjectorSolution(found, len(rows.row), rms, loose, axis, turn)
 
 
 def _plane_deviation(nominal: Projector, solution: Solution, middle: Array) -> float:
@@ -239,15 +238,6 @@ def _projector(nominal: Projector, x: Array) -> Projector:
     K = nominal.K.copy()
     K[1, 1], K[1, 2] = K[1, 1] * np.exp(x[5]), x[6]
     return replace(nominal, K=K, R=R, t=-R @ center)
-
-
-def _linearised(nominal: Projector, rows: DecodedRows) -> Linearised:
-    def residual(x: Array) -> Array:
-        p = _projector(nominal, x)
-        local = rows.points @ p.R.T + p.t
-        return (p.K[1, 1] * local[:, 1] / local[:, 2] + p.K[1, 2] - rows.row) / rows.deviation
-
-    return numeric(residual)
 
 
 def _linear(nominal: Projector, rows: DecodedRows) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -48,9 +49,8 @@ def gather_shading(
                 outlines[c.name] = find_outline(lit_image(capture, c.name))
             except NoSilhouette:
                 continue
-        centre, covariance = sphere_centre(
-            cameras, outlines, radius, f"diffuse sphere in {capture.path}"
-        )
+        where = f"diffuse sphere in {capture.path}"
+        centre, covariance = sphere_centre(cameras, outlines, radius, where)
         centres.append(centre)
         covariances.append(covariance)
         for c in cameras:
@@ -85,15 +85,12 @@ def glints_of(
 ) -> list[Glint]:
     """Highlights on a mirror sphere in the places of `captures`, of every camera and light."""
     out = []
-    for number, capture in enumerate(captures):
-        for c in cameras:
-            for name in lights:
-                if not capture.has_light(name, c.name):
-                    continue
-                image, saturated = light_response(capture, name, c.name)
-                highlight = find_highlight(image.mean(axis=-1), saturated)
-                if highlight is not None:
-                    out.append(Glint(name, c, number, highlight))
+    for (number, capture), c, name in product(enumerate(captures), cameras, lights):
+        if capture.has_light(name, c.name):
+            image, saturated = light_response(capture, name, c.name)
+            highlight = find_highlight(image.mean(axis=-1), saturated)
+            if highlight is not None:
+                out.append(Glint(name, c, number, highlight))
     return out
 
 
@@ -104,12 +101,9 @@ def _disc(camera: Camera, centre: Array, radius: float) -> tuple[Ints, Array]:
     if not (depth > 0).all():
         return np.zeros((0, 2), np.int64), np.zeros((0, 3))
     limit = (camera.width - 1, camera.height - 1)
-    low, high = (
-        np.clip(np.rint(e), 0, limit).astype(int) for e in (at.min(axis=0), at.max(axis=0))
-    )
-    pixels = np.stack(
-        np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), axis=-1
-    ).reshape(-1, 2)
+    ends = np.clip(np.rint([at.min(axis=0), at.max(axis=0)]), 0, limit).astype(int)
+    sides = (np.arange(low, high + 1) for low, high in ends.T)
+    pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels.astype(float))
     towards = centre - camera.center
     along = rays @ towards

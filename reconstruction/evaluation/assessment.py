@@ -120,11 +120,10 @@ def assess_strands(
     if sphere is None:
         warnings.append("the true roots do not lie on a head: there are no figures by scalp region")
     progress("parts of the hair", 0.8)
-    errors = {"pred": of_pred.figures(), "true": of_true.figures()} if len(pred) else {}
     regions = _region_figures(true, truth, comparison, of_pred, head, sphere)
     figures = {
         **comparison.figures(),
-        "errors": errors,
+        "errors": {"pred": of_pred.figures(), "true": of_true.figures()} if len(pred) else {},
         "lengths": length_figures(pred, true),
         "connectivity": connectivity_figures(follow_pred, follow_true),
         "roots": root_figures(pred, true, head),
@@ -187,11 +186,8 @@ def _region_figures(
     if sphere is not None:
         grows = sphere.scalp_regions(true.roots)
         kinds["scalp"] = SCALP, grows[of_pred.strand], grows[recall.drawn.strand]
-    kinds["depth"] = (
-        DEPTHS,
-        depth.regions(precision.drawn.points),
-        depth.regions(recall.drawn.points),
-    )
+    mine, theirs = (depth.regions(matches.drawn.points) for matches in (precision, recall))
+    kinds["depth"] = DEPTHS, mine, theirs
     return {
         kind: {
             name: {

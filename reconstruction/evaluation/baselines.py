@@ -56,9 +56,7 @@ def baseline_hull(
 
 def hull_vertical(hull: VoxelGrid) -> Strands:
     """The hull filled with vertical lines, `SPACING` metres apart, upper ends first."""
-    low = hull.origin - hull.spacing / 2
-    size = hull.spacing * np.array(hull.inside.shape)
-    x, y = (low[a] + np.arange(SPACING / 2, size[a], SPACING) for a in (0, 1))
+    low, (x, y, _) = _lattice(hull)
     columns = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     i, j = hull.index(np.column_stack([columns, np.full(len(columns), low[2])])).T[:2]
     inside = np.pad(hull.inside[i, j], ((0, 0), (1, 1))).astype(np.int8)
@@ -66,9 +64,14 @@ def hull_vertical(hull: VoxelGrid) -> Strands:
     top = np.nonzero(np.diff(inside, axis=1) == -1)[1]
     ends = np.empty((len(column), 2, 3))
     ends[:, :, :2] = columns[column][:, None]
-    ends[:, 0, 2] = low[2] + hull.spacing * top
-    ends[:, 1, 2] = low[2] + hull.spacing * bottom
+    ends[:, :, 2] = low[2] + hull.spacing * np.stack([top, bottom], axis=1)
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
+
+
+def _lattice(hull: VoxelGrid) -> tuple[Array, list[Array]]:
+    """The hull's lowest corner `(3,)`, and coordinates `SPACING` apart along each axis."""
+    low, size = hull.origin - hull.spacing / 2, hull.spacing * np.array(hull.inside.shape)
+    return low, [low[a] + np.arange(SPACING / 2, size[a], SPACING) for a in range(3)]
 
 
 def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
@@ -80,10 +83,7 @@ def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
     """
     points, tangents = _descent(hull, inside_mesh(hull, head) if head is not None else None)
     field, _ = solve_field(hull, points, tangents)
-    low = hull.origin - hull.spacing / 2
-    size = hull.spacing * np.array(hull.inside.shape)
-    axes = [low[a] + np.arange(SPACING / 2, size[a], SPACING) for a in range(3)]
-    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    lattice = np.stack(np.meshgrid(*_lattice(hull)[1], indexing="ij"), axis=-1).reshape(-1, 3)
     lattice = lattice[hull.contains(lattice)]
     direction, there = field.sample(lattice, np.broadcast_to(DOWN, lattice.shape))
     center, half = lattice[there], direction[there] * SPACING / 2

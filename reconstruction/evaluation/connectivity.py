@@ -23,11 +23,8 @@ PERCENTILES = (5, 25, 50, 75, 95)
 
 def spread(values: Array) -> dict[str, float]:
     """Mean and percentiles of `values (N,)`, n > 0: `mean`, `p5`, `p25`, `p50`, `p75`, `p95`."""
-    marks = np.percentile(values, PERCENTILES)
-    return {
-        "mean": float(values.mean()),
-        **{f"p{p}": float(v) for p, v in zip(PERCENTILES, marks, strict=True)},
-    }
+    marks = zip(PERCENTILES, np.percentile(values, PERCENTILES), strict=True)
+    return {"mean": float(values.mean()), **{f"p{p}": float(v) for p, v in marks}}
 
 
 def length_figures(pred: Strands, true: Strands) -> dict[str, Any]:
@@ -141,22 +138,17 @@ def connectivity_figures(pred: Followed | None, true: Followed) -> dict[str, Any
     """
     out: dict[str, Any] = {"lies_on": LIES_ON.name, "true": {"followed": len(true.strands)}}
     fragments = true.fragments()
-    for name, values in (
-        ("by_one", true.shares()),
-        ("covered", true.covered()),
-        ("covering", true.covering()),
-        ("fragments", fragments[fragments > 0]),
-    ):
+    figures = {"by_one": true.shares(), "covered": true.covered(), "covering": true.covering()}
+    for name, values in {**figures, "fragments": fragments[fragments > 0]}.items():
         if len(values):
-            out["true"][name] = {**spread(values), "error": _error(values, true.complete)}
+            out["true"][name] = _spread_and_error(values, true.complete)
     if pred is not None:
-        shares = pred.shares()
-        on_one = {**spread(shares), "error": _error(shares, pred.complete)}
+        on_one = _spread_and_error(pred.shares(), pred.complete)
         out["pred"] = {"followed": len(pred.strands), "on_one": on_one}
     return out
 
 
-def _error(values: Array, complete: bool) -> float:
-    if complete or len(values) < 2:
-        return 0.0
-    return float(values.std(ddof=1) / np.sqrt(len(values)))
+def _spread_and_error(values: Array, complete: bool) -> dict[str, float]:
+    sampled = not complete and len(values) > 1
+    error = float(values.std(ddof=1) / np.sqrt(len(values))) if sampled else 0.0
+    return {**spread(values), "error": error}

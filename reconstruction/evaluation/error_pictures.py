@@ -41,17 +41,13 @@ def draw_errors(assessment: Assessment, folder: str | Path) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     sets = {"predicted": assessment.pred, "true": assessment.true}
+    distances = {name: (s, 1e3 * s.distance) for name, s in sets.items()}
+    angles = {name: (s, s.angle_deg) for name, s in sets.items()}
     pictures = {
         "distance": _views(
-            {name: (s, 1e3 * s.distance) for name, s in sets.items()},
-            STEPS_MM,
-            "millimetres to the nearest point of the other set",
+            distances, STEPS_MM, "millimetres to the nearest point of the other set"
         ),
-        "angle": _views(
-            {name: (s, s.angle_deg) for name, s in sets.items()},
-            STEPS_DEG,
-            "degrees between the tangents there",
-        ),
+        "angle": _views(angles, STEPS_DEG, "degrees between the tangents there"),
         "regions": _regions(assessment.figures["regions"]),
         "lengths": _lengths(assessment),
     }
@@ -73,15 +69,9 @@ def _views(
             towards = points @ np.cross(right, up)
             order = np.argsort(towards)  # what is nearer hides what is behind it
             order = order[towards[order] > 0]
-            shown = axes.scatter(
-                points[order] @ right,
-                points[order] @ up,
-                2.0,
-                np.minimum(values[order], 2 * steps[-1]),
-                cmap=colours,
-                norm=norm,
-                linewidths=0,
-            )
+            x, y, colour = points[order] @ right, points[order] @ up, values[order]
+            colour = np.minimum(colour, 2 * steps[-1])
+            shown = axes.scatter(x, y, 2.0, colour, cmap=colours, norm=norm, linewidths=0)
             axes.set(xlim=(-1, 1), ylim=(-1, 1), xticks=[], yticks=[], aspect="equal")
             axes.spines[:].set_visible(False)
             if name == next(iter(sets)):
@@ -98,15 +88,13 @@ def _regions(regions: Mapping[str, Mapping[str, Any]]) -> Figure:
     figure = Figure(figsize=(WIDTH, 1.2 + 0.42 * len(rows)), layout="constrained")
     y = np.arange(len(rows))[::-1]
     marks = (("precision", ">", COLOURS[1]), ("recall", "<", COLOURS[2]))
-    for axes, threshold in zip(
-        figure.subplots(1, len(THRESHOLDS), sharey=True), THRESHOLDS, strict=True
-    ):
+    every = figure.subplots(1, len(THRESHOLDS), sharey=True)
+    for axes, threshold in zip(every, THRESHOLDS, strict=True):
         scores = [s[threshold.name] for _, s in rows]
         axes.barh(y, [s["f"] for s in scores], 0.6, color="#cfdfe3", label="F")
         for measure, marker, colour in marks:
-            axes.plot(
-                [s[measure] for s in scores], y, marker, color=colour, markersize=6, label=measure
-            )
+            x = [s[measure] for s in scores]
+            axes.plot(x, y, marker, color=colour, markersize=6, label=measure)
         for yi, s in zip(y, scores, strict=True):
             axes.annotate(f"{100 * s['f']:.0f}", (0.02, yi), va="center", fontsize=8, color=INK)
         axes.set_yticks(y, [name for name, _ in rows])
@@ -128,15 +116,9 @@ def _lengths(assessment: Assessment) -> Figure:
     for values, name, colour in ((true, "true", QUIET), (pred, "predicted", COLOURS[0])):
         if len(values):
             share = np.full(len(values), 1 / len(values))
-            axes.hist(
-                np.minimum(values, bins[-1]),
-                bins,
-                weights=share,
-                histtype="step",
-                linewidth=1.8,
-                color=colour,
-                label=f"{len(values):,} {name} strands",
-            )
+            style: dict[str, Any] = {"histtype": "step", "linewidth": 1.8, "color": colour}
+            label = f"{len(values):,} {name} strands"
+            axes.hist(np.minimum(values, bins[-1]), bins, weights=share, label=label, **style)
     axes.set_xlabel("length, mm (the last bar holds all that are longer)", color=QUIET)
     axes.set_ylabel("share of strands", color=QUIET)
     apart = assessment.figures["lengths"].get("distance_mm")

@@ -70,13 +70,9 @@ def scores(
     for k, threshold in enumerate(THRESHOLDS):
         p, dp = _share(precision, k, directed, predicted)
         r, dr = _share(recall, k, directed, true)
-        out[threshold.name] = {
-            "precision": p,
-            "recall": r,
-            "f": 2 * p * r / (p + r) if p + r > 0 else 0.0,
-            "precision_error": dp,
-            "recall_error": dr,
-        }
+        f = 2 * p * r / (p + r) if p + r > 0 else 0.0
+        errors = {"precision_error": dp, "recall_error": dr}
+        out[threshold.name] = {"precision": p, "recall": r, "f": f, **errors}
     return out
 
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Floats, Ints
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.geometry.strands import Resampling, Strands
+from reconstruction.geometry.strands import Resampling, Strands, unit_or_zero
 
 STEP = 1e-3  # metres between the points
 BLOCK = 250_000  # points that are made together, whole strands: a longer one makes a longer block
@@ -150,9 +150,7 @@ class OrientedPoints:
 
 def _directions(before: Floats, after: Floats) -> Floats:
     """Unit vectors `(N, 3)`; 0 where both points coincide."""
-    d = after.astype(float) - before
-    norm = np.linalg.norm(d, axis=1, keepdims=True)
-    return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
+    return unit_or_zero(after.astype(float) - before).astype(np.float32)
 
 
 def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Ints, Ints]]:
@@ -167,7 +165,6 @@ def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Int
     for k in np.unique(part):
         chunk = np.flatnonzero((part == k) & (near > 0))
         if len(chunk):
-            pairs = cKDTree(points[chunk]).sparse_distance_matrix(
-                other.tree, reach, output_type="ndarray"
-            )
+            tree = cKDTree(points[chunk])
+            pairs = tree.sparse_distance_matrix(other.tree, reach, output_type="ndarray")
             yield chunk[pairs["i"]], pairs["j"]

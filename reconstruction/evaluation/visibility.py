@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from reconstruction.arrays import AnyFloats, Bools, Floats
+from reconstruction.arrays import AnyFloats, Bools, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
@@ -78,13 +78,8 @@ class _DepthBuffer:
             self.span = float(np.quantile(depth[front], 0.02)) / (focal * self.scale)
         self.depth = np.full(self.shape[0] * self.shape[1], np.inf, np.float32)
         # world to homogeneous buffer pixels; the third row gives the depth
-        to_buffer = np.array(
-            [
-                [self.scale, 0, -self.scale * self.low[0]],
-                [0, self.scale, -self.scale * self.low[1]],
-                [0, 0, 1],
-            ]
-        )
+        to_buffer = np.diag([self.scale, self.scale, 1.0])
+        to_buffer[:2, 2] = -self.scale * self.low
         self.A = (to_buffer @ camera.K @ camera.R).astype(np.float32)
         self.b = (to_buffer @ camera.K @ camera.t).astype(np.float32)[:, None]
         corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
@@ -101,23 +96,25 @@ class _DepthBuffer:
             yield part, x, y, z
 
     def splat(self, points: AnyFloats) -> None:
-        height, width = self.shape
         for _, x, y, z in self._project(points):
-            on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            flat = y[on].astype(np.int64) * width + x[on].astype(np.int64)
+            on, flat = self._pixels(x, y)
             np.minimum.at(self.depth, flat, z[on])
 
     def sees(self, points: AnyFloats, tolerance: float) -> Bools:
         out = np.zeros(len(points), bool)
-        height, width = self.shape
         (left, top), (right, bottom) = self.image
         for part, x, y, z in self._project(points):
             seen = (x >= left) & (y >= top) & (x < right) & (y < bottom)
-            on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            flat = y[on].astype(np.int64) * width + x[on].astype(np.int64)
+            on, flat = self._pixels(x, y)
             seen[on] &= z[on] <= self.depth[flat] + np.float32(tolerance)
             out[part] = seen
         return out
+
+    def _pixels(self, x: Floats, y: Floats) -> tuple[Bools, Ints]:
+        """Which points fall on the buffer, and the pixels of those."""
+        height, width = self.shape
+        on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        return on, y[on].astype(np.int64) * width + x[on].astype(np.int64)
 
     def over(self, mesh: Mesh) -> Bools:
         """Which faces `(F,)` may cover the buffer: before the camera and over its rectangle."""

@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from reconstruction.arrays import Array
 
 SUFFIXES = (".obj", ".ply", ".csv", ".npy")
-_KINDS = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "float64": "f8",
-}
+_KINDS = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
+_KINDS |= {"i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64"}
+_KIND_OF = {name: kind for kind, names in _KINDS.items() for name in names.split()}
 _ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -39,11 +26,12 @@ def read_points(path: str | Path) -> tuple[Array, Array | None]:
     `(N, 6)`. Raises `ValueError` naming the file and what is wrong.
     """
     path = Path(path)
-    readers = {".obj": _obj, ".ply": _ply, ".csv": _csv, ".npy": _npy}
+    readers: dict[str, Callable[[Path], Any]]
+    readers = {".obj": _obj, ".ply": _ply, ".csv": _csv, ".npy": np.load}
     if path.suffix.lower() not in readers:
         raise ValueError(f"{path}: expected a file of points ({', '.join(SUFFIXES)})")
     try:
-        rows = readers[path.suffix.lower()](path)
+        rows = np.asarray(readers[path.suffix.lower()](path), np.float64)
     except (ValueError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: {error}") from error
     if rows.ndim != 2 or rows.shape[1] not in (3, 6) or not len(rows):
@@ -51,8 +39,6 @@ def read_points(path: str | Path) -> tuple[Array, Array | None]:
     if not np.isfinite(rows).all():
         bad = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
         raise ValueError(f"{path}: point {bad} is not finite: {rows[bad].tolist()}")
-    if rows.shape[1] == 3:
-        return rows, None
     length = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
     if not (length > 0).all():
         return rows[:, :3], None
@@ -86,10 +72,6 @@ def _csv(path: Path) -> Array:
     return np.array(rows, np.float64)
 
 
-def _npy(path: Path) -> Array:
-    return np.asarray(np.load(path, allow_pickle=False), np.float64)
-
-
 def _ply(path: Path) -> Array:
     """The vertices of a PLY, which must be its first element."""
     data = path.read_bytes()
@@ -107,7 +89,7 @@ def _ply(path: Path) -> Array:
     count = int(lines[elements[0]][2])
     stop = elements[1] if len(elements) > 1 else len(lines)
     properties = [line[1:] for line in lines[elements[0] : stop] if line[:1] == ["property"]]
-    if any(p[0] not in _KINDS for p in properties):
+    if any(p[0] not in _KIND_OF for p in properties):
         raise ValueError("a vertex has a property that is not a plain number")
     order = _ORDERS[form]
     names = [p[-1] for p in properties]
@@ -122,7 +104,7 @@ def _ply(path: Path) -> Array:
             raise ValueError(f"{len(numbers)} numbers for {count} vertices of {len(names)}")
         table = numbers.reshape(count, len(names))
         return table[:, [names.index(n) for n in wanted]]
-    kind = np.dtype([(n, order + _KINDS[p[0]]) for n, p in zip(names, properties, strict=True)])
+    kind = np.dtype([(n, order + _KIND_OF[p[0]]) for n, p in zip(names, properties, strict=True)])
     if len(body) < count * kind.itemsize:
         raise ValueError(f"{len(body)} bytes for {count} vertices of {kind.itemsize}")
     rows = np.frombuffer(body, kind, count)

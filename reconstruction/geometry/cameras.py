@@ -97,21 +97,21 @@ class Pinhole:
         z = local[..., 2]
         xy = local[..., :2] / np.where(np.abs(z) < 1e-12, 1e-12, z)[..., None]
         x, y = self._through_lens(xy[..., 0], xy[..., 1])
-        pixels = np.stack(
-            [self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]],
-            axis=-1,
-        )
-        return pixels, z
+        u, v = self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]
+        return np.stack([u, v], axis=-1), z
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit world directions `(..., 3)` from the centre through `pixels (..., 2)`."""
-        pixels = np.asarray(pixels, float)
-        y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
-        x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
-        x, y = self._before_lens(x, y)
+        x, y = self._slopes(np.asarray(pixels, float))
         local = np.stack([x, y, np.ones_like(x)], axis=-1)
         world = local @ self.R
         return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
+
+    def _slopes(self, pixels: Array) -> tuple[Array, Array]:
+        """Slopes x/z, y/z `(...)` before the lens of `pixels (..., 2)`."""
+        y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
+        x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
+        return self._before_lens(x, y)
 
     def _through_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Slopes x/z, y/z behind the lens from those before it."""
@@ -124,12 +124,8 @@ class Pinhole:
     def inside(self, pixels: ArrayLike) -> Bools:
         """Whether `pixels (..., 2)` fall on the image, edge pixels' outer halves included."""
         p = np.asarray(pixels, float)
-        return np.asarray(
-            (p[..., 0] >= -0.5)
-            & (p[..., 0] < self.width - 0.5)
-            & (p[..., 1] >= -0.5)
-            & (p[..., 1] < self.height - 0.5)
-        )
+        end = np.array([self.width - 0.5, self.height - 0.5])
+        return np.asarray(((p >= -0.5) & (p < end)).all(axis=-1))
 
     def pixels_of(self, points: ArrayLike) -> tuple[Bools, Ints, Ints, Array]:
         """Which of `points (N, 3)` fall on the image, the pixels' x and y, and depths; `(N,)` each.
@@ -151,14 +147,8 @@ class Pinhole:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready description that `from_dict` reads back exactly."""
-        return {
-            "name": self.name,
-            "width": self.width,
-            "height": self.height,
-            "K": self.K.tolist(),
-            "R": self.R.tolist(),
-            "t": self.t.tolist(),
-        }
+        size = {"name": self.name, "width": self.width, "height": self.height}
+        return size | {k: getattr(self, k).tolist() for k in ("K", "R", "t")}
 
 
 @dataclass(frozen=True, eq=False)

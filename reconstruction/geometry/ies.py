@@ -11,14 +11,8 @@ import numpy as np
 from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import LightProfile, Photometry, Unit
 
-VERSIONS = {
-    "IESNA91": 1991,
-    "IESNA:LM-63-1991": 1991,
-    "IESNA:LM-63-1995": 1995,
-    "IESNA:LM-63-2002": 2002,
-    "IES:LM-63-2019": 2019,
-}
-"""First lines and the edition they stand for; a file of 1986 has none."""
+VERSIONS = {"IESNA91": 1991, "IES:LM-63-2019": 2019}  # by first line; a file of 1986 has none
+VERSIONS |= {f"IESNA:LM-63-{year}": year for year in (1991, 1995, 2002)}
 _PHOTOMETRY: dict[int, Photometry] = {1: "C", 2: "B", 3: "A"}
 _MILLIWATTS = re.compile(r"\bmw\s*/\s*sr\b|\bmilliwatts?\b", re.IGNORECASE)
 
@@ -80,8 +74,10 @@ def read_ies(
     value_unit: Unit = "W/sr" if radiometric else "cd"
     values = values * (multiplier * (1e-3 if radiometric else 1.0))
     if photometry == "C":
-        return _type_c(path.stem, vertical, horizontal, values, value_unit)
-    return _type_a_or_b(path.stem, vertical, horizontal, values, photometry, value_unit)
+        table = _type_c(vertical, horizontal, values)
+    else:
+        table = _type_a_or_b(vertical, horizontal, values, photometry)
+    return LightProfile(path.stem, *table, photometry, value_unit)
 
 
 def _labels(path: Path, lines: list[str]) -> tuple[int, int]:
@@ -93,9 +89,8 @@ def _labels(path: Path, lines: list[str]) -> tuple[int, int]:
     version = VERSIONS.get(first, 1986)
     if version == 1986:
         if re.match(r"IES(NA)?:?\s*(LM-63|\d\d)", first):
-            raise IesError(
-                f"{path}, line 1: edition {first!r} is unknown; known are {list(VERSIONS)}"
-            )
+            known = list(VERSIONS)
+            raise IesError(f"{path}, line 1: edition {first!r} is unknown; known are {known}")
         return tilt, version
     for number, line in enumerate(lines[1:tilt], 2):
         if line.strip() and not re.match(r"\s*\[[^\]]*\]", line):
@@ -211,31 +206,26 @@ def _angles(numbers: _Numbers, photometry: Photometry, sizes: list[int]) -> tupl
     return vertical, horizontal
 
 
-def _type_c(
-    name: str, vertical: Array, horizontal: Array, values: Array, unit: Unit
-) -> LightProfile:
+def _type_c(vertical: Array, horizontal: Array, values: Array) -> tuple[Array, Array, Array]:
     """All round, by the symmetry that the range of the horizontal angles stands for."""
     h, v = horizontal, values
-    if (h[0], h[-1]) == (90, 270):
-        h, v = np.append(h, 540 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
     if h[-1] == 0:
         h, v = np.array([0.0, 360.0]), np.repeat(v, 2, axis=0)
-    if h[-1] == 90:
-        h, v = np.append(h, 180 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
-    if h[-1] == 180:
-        h, v = np.append(h, 360 - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
+    for end in (90, 180, 270):  # mirrored there; from 0 to 270 is no half
+        if h[-1] == end and (h[0] == 90) == (end == 270):
+            h, v = np.append(h, 2 * end - h[-2::-1]), np.append(v, v[-2::-1], axis=0)
     if h[-1] - h[0] < 360:
         h, v = np.append(h, 360), np.append(v, v[:1], axis=0)
-    return LightProfile(name, h, vertical, v, "C", unit)
+    return h, vertical, v
 
 
 def _type_a_or_b(
-    name: str, vertical: Array, horizontal: Array, values: Array, photometry: Photometry, unit: Unit
-) -> LightProfile:
+    vertical: Array, horizontal: Array, values: Array, photometry: Photometry
+) -> tuple[Array, Array, Array]:
     """Both sides of the vertical plane where only one is given; dark beyond the table."""
     if horizontal[0] == 0:
         horizontal = np.append(-horizontal[:0:-1], horizontal)
         values = np.append(values[:0:-1], values, axis=0)
     if photometry == "A":
-        return LightProfile(name, horizontal, vertical + 90, values, photometry, unit)
-    return LightProfile(name, vertical, horizontal + 90, values.T, photometry, unit)
+        return horizontal, vertical + 90, values
+    return vertical, horizontal + 90, values.T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -75,14 +75,7 @@ class LightProfile:
         peak = self.values.max()
         if not peak > 0:
             raise ValueError(f"profile {self.name}: it is dark everywhere, so it has no shape")
-        return type(self)(
-            self.name,
-            self.longitude_deg,
-            self.colatitude_deg,
-            self.values / peak,
-            self.photometry,
-            "relative",
-        )
+        return replace(self, values=self.values / peak, unit="relative")
 
     def at(self, directions: ArrayLike) -> Array:
         """Values `(...)` towards `directions (..., 3)` of any length in the light's frame."""
@@ -114,20 +107,8 @@ class LightProfile:
         return float(across @ self.values @ along)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON-ready description that `from_dict` reads back exactly."""
-        return {
-            "name": self.name,
-            "longitude_deg": self.longitude_deg.tolist(),
-            "colatitude_deg": self.colatitude_deg.tolist(),
-            "values": self.values.tolist(),
-            "photometry": self.photometry,
-            "unit": self.unit,
-        }
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Read what `to_dict` wrote; raises `ValueError` or `TypeError` naming the field."""
-        return cls(**data)
+        """A JSON-ready description: `LightProfile(**it)` is the same again."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
 
 
 _SLACK_DEG = 1e-9  # a direction on a table's last node is in it, however it was rounded

@@ -86,12 +86,8 @@ class Light:
 
         Names its profile, which the rig's description holds beside its lights.
         """
-        out: dict[str, Any] = {
-            "name": self.name,
-            "position": self.position.tolist(),
-            "intensity": self.intensity.tolist(),
-            "beside": self.beside,
-        }
+        out: dict[str, Any] = {"name": self.name, "position": self.position.tolist()}
+        out |= {"intensity": self.intensity.tolist(), "beside": self.beside}
         if self.orientation is not None:
             out["orientation"] = self.orientation.tolist()
         if self.profile is not None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import Array, Bools, Ints
+from reconstruction.geometry.strands import unit_or_zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +37,7 @@ class Mesh:
 
     def face_normals(self) -> Array:
         """Unit normals `(F, 3)` by the right-hand rule; 0 for faces without area."""
-        n = self._cross()
-        length = np.linalg.norm(n, axis=1, keepdims=True)
-        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+        return unit_or_zero(self._cross())
 
     def face_areas(self) -> Array:
         """Areas `(F,)` in square metres."""
@@ -48,8 +47,7 @@ class Mesh:
         """Area-weighted unit normals `(V, 3)`; 0 for vertices of no face."""
         n = np.zeros_like(self.vertices)
         np.add.at(n, self.faces.ravel(), np.repeat(self._cross(), 3, axis=0))
-        length = np.linalg.norm(n, axis=1, keepdims=True)
-        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+        return unit_or_zero(n)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Mesh:
         """The mesh moved by `x -> rotation (3, 3) @ x + translation (3,)`."""

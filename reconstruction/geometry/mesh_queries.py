@@ -73,12 +73,8 @@ def _crossings(
         area = (b[u] - a[u]) * (c[v] - a[v]) - (b[v] - a[v]) * (c[u] - a[u])
         if area == 0:
             continue
-        i, j = (
-            grid.ravel()
-            for grid in np.meshgrid(
-                np.arange(low[f, 0], high[f, 0] + 1), np.arange(low[f, 1], high[f, 1] + 1)
-            )
-        )
+        sides = (np.arange(low[f, k], high[f, k] + 1) for k in (0, 1))
+        i, j = (grid.ravel() for grid in np.meshgrid(*sides))
         wb = ((i - a[u]) * (c[v] - a[v]) - (j - a[v]) * (c[u] - a[u])) / area
         wc = ((b[u] - a[u]) * (j - a[v]) - (b[v] - a[v]) * (i - a[u])) / area
         hit = (wb >= 0) & (wc >= 0) & (wb + wc <= 1)

@@ -45,14 +45,10 @@ class Projector(Pinhole):
     def row_weight(self, row: ArrayLike, v: ArrayLike) -> Array:
         """Share `(...)` of the all-on light that reaches row `v` when `row` alone is lit."""
         offset = np.asarray(row, float) - np.asarray(v, float)
-        return np.asarray(
-            ndtr((offset + 0.5) / self.line_sigma) - ndtr((offset - 0.5) / self.line_sigma)
-        )
+        above, below = ((offset + s) / self.line_sigma for s in (0.5, -0.5))
+        return np.asarray(ndtr(above) - ndtr(below))
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready description that `Rig.from_dict` reads back exactly."""
-        return {
-            **super().to_dict(),
-            "intensity": self.intensity.tolist(),
-            "line_sigma": self.line_sigma,
-        }
+        own = {"intensity": self.intensity.tolist(), "line_sigma": self.line_sigma}
+        return super().to_dict() | own

@@ -68,11 +68,7 @@ class Rig:
         """
         path = Path(path)
         try:
-            data = (
-                json.loads(path.read_text())
-                if path.suffix == ".json"
-                else tomllib.loads(path.read_text())
-            )
+            data = (json if path.suffix == ".json" else tomllib).loads(path.read_text())
         except FileNotFoundError:
             raise RigError(f"{path}: no such rig file") from None
         except (json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
@@ -117,10 +113,15 @@ def _named(items: tuple[T, ...], name: str, kind: str) -> T:
     raise KeyError(f"no {kind} {name!r} in this rig; it has {[i.name for i in items]}")
 
 
-def _take(table: dict[str, Any], field: str, where: str) -> Any:
-    if field not in table:
-        raise RigError(f"{where}: the field {field!r} is missing")
-    return table[field]
+def _take(table: dict[str, Any], where: str, *fields: str) -> list[Any]:
+    if missing := [f for f in fields if f not in table]:
+        raise RigError(f"{where}: the field {missing[0]!r} is missing")
+    return [table[f] for f in fields]
+
+
+def _refuse_others(table: dict[str, Any], known: set[str], where: str) -> None:
+    if unknown := set(table) - known:
+        raise RigError(f"{where}: unknown fields {sorted(unknown)}; known are {sorted(known)}")
 
 
 _OWN_FIELDS: dict[type[Pinhole], tuple[str, ...]] = {
@@ -134,31 +135,21 @@ def _pinholes(kind: type[P], data: dict[str, Any], key: str) -> list[P]:
     out: list[P] = []
     for i, table in enumerate(data.get(key, [])):
         where = f"[[{key}]] number {i + 1} ({table.get('name', 'unnamed')})"
-        name = str(_take(table, "name", where))
-        width, height = (int(_take(table, f, where)) for f in ("width", "height"))
+        name, width, height = _take(table, where, "name", "width", "height")
         own = _OWN_FIELDS[kind]
         more: dict[str, Any] = {f: table[f] for f in own if f in table}
-        allowed = {
-            *("name", "width", "height", "K", "R", "t"),
-            *("position", "target", "fov_deg", "roll_deg", *own),
-        }
-        unknown = set(table) - allowed
-        if unknown:
-            raise RigError(
-                f"{where}: unknown fields {sorted(unknown)}; known are {sorted(allowed)}"
-            )
+        explicit, placed = ("K", "R", "t"), ("position", "target", "fov_deg")
+        _refuse_others(
+            table, {*("name", "width", "height"), *explicit, *placed, "roll_deg", *own}, where
+        )
+        pose = _take(table, where, *(explicit if "K" in table else placed))
+        make: Any = kind if "K" in table else kind.look_at
+        if "K" not in table and "roll_deg" in table:
+            more["roll_deg"] = float(table["roll_deg"])
         try:
-            if "K" in table:
-                K, R, t = (_take(table, f, where) for f in ("K", "R", "t"))
-                out.append(kind(name, width, height, K, R, t, **more))
-            else:
-                position, target, fov = (
-                    _take(table, f, where) for f in ("position", "target", "fov_deg")
-                )
-                roll = float(table.get("roll_deg", 0.0))
-                out.append(kind.look_at(name, width, height, position, target, fov, roll, **more))
+            out.append(make(str(name), int(width), int(height), *pose, **more))
         except (ValueError, TypeError) as error:
-            raise error if isinstance(error, RigError) else RigError(f"{where}: {error}") from error
+            raise RigError(f"{where}: {error}") from error
     return out
 
 
@@ -169,7 +160,7 @@ def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LightProfile]:
         where = f"[profiles.{name}]"
         try:
             if "file" not in table:
-                out[name] = LightProfile.from_dict({**table, "name": name})
+                out[name] = LightProfile(**{**table, "name": name})
                 continue
             if unknown := set(table) - {"file", "unit", "tilt_deg"}:
                 raise RigError(f"unknown fields {sorted(unknown)}")
@@ -193,19 +184,14 @@ _LIGHT_FIELDS = {
 
 def _light(table: dict[str, Any], where: str, profiles: dict[str, LightProfile]) -> Light:
     """A light; `aim` (a direction) and `roll_deg` stand for `orientation`."""
-    if unknown := set(table) - _LIGHT_FIELDS:
-        raise RigError(
-            f"{where}: unknown fields {sorted(unknown)}; known are {sorted(_LIGHT_FIELDS)}"
-        )
-    name, position, intensity = (_take(table, f, where) for f in ("name", "position", "intensity"))
-    more: dict[str, Any] = {
-        f: table[f] for f in ("beside", "orientation", "radius", "size") if f in table
-    }
+    _refuse_others(table, _LIGHT_FIELDS, where)
+    required = _take(table, where, "name", "position", "intensity")
+    own = ("beside", "orientation", "radius", "size")
+    more: dict[str, Any] = {f: table[f] for f in own if f in table}
     if "profile" in table:
         if table["profile"] not in profiles:
-            raise RigError(
-                f"{where}: no [profiles.{table['profile']}]; there are {sorted(profiles)}"
-            )
+            kept = sorted(profiles)
+            raise RigError(f"{where}: no [profiles.{table['profile']}]; there are {kept}")
         more["profile"] = profiles[table["profile"]]
     try:
         if "aim" in table:
@@ -215,7 +201,7 @@ def _light(table: dict[str, Any], where: str, profiles: dict[str, LightProfile])
             if aim.shape != (3,) or not np.isfinite(aim).all() or not aim.any():
                 raise RigError(f"aim must be a direction of 3 numbers, got {table['aim']}")
             more["orientation"] = facing(aim, float(table.get("roll_deg", 0.0)))
-        return Light(name, position, intensity, **more)
+        return Light(*required, **more)
     except (ValueError, TypeError) as error:
         raise RigError(f"{where}: {error}") from error
 
@@ -234,11 +220,8 @@ def _lights(
     dome = data.get("dome")
     if dome is None:
         return lights
-    count = int(_take(dome, "lights", "[dome]"))
-    intensity = _take(dome, "intensity", "[dome]")
-    positions = dome_positions(
-        count, float(_take(dome, "radius", "[dome]")), float(dome.get("lowest_deg", -90.0))
-    )
+    count, intensity, radius = _take(dome, "[dome]", "lights", "intensity", "radius")
+    positions = dome_positions(int(count), float(radius), float(dome.get("lowest_deg", -90.0)))
     beside: dict[int, str] = {}
     offset = float(dome.get("beside_cameras_at", 0.0))
     if offset > 0:
@@ -251,22 +234,10 @@ def _lights(
     shared = {f: dome[f] for f in ("profile", "size", "roll_deg") if f in dome}
     if "lamp_radius" in dome:  # the dome's own `radius` is how far out the lights stand
         shared["radius"] = dome["lamp_radius"]
-    if "profile" in shared or "size" in shared:
-        aims = [{"aim": -p} for p in positions]
-    else:
-        aims = [{} for _ in positions]
-    return lights + [
-        _light(
-            {
-                "name": f"light_{i:03d}",
-                "position": positions[i],
-                "intensity": intensity,
-                "beside": beside.get(i),
-                **shared,
-                **aims[i],
-            },
-            "[dome]",
-            profiles,
-        )
-        for i in range(count)
-    ]
+    shared["intensity"] = intensity
+    for i, p in enumerate(positions):
+        table = {"name": f"light_{i:03d}", "position": p, "beside": beside.get(i), **shared}
+        if "profile" in shared or "size" in shared:
+            table["aim"] = -p
+        lights.append(_light(table, "[dome]", profiles))
+    return lights

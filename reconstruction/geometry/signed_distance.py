@@ -29,9 +29,8 @@ def capsule(p: Array, a: ArrayLike, b: ArrayLike, r_a: float, r_b: float) -> Arr
     """
     a, b = np.asarray(a, float), np.asarray(b, float)
     h = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-    return np.asarray(
-        np.linalg.norm(p - a - h[..., None] * (b - a), axis=-1) - r_a - h * (r_b - r_a)
-    )
+    away = np.linalg.norm(p - a - h[..., None] * (b - a), axis=-1)
+    return np.asarray(away - r_a - h * (r_b - r_a))
 
 
 def blend(a: Array, b: Array, width: float) -> Array:

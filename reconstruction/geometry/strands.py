@@ -49,13 +49,9 @@ class Strands:
     @classmethod
     def from_list(cls, strands: list[AnyFloats], radius: float = 4e-5) -> Strands:
         """Strands from a list of `(n_i, 3)` arrays; an empty list gives a head without hair."""
-        counts = [len(s) for s in strands]
+        offsets = np.cumsum([0, *map(len, strands)])
         points = np.concatenate(strands) if strands else np.zeros((0, 3))
-        return cls(
-            points.astype(np.float32),
-            np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-            radius,
-        )
+        return cls(points.astype(np.float32), offsets, radius)
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -86,22 +82,16 @@ class Strands:
     def lengths(self) -> Array:
         """Arc length of each strand `(S,)`, metres."""
         starts = self.segment_starts
-        step = np.linalg.norm(
-            self.points[starts + 1].astype(float) - self.points[starts].astype(float), axis=1
-        )
+        step = np.linalg.norm(self.points[starts + 1].astype(float) - self.points[starts], axis=1)
         return np.bincount(self.strand_of_point[starts], step, len(self)).astype(np.float64)
 
     def tangents(self) -> Floats:
         """Unit tangents `(N, 3)` by central differences, root to tip; 0 where points coincide."""
-        p = self.points.astype(float)
-        last = np.zeros(len(p), bool)
-        last[self.offsets[1:] - 1] = True
-        first = np.zeros(len(p), bool)
-        first[self.offsets[:-1]] = True
+        p, strand = self.points.astype(float), self.strand_of_point
         index = np.arange(len(p))
-        d = p[index + ~last] - p[index - ~first]
-        norm = np.linalg.norm(d, axis=1, keepdims=True)
-        return np.divide(d, norm, out=np.zeros_like(d), where=norm > 0).astype(np.float32)
+        before = np.maximum(index - 1, self.offsets[strand])
+        d = p[np.minimum(index + 1, self.offsets[strand + 1] - 1)] - p[before]
+        return unit_or_zero(d).astype(np.float32)
 
     def subset(self, which: ArrayLike) -> Strands:
         """The strands at the indices (or the mask) `which (M,)`, in that order."""
@@ -163,6 +153,12 @@ class Resampling:
         if isinstance(radius, np.ndarray):
             radius = (radius[left] * (1 - w) + radius[left + 1] * w).astype(np.float32)
         return points, radius
+
+
+def unit_or_zero(vectors: Array) -> Array:
+    """`vectors (N, 3)` of length 1; 0 where they are."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
 def smoothed(line: Array, sigma: float) -> Array:

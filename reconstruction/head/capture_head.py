@@ -76,18 +76,14 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
     `CaptureError` where too few are left to fit a head to.
     """
     capture, masks = masked.capture, masked.masks
-    skin = np.zeros(len(cloud), bool)
-    hair = np.zeros(len(cloud), bool)
+    skin, hair = np.zeros((2, len(cloud)), bool)
     for index, name in enumerate(cloud.cameras):
         if name not in masks:
             continue
         mine = np.flatnonzero(cloud.camera == index)
-        camera = capture.rig.camera(name)
-        pixels, depth = camera.project(cloud.points[mine])
-        ok = (depth > 0) & camera.inside(pixels)
-        x, y = np.rint(pixels[ok]).astype(int).T
-        skin[mine[ok]] = masks[name].skin[y, x]
-        hair[mine[ok]] = masks[name].hair[y, x]
+        seen, x, y, _ = capture.rig.camera(name).pixels_of(cloud.points[mine])
+        skin[mine[seen]] = masks[name].skin[y[seen], x[seen]]
+        hair[mine[seen]] = masks[name].hair[y[seen], x[seen]]
     if skin.any() and hair.any():
         near = cKDTree(cloud.points[hair]).query(cloud.points[skin])[0] < _CELL
         skin[np.flatnonzero(skin)[near]] = False

@@ -119,9 +119,7 @@ def fit_head(
     part, landmarks, any_unit = hints.part, hints.landmarks, hints.any_unit
     template = generic_head() if template is None else template
     at: Array = np.asarray(points, np.float64).reshape(-1, 3)
-    facing: Array | None = None
-    if normals is not None:
-        facing = np.asarray(normals, np.float64).reshape(-1, 3)
+    facing = None if normals is None else np.asarray(normals, np.float64).reshape(-1, 3)
     faces = _faces(template, part)
     extent = float(np.ptp(template.vertices, axis=0).max())
     places, own, face = surface_samples(template, extent / 35)

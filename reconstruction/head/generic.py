@@ -70,10 +70,8 @@ def generic_head() -> Mesh:
     vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(_CELL,) * 3)
     vertices = vertices.astype(float) + HEAD_BOX[0]
     mesh = Mesh(vertices, faces.astype(np.int64))
-    volume = np.einsum(
-        "ij,ij->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])
-    )
-    if volume < 0:
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:  # the volume
         mesh = Mesh(vertices, faces[:, ::-1].astype(np.int64))
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     scalp = (middle[:, 2] > _HAIRLINE(np.clip(middle[:, 1], -0.1, 0.11))) & (_ears(middle) > 0.007)

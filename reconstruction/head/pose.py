@@ -7,6 +7,7 @@ Zinßer, Schmidt, Niemann 2005 for the scale.)
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -139,14 +140,13 @@ def find_pose(
     coarse, facing = some(_COARSE)
     yaws = np.arange(_YAWS) * 2 * np.pi / _YAWS if turn is None else turn + _ABOUT
     tries = []
-    for scale in search.scales:
-        for yaw in yaws:
-            rotation = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
-            moved = scale * surface.points @ rotation.T
-            shift = np.median(coarse, axis=0) - np.median(moved, axis=0)
-            shift[2] = np.percentile(coarse[:, 2], 85) - np.percentile(moved[:, 2], 85)
-            pose = _refine(surface, (coarse, facing), (scale, rotation, shift), search, 20)
-            tries.append((_cost(surface, pose, coarse, facing, size), pose))
+    for scale, yaw in product(search.scales, yaws):
+        rotation = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
+        moved = scale * surface.points @ rotation.T
+        shift = np.median(coarse, axis=0) - np.median(moved, axis=0)
+        shift[2] = np.percentile(coarse[:, 2], 85) - np.percentile(moved[:, 2], 85)
+        pose = _refine(surface, (coarse, facing), (scale, rotation, shift), search, 20)
+        tries.append((_cost(surface, pose, coarse, facing, size), pose))
     tries.sort(key=lambda t: t[0])
     distinct: list[Pose] = []
     for _, pose in tries:
@@ -245,11 +245,5 @@ def _refine(
         spread = np.sqrt(variance * np.diag(vectors / values @ vectors.T) / total)
         spread[:4] /= radius
     first = int(np.abs(motions[:, 0]).argmax())
-    return Pose(
-        float(scale),
-        rotation,
-        translation,
-        spread,
-        np.sqrt(np.maximum(stiffness, 0)),
-        MOTIONS[first],
-    )
+    stiffness = np.sqrt(np.maximum(stiffness, 0))
+    return Pose(float(scale), rotation, translation, spread, stiffness, MOTIONS[first])

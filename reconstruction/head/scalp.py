@@ -70,10 +70,7 @@ def find_scalp(head: Mesh, hair: VoxelGrid | None = None, spacing: float = 2e-3)
 
 
 def _under_hair(points: Array, normals: Array, hair: VoxelGrid) -> Bools:
-    covered = np.zeros(len(points), bool)
-    for lift in _LIFTS:
-        covered |= hair.contains(points + lift * normals)
-    return covered
+    return np.asarray(np.any([hair.contains(points + d * normals) for d in _LIFTS], axis=0))
 
 
 def _above_hairline(points: Array, covered: Bools) -> Bools:
@@ -115,9 +112,7 @@ def sample_roots(scalp: Scalp, count: int, seed: int) -> tuple[Array, Array]:
         n = np.einsum("nk,nkd->nd", bary, normals[face])
         keep = scalp.share[face] >= 1
         keep[~keep] = tree.query(p[~keep])[0] < 2.5e-3
-        points, directions = (
-            np.concatenate([points, p[keep]]),
-            np.concatenate([directions, n[keep]]),
-        )
+        points = np.concatenate([points, p[keep]])
+        directions = np.concatenate([directions, n[keep]])
     n = directions[:count]
     return points[:count], n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)

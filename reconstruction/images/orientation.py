@@ -73,13 +73,13 @@ def _answer(bank: LogGaborBank, image: Floats, out: Floats) -> None:
     for k, (axis, lines, transfer) in enumerate(_wedges(bank, h, w)):
         some = spectrum.take(lines, axis=1 - axis) * transfer
         some = fft.ifft(some, axis=axis, overwrite_x=True)
-        across = (slice(None), inner[1]) if axis == 1 else (inner[0], slice(None))
-        full = np.zeros((h, shape[1]) if axis == 1 else (shape[0], w), np.complex64)
         if axis == 1:
-            full[lines] = some[across]
+            full = np.zeros((h, shape[1]), np.complex64)
+            full[lines] = some[:, inner[1]]
             answer = fft.ifft(full, axis=0, overwrite_x=True)[inner[0]]
         else:
-            full[:, lines] = some[across]
+            full = np.zeros((shape[0], w), np.complex64)
+            full[:, lines] = some[inner[0]]
             answer = fft.ifft(full, axis=1, overwrite_x=True)[:, inner[1]]
         np.abs(answer, out=out[k])
 
@@ -146,10 +146,8 @@ def orientations(
     if images.ndim == 2:
         images = images[None]
     if images.ndim != 3 or images.shape[1:] != mask.shape:
-        raise ValueError(
-            f"expected images (N, {mask.shape[0]}, {mask.shape[1]}) like the mask, "
-            f"got {images.shape}"
-        )
+        wanted = f"(N, {mask.shape[0]}, {mask.shape[1]})"
+        raise ValueError(f"expected images {wanted} like the mask, got {images.shape}")
     answers = np.empty((bank.count, *mask.shape), np.float32)
     total = np.zeros_like(answers)
     bright = float(np.abs(images[:, mask]).mean()) if mask.any() and len(images) else 0.0

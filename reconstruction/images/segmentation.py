@@ -39,13 +39,11 @@ class Network:
                 "(width, height) that it was made for"
             ) from error
         if scores.ndim != 4 or scores.shape[0] != 1 or not np.isfinite(scores).all():
-            raise NetworkError(
-                f"{o.file}: expected finite scores (1, classes, h, w), got {scores.shape}"
-            )
-        if scores.shape[1] > 1 and not 0 <= o.hair < scores.shape[1]:
-            raise NetworkError(
-                f"{o.file}: hair is class {o.hair}, but it tells {scores.shape[1]} classes"
-            )
+            got = f"expected finite scores (1, classes, h, w), got {scores.shape}"
+            raise NetworkError(f"{o.file}: {got}")
+        classes = scores.shape[1]
+        if classes > 1 and not 0 <= o.hair < classes:
+            raise NetworkError(f"{o.file}: hair is class {o.hair}, but it tells {classes} classes")
         # scores are enlarged, not masks: the edge stays smooth
         planes = [cv2.resize(s, (width, height)) for s in scores[0]]
         if len(planes) > 1:
@@ -55,10 +53,8 @@ class Network:
 
     def to_dict(self) -> dict[str, Any]:
         """What a report says of it: the file, and its SHA-256."""
-        return {
-            "file": self.options.file,
-            "sha256": hashlib.sha256(Path(self.options.file).read_bytes()).hexdigest(),
-        }
+        data = Path(self.options.file).read_bytes()
+        return {"file": self.options.file, "sha256": hashlib.sha256(data).hexdigest()}
 
     @cached_property
     def _net(self) -> Any:

@@ -41,16 +41,19 @@ def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> 
 def dark_response(capture: Capture, step: Step, camera: str) -> tuple[Floats, Bools]:
     """The frame less the dark one, at full level `(H, W, 3)`, and where it is saturated."""
     image, saturated = capture.response_and_saturated(step, camera)
-    level = step.level if step.level > 0 else 1.0
-    return image - dark_rgb(capture, camera, step.exposure) / np.float32(level), saturated
+    return image - _dark_of(capture, step, camera), saturated
 
 
 def light_response(capture: Capture, light: str, camera: str) -> tuple[Floats, Bools]:
     """`Capture.light` less the dark frame, at full level `(H, W, 3)`, and where it is saturated."""
     image, saturated = capture.light(light, camera)
     step = next(s for s in capture.of_kind("olat") if s.light == light)
+    return image - _dark_of(capture, step, camera), saturated
+
+
+def _dark_of(capture: Capture, step: Step, camera: str) -> Floats:
     level = step.level if step.level > 0 else 1.0
-    return image - dark_rgb(capture, camera, step.exposure) / np.float32(level), saturated
+    return dark_rgb(capture, camera, step.exposure) / np.float32(level)
 
 
 def background_noise(image: AnyFloats) -> float:

@@ -231,15 +231,11 @@ def space_carve(
     more than `margin` metres in front of it are empty; voxels off an image are not judged by it.
     """
     index = np.argwhere(hull.inside)
-    for camera in cameras:
-        if camera.name not in first_surface:
-            continue
+    for camera in (c for c in cameras if c.name in first_surface):
         first = first_surface[camera.name]
         if first.shape != (camera.height, camera.width):
-            raise ValueError(
-                f"{camera.name}: first_surface must be {(camera.height, camera.width)}, "
-                f"got {first.shape}"
-            )
+            size = (camera.height, camera.width)
+            raise ValueError(f"{camera.name}: first_surface must be {size}, got {first.shape}")
         seen, x, y, depth = camera.pixels_of(hull.centers(index))
         index = index[~seen | (depth >= first[y, x] - margin)]
     inside = np.zeros_like(hull.inside)

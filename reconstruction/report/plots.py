@@ -30,18 +30,17 @@ def plot_report(report: Report, folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    out: list[Path] = []
+    figures: dict[str, Figure] = {}
     if report.stages:
-        out.append(save_figure(_seconds(report.stages), folder / "seconds.png"))
+        figures["seconds"] = _seconds(report.stages)
     for stage in report.stages:
         drawn = [s for s in stage.series if any(e > 0 for _, e in s.points)]
         if drawn:
-            out.append(
-                save_figure(_errors(stage.name, drawn), folder / f"error_{_slug(stage.name)}.png")
-            )
+            slug = "".join(c if c.isalnum() else "_" for c in stage.name.lower())
+            figures[f"error_{slug}"] = _errors(stage.name, drawn)
     if any(stage.left_out or stage.warnings for stage in report.stages):
-        out.append(save_figure(_left_out(report.stages), folder / "left_out.png"))
-    return out
+        figures["left_out"] = _left_out(report.stages)
+    return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
 
 
 def plot_geometry(results: Mapping[str, Mapping[str, Any]], path: str | Path) -> Path:
@@ -66,16 +65,9 @@ def plot_geometry(results: Mapping[str, Mapping[str, Any]], path: str | Path) ->
                 x = np.arange(len(names)) + (k - (len(results) - 1) / 2) * width
                 colour = COLOURS[0] if k == 0 else ("#a9b1b8", "#ccd2d6", FAINT)[(k - 1) % 3]
                 axes.bar(x, values, 0.9 * width, color=colour, label=_words(name))
+                style = {"ha": "center", "fontsize": 7, "color": INK if k == 0 else QUIET}
                 for xi, v in zip(x, values, strict=True):
-                    axes.annotate(
-                        f"{100 * v:.0f}",
-                        (xi, v),
-                        (0, 2),
-                        textcoords="offset points",
-                        ha="center",
-                        fontsize=7,
-                        color=INK if k == 0 else QUIET,
-                    )
+                    _note(axes, f"{100 * v:.0f}", (xi, v), (0, 2), style)
             axes.set_xticks(range(len(names)), [_threshold(t) for t in names])
             axes.set_ylim(0, 1.08)
             axes.set_yticks([0, 0.5, 1], ["0", "50 %", "100 %"])
@@ -102,15 +94,8 @@ def _seconds(stages: Sequence[Stage]) -> Figure:
     axes.barh(rows, seconds, 0.62, color=COLOURS[0])
     total = max(float(seconds.sum()), 1e-9)
     for y, s in zip(rows, seconds, strict=True):
-        axes.annotate(
-            f"{_duration(s)}   {100 * s / total:.0f} %",
-            (s, y),
-            (5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8.5,
-            color=QUIET,
-        )
+        style = {"va": "center", "fontsize": 8.5, "color": QUIET}
+        _note(axes, f"{_duration(s)}   {100 * s / total:.0f} %", (s, y), (5, 0), style)
     axes.set_yticks(rows, [_words(s.name) for s in stages])
     axes.set_xlim(0, 1.18 * max(float(seconds.max()), 1e-9))
     axes.set_xlabel("seconds", color=QUIET)
@@ -134,18 +119,10 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
             points = np.array([p for p in s.points if p[1] > 0], float).reshape(-1, 2)
             seconds = np.where(points[:, 0] > 0, points[:, 0], start)
             colour = COLOURS[k % len(COLOURS)]
-            dense = len(points) > 25
-            axes.plot(
-                seconds,
-                points[:, 1],
-                color=colour,
-                linewidth=1.8,
-                marker=None if dense else "o",
-                markersize=4.5,
-                markeredgecolor="white",
-                markeredgewidth=0.6,
-                label=_words(s.name),
-            )
+            line = {"color": colour, "linewidth": 1.8, "label": _words(s.name)}
+            if len(points) <= 25:
+                line |= {"marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
+            axes.plot(seconds, points[:, 1], **line)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xlabel("seconds", color=QUIET)
@@ -154,9 +131,8 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
         axes.legend(frameon=False, fontsize=9, labelcolor=INK)
     for axes in grid[len(kinds) :]:
         axes.remove()
-    figure.suptitle(
-        f"{_words(stage)}: error against run time", x=0.01, ha="left", fontsize=11, **_BOLD
-    )
+    title = f"{_words(stage)}: error against run time"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, **_BOLD)
     return figure
 
 
@@ -176,10 +152,8 @@ def _left_out(stages: Sequence[Stage]) -> Figure:
         [] if i and rows[i - 1][0] == name else textwrap.wrap(name, 16)
         for i, (name, _, _) in enumerate(rows)
     ]
-    heights = [
-        gap + line * max(len(first), *map(len, cells))
-        for first, (_, cells, _) in zip(shown, rows, strict=True)
-    ]
+    lines = (max(len(a), *map(len, cells)) for a, (_, cells, _) in zip(shown, rows, strict=True))
+    heights = [gap + line * n for n in lines]
     total = 0.85 + sum(heights)
     figure = Figure(figsize=(WIDTH + 2, total))
 
@@ -211,6 +185,10 @@ def clean_axes(axes: Axes, grid_axis: Any) -> None:
     axes.set_axisbelow(True)
 
 
+def _note(axes: Axes, text: str, at: Any, offset: tuple[int, int], style: dict[str, Any]) -> None:
+    axes.annotate(text, at, offset, textcoords="offset points", **style)
+
+
 def _threshold(name: str) -> str:
     """`1mm_10deg` as in print."""
     return name.replace("mm_", " mm\n").replace("deg", "°")
@@ -218,10 +196,6 @@ def _threshold(name: str) -> str:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _slug(name: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in name.lower())
 
 
 def _duration(seconds: float) -> str:

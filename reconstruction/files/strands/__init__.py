@@ -28,21 +28,14 @@ from reconstruction.geometry.strands import Strands
 
 __all__ = ["READABLE", "WRITABLE", "StrandFileError", "read_strands", "write_strands"]
 
+_USD = (".usd", ".usda", ".usdc")
 _READERS: dict[str, Callable[[Path], Strands]] = {
-    ".npz": read_npz,
-    ".hair": read_hair,
-    ".tfx": read_tfx,
-    ".data": read_data,
-    ".usd": read_usd,
-    ".usda": read_usd,
-    ".usdc": read_usd,
+    **{".npz": read_npz, ".hair": read_hair, ".tfx": read_tfx, ".data": read_data},
+    **dict.fromkeys(_USD, read_usd),
 }
 _WRITERS: dict[str, Callable[[Path, Strands], None]] = {
-    ".npz": write_npz,
-    ".hair": write_hair,
-    ".usd": write_usd,
-    ".usda": write_usd,
-    ".usdc": write_usd,
+    **{".npz": write_npz, ".hair": write_hair},
+    **dict.fromkeys(_USD, write_usd),
     ".abc": write_abc,
 }
 READABLE = tuple(_READERS)

@@ -39,13 +39,9 @@ def write_abc(path: Path, strands: Strands) -> None:
     points = imath.V3fArrayFromBuffer(turned.points)
     counts = imath.IntArrayFromBuffer(np.diff(strands.offsets).astype(np.int32))
     widths = imath.FloatArrayFromBuffer(width)
-    sample = AbcGeom.OCurvesSchemaSample(
-        points,
-        counts,
-        AbcGeom.CurveType.kLinear,
-        AbcGeom.CurvePeriodicity.kNonPeriodic,
-        AbcGeom.OFloatGeomParamSample(widths, scope),
-    )
+    kind = AbcGeom.CurveType.kLinear, AbcGeom.CurvePeriodicity.kNonPeriodic
+    width_sample = AbcGeom.OFloatGeomParamSample(widths, scope)
+    sample = AbcGeom.OCurvesSchemaSample(points, counts, *kind, width_sample)
     try:
         with writing(path) as temporary:
             archive = Abc.OArchive(str(temporary))

@@ -97,20 +97,12 @@ def write_hair(path: Path, strands: Strands) -> None:
         raise StrandFileError(f"{path}: .hair holds under 2^32 points, got {len(strands.points)}")
     vary = isinstance(strands.radius, np.ndarray)
     width = 2 * np.asarray(strands.radius, np.float32)
-    header = HEADER.pack(
-        b"HAIR",
-        len(strands),
-        len(strands.points),
-        SEGMENTS | POINTS | (THICKNESS if vary else 0),
-        0,
-        float(width.mean()) if width.size else 8e-5,
-        0.0,
-        *(0.5, 0.5, 0.5),
-        INFORMATION,
-    )
+    flags = SEGMENTS | POINTS | (THICKNESS if vary else 0)
+    thickness = float(width.mean()) if width.size else 8e-5
+    numbers = len(strands), len(strands.points), flags, 0, thickness, 0.0, 0.5, 0.5, 0.5
+    header = HEADER.pack(b"HAIR", *numbers, INFORMATION)
     with writing(path) as temporary, temporary.open("wb") as file:
-        file.write(header)
-        file.write(segments.astype("<u2").tobytes())
+        file.write(header + segments.astype("<u2").tobytes())
         file.write(strands.points.astype("<f4").tobytes())
         if vary:
             file.write(width.astype("<f4").tobytes())

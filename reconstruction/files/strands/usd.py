@@ -32,11 +32,8 @@ def read_usd(path: Path) -> Strands:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
     cache = UsdGeom.XformCache()
-    found = [
-        _curves(path, prim, cache, turn)
-        for prim in stage.Traverse()
-        if prim.IsA(UsdGeom.BasisCurves)
-    ]
+    hair = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves))
+    found = [_curves(path, prim, cache, turn) for prim in hair]
     if not found:
         raise StrandFileError(f"{path}: no BasisCurves in this stage")
     points, counts, radius = (np.concatenate(part) for part in zip(*found, strict=True))
