@@ -4,9 +4,9 @@ Alembic curves out.
     strands = read_strands("groom.hair")
     write_strands("groom.usdc", strands)
 
-The suffix says the format. Every reader raises `StrandFileError`, naming the file and what is
-wrong with it, and none trusts a header: what a header claims is held against the file's size
-before anything is allocated.
+The suffix says the format. The readers say what is wrong with a file, `read_strands` which it is,
+and none trusts a header: what it claims is held against the file's size before anything is
+allocated.
 """
 
 from __future__ import annotations
@@ -63,7 +63,10 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
         )
     if not path.is_file():
         raise StrandFileError(f"{path}: no such file")
-    strands = reader(path)
+    try:
+        strands = reader(path)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise StrandFileError(f"{path}: {error}") from error
     if up_axis == "y" and reader is not read_usd:
         return strands.transformed(_Y_UP_TO_Z_UP, np.zeros(3))
     return strands

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.files.durable import writing
-from reconstruction.files.strands.errors import StrandFileError, require_finite, strands_of
+from reconstruction.files.strands.errors import StrandFileError, require_finite
 from reconstruction.geometry.strands import Strands
 
 HEADER = struct.Struct("<4s4I5f88s")
@@ -33,22 +33,20 @@ def read_hair(path: Path) -> Strands:
     with path.open("rb") as file:
         head = file.read(HEADER.size)
         if len(head) < HEADER.size:
-            raise StrandFileError(
-                f"{path}: {len(head)} bytes, a .hair header has {HEADER.size}: truncated"
-            )
+            raise StrandFileError(f"{len(head)} bytes, a .hair header has {HEADER.size}: truncated")
         magic, strands, points, flags, default_segments, thickness, *_ = HEADER.unpack(head)
         if magic.upper() != b"HAIR":
-            raise StrandFileError(f"{path}: not a .hair file, it begins with {magic!r}")
+            raise StrandFileError(f"not a .hair file, it begins with {magic!r}")
         if not flags & POINTS:
-            raise StrandFileError(f"{path}: the header's flags {flags:#x} announce no points")
+            raise StrandFileError(f"the header's flags {flags:#x} announce no points")
         if flags >> 5:
-            raise StrandFileError(f"{path}: the header's flags {flags:#x} have unknown bits set")
+            raise StrandFileError(f"the header's flags {flags:#x} have unknown bits set")
         needed = HEADER.size + 2 * strands * bool(flags & SEGMENTS)
         per_point = 12 + 4 * bool(flags & THICKNESS) + 4 * bool(flags & TRANSPARENCY)
         needed += points * (per_point + 12 * bool(flags & COLOUR))
         if needed > size:
             raise StrandFileError(
-                f"{path}: truncated, or its counts are wrong: {strands} strands with {points} "
+                f"truncated, or its counts are wrong: {strands} strands with {points} "
                 f"points need {needed} bytes, the file has {size}"
             )
         if flags & SEGMENTS:
@@ -57,24 +55,23 @@ def read_hair(path: Path) -> Strands:
             segments = np.full(strands, default_segments, np.int64)
         else:
             raise StrandFileError(
-                f"{path}: {strands} strands of the default {default_segments} segments do not "
+                f"{strands} strands of the default {default_segments} segments do not "
                 f"make {points} points"
             )
         if segments.sum() + strands != points:
             raise StrandFileError(
-                f"{path}: the segments make {segments.sum() + strands} points, "
-                f"the header says {points}"
+                f"the segments make {segments.sum() + strands} points, the header says {points}"
             )
         start = file.tell()
         xyz = np.frombuffer(file.read(12 * points), "<f4").reshape(-1, 3)
-        require_finite(path, xyz, range(start, start + 12 * points, 12))
+        require_finite(xyz, range(start, start + 12 * points, 12))
         width = np.full(points, thickness, np.float32)
         if flags & THICKNESS:
             width = np.frombuffer(file.read(4 * points), "<f4")
     keep = np.repeat(segments > 0, segments + 1)
     counts = (segments + 1)[segments > 0]
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return strands_of(path, xyz[keep], offsets, _radius(width[keep]))
+    return Strands(xyz[keep], offsets, _radius(width[keep]))
 
 
 def _radius(width: np.ndarray) -> float | np.ndarray:

@@ -12,7 +12,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from reconstruction.files.durable import writing
-from reconstruction.files.strands.errors import StrandFileError, strands_of
+from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.geometry.strands import Strands
 
 DEFLATE_AT_BEST = 1032
@@ -23,18 +23,18 @@ def read_npz(path: Path) -> Strands:
     """Read an archive; other members than `points`, `offsets`, `radius` are not looked at."""
     try:
         with zipfile.ZipFile(path) as archive:
-            points = _member(path, archive, "points", "f")
-            offsets = _member(path, archive, "offsets", "iu")
+            points = _member(archive, "points", "f")
+            offsets = _member(archive, "offsets", "iu")
             radius: NDArray[Any] | float = 4e-5
             if "radius.npy" in archive.namelist():
-                radius = _member(path, archive, "radius", "f")
+                radius = _member(archive, "radius", "f")
     except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, OSError, NotImplementedError) as e:
-        raise StrandFileError(f"{path}: not a whole .npz archive ({e})") from e
+        raise StrandFileError(f"not a whole .npz archive ({e})") from e
     if points.ndim != 2 or points.shape[1] != 3:
-        raise StrandFileError(f"{path}: points must be (N, 3), got {points.shape}")
+        raise StrandFileError(f"points must be (N, 3), got {points.shape}")
     if isinstance(radius, np.ndarray) and radius.ndim == 0:
         radius = float(radius)
-    return strands_of(path, points, offsets, radius)
+    return Strands(points, offsets, radius)
 
 
 def write_npz(path: Path, strands: Strands) -> None:
@@ -44,17 +44,16 @@ def write_npz(path: Path, strands: Strands) -> None:
         np.savez(temporary, points=strands.points, offsets=strands.offsets, radius=radius)
 
 
-def _member(path: Path, archive: zipfile.ZipFile, name: str, kinds: str) -> NDArray[Any]:
+def _member(archive: zipfile.ZipFile, name: str, kinds: str) -> NDArray[Any]:
     """One array, read only if its header, its member and the file agree on its size."""
-    where = f"{path}: {name}"
     try:
         info = archive.getinfo(name + ".npy")
     except KeyError:
         held = [n.removesuffix(".npy") for n in archive.namelist()]
-        raise StrandFileError(f"{where} is missing; the archive holds {held}") from None
+        raise StrandFileError(f"{name} is missing; the archive holds {held}") from None
     if info.file_size > DEFLATE_AT_BEST * (info.compress_size + 64):
         raise StrandFileError(
-            f"{where}: {info.compress_size} compressed bytes cannot hold {info.file_size}"
+            f"{name}: {info.compress_size} compressed bytes cannot hold {info.file_size}"
         )
     with archive.open(info) as file:
         try:
@@ -66,18 +65,18 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str, kinds: str) -> NDAr
             else:
                 raise ValueError(f"unknown .npy version {version}")
         except ValueError as error:
-            raise StrandFileError(f"{where}: {error}") from error
+            raise StrandFileError(f"{name}: {error}") from error
         if dtype.kind not in kinds or dtype.hasobject:
-            raise StrandFileError(f"{where}: unexpected type {dtype}")
+            raise StrandFileError(f"{name}: unexpected type {dtype}")
         if any(n < 0 for n in shape):
-            raise StrandFileError(f"{where}: absurd shape {shape}")
+            raise StrandFileError(f"{name}: absurd shape {shape}")
         expected = math.prod(shape) * dtype.itemsize
         if expected > info.file_size:
             raise StrandFileError(
-                f"{where}: shape {shape} of {dtype} needs {expected} bytes, "
+                f"{name}: shape {shape} of {dtype} needs {expected} bytes, "
                 f"the archive has {info.file_size}"
             )
         data = file.read(expected)
     if len(data) != expected:
-        raise StrandFileError(f"{where}: truncated, {len(data)} of {expected} bytes")
+        raise StrandFileError(f"{name}: truncated, {len(data)} of {expected} bytes")
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy()

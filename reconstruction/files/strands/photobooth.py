@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.files.strands.errors import StrandFileError, require_finite, strands_of
+from reconstruction.files.strands.errors import StrandFileError, require_finite
 from reconstruction.geometry.strands import Strands
 
 
@@ -24,12 +24,12 @@ def read_data(path: Path) -> Strands:
     """
     raw = path.read_bytes()
     if len(raw) < 4:
-        raise StrandFileError(f"{path}: {len(raw)} bytes, a .data file has at least 4: truncated")
+        raise StrandFileError(f"{len(raw)} bytes, a .data file has at least 4: truncated")
     words = np.frombuffer(raw[: len(raw) // 4 * 4], "<i4")
     strands = int(words[0])
     if strands < 0 or 4 * (strands + 1) > len(raw):
         raise StrandFileError(
-            f"{path}: byte 0: {strands} strands need at least {4 * (strands + 1)} bytes, the file "
+            f"byte 0: {strands} strands need at least {4 * (strands + 1)} bytes, the file "
             f"has {len(raw)}: not a .data file, or truncated"
         )
     counts = np.zeros(strands, np.int64)
@@ -39,7 +39,7 @@ def read_data(path: Path) -> Strands:
         end = at + 1 + 3 * count
         if count < 0 or 4 * max(end, at + 1) > len(raw):
             raise StrandFileError(
-                f"{path}: byte {4 * at}: strand {i} of {strands} has {count} points, which end at "
+                f"byte {4 * at}: strand {i} of {strands} has {count} points, which end at "
                 f"byte {4 * max(end, at + 1)}, the file has {len(raw)}: truncated, or not a .data "
                 "file"
             )
@@ -47,7 +47,7 @@ def read_data(path: Path) -> Strands:
         at = end
     if 4 * at != len(raw):
         raise StrandFileError(
-            f"{path}: byte {4 * at}: the {strands} strands end here, the file has {len(raw)} "
+            f"byte {4 * at}: the {strands} strands end here, the file has {len(raw)} "
             "bytes: not a .data file, or its counts are wrong"
         )
     first = np.cumsum(np.concatenate([[2], 3 * counts[:-1] + 1])) if strands else counts
@@ -56,5 +56,5 @@ def read_data(path: Path) -> Strands:
     place = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts[keep])
     word = np.repeat(first[keep], counts[keep]) + 3 * place
     points = words.view("<f4")[word[:, None] + np.arange(3)]
-    require_finite(path, points, 4 * word)
-    return strands_of(path, points, offsets)
+    require_finite(points, 4 * word)
+    return Strands(points, offsets)

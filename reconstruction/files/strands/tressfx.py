@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.files.strands.errors import StrandFileError, require_finite, strands_of
+from reconstruction.files.strands.errors import StrandFileError, require_finite
 from reconstruction.geometry.strands import Strands
 
 _COUNTS = struct.Struct("<f2I")
@@ -36,34 +36,30 @@ def read_tfx(path: Path) -> Strands:
     with path.open("rb") as file:
         head = file.read(max(length for length, _, _ in _LAYOUTS.values()))
         if len(head) < _COUNTS.size:
-            raise StrandFileError(
-                f"{path}: {len(head)} bytes, a .tfx header has at least 160: truncated"
-            )
+            raise StrandFileError(f"{len(head)} bytes, a .tfx header has at least 160: truncated")
         version, strands, vertices = _COUNTS.unpack_from(head)
         if version not in _LAYOUTS:
             raise StrandFileError(
-                f"{path}: byte 0: TressFX version {version:.9g}, only 3 and 4 can be read"
+                f"byte 0: TressFX version {version:.9g}, only 3 and 4 can be read"
             )
         header, where, stride = _LAYOUTS[version]
         if len(head) < header:
             raise StrandFileError(
-                f"{path}: {len(head)} bytes, the header of a version {version:g} .tfx has {header}:"
+                f"{len(head)} bytes, the header of a version {version:g} .tfx has {header}:"
                 " truncated"
             )
         if vertices < 2:
-            raise StrandFileError(
-                f"{path}: byte 8: {vertices} vertices a strand, at least 2 are needed"
-            )
+            raise StrandFileError(f"byte 8: {vertices} vertices a strand, at least 2 are needed")
         (start,) = struct.unpack_from("<I", head, where)
         needed = start + stride * strands * vertices
         if start < header or needed > size:
             raise StrandFileError(
-                f"{path}: truncated, or its counts are wrong: {strands} strands of {vertices} "
+                f"truncated, or its counts are wrong: {strands} strands of {vertices} "
                 f"vertices from byte {start} end at byte {needed}, the file has {size} and its "
                 f"header {header}"
             )
         file.seek(start)
         data = np.frombuffer(file.read(stride * strands * vertices), "<f4")
     points = data.reshape(-1, stride // 4)[:, :3]
-    require_finite(path, points, range(start, needed, stride))
-    return strands_of(path, points, np.arange(strands + 1) * vertices)
+    require_finite(points, range(start, needed, stride))
+    return Strands(points, np.arange(strands + 1) * vertices)

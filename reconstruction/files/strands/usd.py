@@ -16,7 +16,7 @@ from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.files.durable import writing
-from reconstruction.files.strands.errors import StrandFileError, strands_of
+from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.geometry.strands import Strands
 
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -27,27 +27,27 @@ def read_usd(path: Path) -> Strands:
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise StrandFileError(f"{path}: cannot be read as USD ({_first_line(error)})") from error
+        raise StrandFileError(f"cannot be read as USD ({_first_line(error)})") from error
     turn = float(UsdGeom.GetStageMetersPerUnit(stage)) * np.eye(3)
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
     cache = UsdGeom.XformCache()
     hair = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves))
-    found = [_curves(path, prim, cache, turn) for prim in hair]
+    found = [_curves(prim, cache, turn) for prim in hair]
     if not found:
-        raise StrandFileError(f"{path}: no BasisCurves in this stage")
+        raise StrandFileError("no BasisCurves in this stage")
     points, counts, radius = (np.concatenate(part) for part in zip(*found, strict=True))
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     if len(radius) == 0:
-        return strands_of(path, points, offsets)
+        return Strands(points, offsets)
     same = bool((radius == radius[0]).all())
-    return strands_of(path, points, offsets, float(radius[0]) if same else radius)
+    return Strands(points, offsets, float(radius[0]) if same else radius)
 
 
-def _curves(path: Path, prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
+def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
     """Points in metres, vertex counts and per-point radii of one prim."""
     curves = UsdGeom.BasisCurves(prim)
-    where = f"{path}: {prim.GetPath()}"
+    where = prim.GetPath()
     if curves.GetTypeAttr().Get() != UsdGeom.Tokens.linear:
         raise StrandFileError(f"{where}: only linear curves can be read; convert the cubic ones")
     if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
