@@ -7,6 +7,7 @@ and renamed: after a crash it is the old one or the new one, whole.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,6 +52,18 @@ FILES = {
 """What a model folder may hold, by its place in it. Checkpoints are there while a fit runs."""
 
 
+_OF_APPEARANCE = (
+    "appearance.json",
+    "hair_maps.npz",
+    "lights.json",
+    "comparison.png",
+    "inverse_rendering.png",
+    "relit.png",
+    "relit.exr",
+    "render.png",
+    "plots",
+    "results.json",
+)
 _RECONSTRUCT = "hairstage reconstruct CAPTURE --out"
 
 
@@ -83,8 +96,17 @@ class Model:
         return self.file(name).exists()
 
     def remove(self, name: str) -> None:
-        """Remove a file where it is there."""
-        self.file(name).unlink(missing_ok=True)
+        """Remove a file, or a folder of files, where it is there."""
+        path = self.file(name)
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+    def forget_appearance(self) -> None:
+        """Remove every fit to the strands, and the pictures and figures of it."""
+        for name in _OF_APPEARANCE:
+            self.remove(name)
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
@@ -108,7 +130,9 @@ class Model:
         return read_strands(self._needed("strands.npz", _RECONSTRUCT))
 
     def write_strands(self, strands: Strands) -> None:
-        """Write the strands in all three formats."""
+        """Write the strands in all three formats; what was made of others is removed first."""
+        self.forget_appearance()
+        self.remove("scalp_map.npz")
         for suffix in ("npz", "hair", "usdc"):
             write_strands(self.file(f"strands.{suffix}"), strands)
 

@@ -62,13 +62,13 @@ def reconstruct(
     `motion` is the subject's where it is known from elsewhere; None solves for it.
 
     Writes `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`, `scalp_map.npz`,
-    `masks/*.png`, `head.obj` where the capture has none, and `report.json`, whose stages of the
-    same name are replaced. Raises `CaptureError` where the capture lacks what the method cannot do
-    without: OLAT frames, a head or points to fit one to, two cameras.
+    `masks/*.png`, `head.obj` where the capture has none, and `report.json`. What was made of the
+    model's earlier strands is removed. Raises `CaptureError` where the capture lacks what the
+    method cannot do without: OLAT frames, a head or points to fit one to, two cameras.
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
-    stages = _Stages(model.create(), options, progress, model.report())
+    stages = _Stages(model.create(), options, progress, Report())
     whole = stages.undistorted(capture)
     capture = _without(whole, options.held_out)
     head = stages.known_head(capture)

@@ -81,9 +81,10 @@ def fit(
             stage.warn("no camera sees skin: its colour is a guess")
     v = float(variance_of_roughness(corrected))
     found = (colours.hair, colours.colour, colours.skin, exposure)
-    FittedAppearance(*found, v, plain.v, printed).save(model)
-    for stale in ("hair_maps.npz", "lights.json", "inverse_rendering.png"):
-        model.remove(stale)
+    model.forget_appearance()
+    FittedAppearance(*found, v, plain.v, printed, held_out).save(model)
+    for stale in ("inverse_rendering", "images"):
+        report.drop(stale)
     model.write_report(report)
     progress("appearance fitted", 1.0)
     return report

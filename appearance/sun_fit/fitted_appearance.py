@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from appearance.metrics.scores import Exposure
+from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
 from reconstruction import Model, ModelError
 
@@ -17,7 +18,8 @@ class FittedAppearance:
     `hair` is what to render with, `colour (3,)` the multiple-scattering albedo behind its
     absorption, `skin (3,)` a diffuse albedo, `exposure` the capture's. `v` is the longitudinal
     variance behind `hair.beta_m`; `plain_v` and `printed_v` are what the captured lobe reads before
-    the correction by rendering, with a floor and (as Sun's Eq. 10) without.
+    the correction by rendering, with a floor and (as Sun's Eq. 10) without. `held_out` is what
+    the fit did not observe.
     """
 
     hair: HairAppearance
@@ -27,11 +29,23 @@ class FittedAppearance:
     v: float
     plain_v: float
     printed_v: float
+    held_out: HeldOut
 
     def save(self, model: Model) -> None:
         """Write `appearance.json`."""
         data = {**asdict(self), "hair": self.hair.to_dict(), "exposure": self.exposure.scale}
         model.write_json("appearance.json", data)
+
+    @classmethod
+    def is_of(cls, model: Model, held_out: HeldOut) -> bool:
+        """Whether the model has an appearance whose fit left out these cameras and lights."""
+        if not model.has("appearance.json"):
+            return False
+        made = cls.load(model).held_out
+        return all(
+            set(a) == set(b)
+            for a, b in ((made.cameras, held_out.cameras), (made.lights, held_out.lights))
+        )
 
     @classmethod
     def load(cls, model: Model) -> FittedAppearance:
@@ -44,7 +58,10 @@ class FittedAppearance:
                 (colour[0], colour[1], colour[2]),
                 (skin[0], skin[1], skin[2]),
                 Exposure(float(data["exposure"])),
-                *(float(data[k]) for k in ("v", "plain_v", "printed_v")),
+                float(data["v"]),
+                float(data["plain_v"]),
+                float(data["printed_v"]),
+                HeldOut(*(tuple(data["held_out"][k]) for k in ("cameras", "lights"))),
             )
         except (KeyError, IndexError, TypeError, ValueError) as error:
             path = model.file("appearance.json")

@@ -109,6 +109,20 @@ def test_roots_on_the_map_are_those_of_these_strands(model: Model) -> None:
     assert model.root_uv(Strands.from_list([np.eye(3)])) is None  # a map of other strands
 
 
+def test_new_strands_leave_nothing_that_was_made_of_others(model: Model) -> None:
+    kept = ["masks/left_hair.png", "progress.json", "strands.hair", "strands.npz", "strands.usdc"]
+    model.write_mask("left", "hair", np.ones((2, 2), bool))
+    model.write_json("progress.json", {})
+    for name in ("appearance.json", "lights.json", "results.json"):
+        model.write_json(name, {})
+    for name in ("hair_maps.npz", "scalp_map.npz"):
+        model.write_arrays(name, {"roots": np.zeros((2, 2))})
+    for name in ("comparison.png", "relit.png", "render.png", "plots/geometry.png"):
+        model.write_png(name, np.zeros((2, 2), np.uint8))
+    model.write_strands(HAIR)
+    assert [str(p) for p in model.listing()] == kept
+
+
 def test_what_is_listed_is_whole_and_inside(model: Model, tmp_path: Path) -> None:
     model.write_strands(HAIR)
     model.write_points(PointCloud.empty(("left",), ()))

@@ -34,11 +34,13 @@ def run(args: argparse.Namespace, output: Output) -> None:
     """The hair's appearance from a capture and its strands.
 
     Write MODEL/appearance.json: roughness and colour of hair and skin (method sun).
-    inverse_rendering goes on from there, with a sun fit first where there is none: hair that varies
-    over the scalp and along strands, and the lights as they are found, in MODEL/hair_maps.npz and
-    lights.json; stopped, it goes on where it was. With held-out cameras or lights, judge the model
-    on them.
+    inverse_rendering goes on from there, with a sun fit first where there is none that held out the
+    same: hair that varies over the scalp and along strands, and the lights as they are found, in
+    MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With held-out cameras or
+    lights, judge the model on them.
     """
+    from appearance import HeldOut
+    from appearance.sun_fit.fitted_appearance import FittedAppearance
     from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
@@ -53,7 +55,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     }
     options = parse_options(JobOptions, asked)
     data: dict[str, Any] = {"model": str(model), "method": args.method}
-    if not inverse or not model.has("appearance.json"):
+    held_out = HeldOut(options.held_out_cameras, options.held_out_lights)
+    if not (inverse and FittedAppearance.is_of(model, held_out)):
         with progress_bar("sun") as progress:
             fit(StepContext(args.capture, model, options, progress))
     if inverse:

@@ -59,7 +59,7 @@ def made(plain, tufted, tmp_path_factory):
     writer.finish("completed", {})
     start = HairAppearance((0.2, 0.2, 0.2), 0.4, 0.3)
     skin = (0.3, 0.3, 0.3)
-    FittedAppearance(start, skin, skin, Exposure(plain.scale), 0.1, 0.1, 0.1).save(model)
+    FittedAppearance(start, skin, skin, Exposure(plain.scale), 0.1, 0.1, 0.1, HeldOut()).save(model)
     return Capture(folder / "capture"), model
 
 

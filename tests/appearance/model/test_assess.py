@@ -72,7 +72,7 @@ def made(tmp_path_factory):
         model.write_mask(camera.name, "hair", mask)
     writer.finish("completed", {})
     exposure = Exposure.of(bright)
-    FittedAppearance(TRUTH, (0.1,) * 3, (0.3,) * 3, exposure, 0.1, 0.1, 0.1).save(model)
+    FittedAppearance(TRUTH, (0.1,) * 3, (0.3,) * 3, exposure, 0.1, 0.1, 0.1, HeldOut()).save(model)
     return Capture(folder / "capture"), model, scene
 
 

@@ -14,6 +14,7 @@ from appearance import (
     Exposure,
     FittedModel,
     HairAppearance,
+    HeldOut,
     Sampling,
     render_environment,
     render_olat,
@@ -43,7 +44,7 @@ def model(strands, root_uv, tmp_path_factory):
     model.write_strands(strands)
     maps.save(model, root_uv)
     skin = (0.3, 0.2, 0.1)
-    FittedAppearance(HAIR, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1).save(model)
+    FittedAppearance(HAIR, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()).save(model)
     return model
 
 

@@ -29,6 +29,7 @@ from reconstruction.geometry.lights import dome_positions
 
 TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.25, 0.2)
 SKIN = (0.4, 0.3, 0.2)
+LEFT_OUT = HeldOut(("cam_2",), ("l5", "l7"))
 OPTIONS = FitOptions(
     hair_pixels=200, skin_pixels=40, roughness_cameras=2, roughness_spp=36, colour_spp=16
 )
@@ -88,6 +89,7 @@ def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.25)
     np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.2)
     np.testing.assert_allclose(appearance.skin, SKIN, rtol=0.05)
+    assert appearance.held_out == HeldOut(("cam_2",), ("l5",))
     assert appearance.v == pytest.approx(float(variance_of_roughness(appearance.hair.beta_m)))
 
 
@@ -148,10 +150,13 @@ def test_saturated_samples_are_not_valid(made, tmp_path):
 
 
 def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
-    a = FittedAppearance(TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3)
+    a = FittedAppearance(TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT)
     model = Model(tmp_path)
+    assert not FittedAppearance.is_of(model, LEFT_OUT)
     a.save(model)
     assert FittedAppearance.load(model) == a
+    assert FittedAppearance.is_of(model, HeldOut(("cam_2",), ("l7", "l5")))
+    assert not FittedAppearance.is_of(model, HeldOut(("cam_2",)))
     path = tmp_path / "appearance.json"
     data = json.loads(path.read_text())
     del data["skin"]

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from appearance import Exposure, HairAppearance
+from appearance import Exposure, HairAppearance, HeldOut
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Model
 from stage_service.jobs.evaluation import evaluate_appearance
@@ -23,9 +23,9 @@ def test_one_colour_under_two_azimuthal_roughnesses_is_one_colour(tmp_path):
     ours = HairAppearance((0.1, 0.2, 0.4), 0.5, 0.2)
     factor = (chiang(0.2) / chiang(0.6)) ** 2
     true = HairAppearance(tuple(factor * s for s in ours.sigma_a), 0.3, 0.6)
-    FittedAppearance(ours, (0.5,) * 3, (0.4, 0.3, 0.2), Exposure(1.0), 0.2, 0.2, 0.2).save(
-        Model(tmp_path)
-    )
+    FittedAppearance(
+        ours, (0.5,) * 3, (0.4, 0.3, 0.2), Exposure(1.0), 0.2, 0.2, 0.2, HeldOut()
+    ).save(Model(tmp_path))
     truth = tmp_path / "truth.json"
     truth.write_text(json.dumps({"hair": true.to_dict(), "skin": [0.5, 0.4, 0.3]}))
     figures = evaluate_appearance(Model(tmp_path), truth)
