@@ -118,7 +118,7 @@ def usable_masks(
         stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
     if not any(mask.hair.any() for mask in out.values()):
         raise CaptureError(
-            f"{capture.path}: no pixel of any camera is hair: check the lamps, the cameras' poses "
+            f"{capture.path}: no pixel of any camera is hair: check the lights, the cameras' poses "
             "and, where given, the hair masks"
         )
     if len(out) < 2:

@@ -116,14 +116,14 @@ class Model:
         with writing(path) as temporary:
             yield temporary
 
-    def listing(self) -> list[Path]:
-        """The files that are whole, relative to the folder, in order."""
+    def artifacts(self) -> dict[str, Path]:
+        """The files that are whole, by their names relative to the folder, in order."""
         root = self.path.resolve()
-        return [
-            p.relative_to(root)
+        return {
+            p.relative_to(root).as_posix(): p
             for p in sorted(root.rglob("*"))
             if p.is_file() and not p.name.startswith(PART) and p.resolve().is_relative_to(root)
-        ]
+        }
 
     def strands(self) -> Strands:
         """The strands. Raises `ModelError` where there are none yet."""

@@ -20,7 +20,7 @@ from reconstruction.arrays import Array
 from simulators.frames.frames import Snapshot
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps
-from simulators.peers.projector_controller import ProjectorController, Show
+from simulators.peers.projector_controller import Show, SimulatedProjectorController
 
 Counts = NDArray[np.uint16]
 MakeCounts = Callable[[str, Snapshot, float], Counts]
@@ -70,7 +70,7 @@ class World:
         self.rig, self.lamps, self.faults = rig, lamps, faults
         self._make, self._log = make, log
         self._pulses = self._fired = self._pose = 0
-        self.projectors = ProjectorController(
+        self.projectors = SimulatedProjectorController(
             rig.projectors, partial(self.begun, "projectors", "blank")
         )
         lamps.cut_by(self.safety)

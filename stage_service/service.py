@@ -230,17 +230,15 @@ class Service:
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
-        model = Model(self._queue.get(job_id).model)
-        return [
-            Artifact(path=str(p), bytes=(model.path / p).stat().st_size) for p in model.listing()
-        ]
+        files = Model(self._queue.get(job_id).model).artifacts()
+        return [Artifact(path=name, bytes=p.stat().st_size) for name, p in files.items()]
 
     def artifact(self, job_id: str, path: str) -> Path:
         """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
-        model = Model(self._queue.get(job_id).model)
-        if Path(path) not in model.listing():
+        file = Model(self._queue.get(job_id).model).artifacts().get(path)
+        if file is None:
             raise UnknownArtifact(f"job {job_id} has no file {path!r}")
-        return model.path / path
+        return file
 
     def devices(self) -> dict[str, Any]:
         """Each device and whether it answers; "safety": whether the lamps are known to be off."""

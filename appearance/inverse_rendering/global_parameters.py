@@ -17,7 +17,7 @@ import numpy as np
 from appearance.inverse_rendering import losses
 from appearance.inverse_rendering.batches import Batch, Comparison
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import Raw
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
@@ -52,7 +52,7 @@ class Evidence:
 
 
 def solve_global_parameters(
-    problem: Problem,
+    problem: FitProblem,
     raw: Raw,
     gain: Array,
     names: Sequence[str],
@@ -119,7 +119,7 @@ def _moved(raw: Raw, gain: Array, number: Number, d: float) -> tuple[Raw, Array]
 class _System:
     """The normal equations of some pixels, about which everything is flat over patches `(N,)`."""
 
-    problem: Problem
+    problem: FitProblem
     numbers: Sequence[Number]
     evidence: Evidence
     turn: int

@@ -18,7 +18,7 @@ from appearance.bsdf.maps import HairMaps
 from appearance.bsdf.parameters import StrandHit
 from appearance.inverse_rendering.batches import Patch
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import BRACKET, Raw, decode, encode_absorption
 from appearance.observations import Observed
 from appearance.render.paths import Surface, jittered, stream
@@ -32,7 +32,7 @@ _WIDE = 0.02
 
 
 def absorption_of_cells(
-    problem: Problem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 12, seed: int = 0
+    problem: FitProblem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 12, seed: int = 0
 ) -> HairMaps:
     """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
 
@@ -60,7 +60,7 @@ def absorption_of_cells(
     return replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
 
 
-def visible_cells(problem: Problem, o: Observed, shape: Shape, seed: int) -> Ints:
+def visible_cells(problem: FitProblem, o: Observed, shape: Shape, seed: int) -> Ints:
     """Cells that rays through the pixels meet first `(P, 8)`, as flat indices; -1 where none."""
     count = len(o.pixels) * _RAYS
     lane = dr.arange(mi.UInt32, count)

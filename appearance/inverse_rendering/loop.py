@@ -19,7 +19,7 @@ from appearance.inverse_rendering.checkpoint import State
 from appearance.inverse_rendering.global_parameters import WIDE, Evidence, solve_global_parameters
 from appearance.inverse_rendering.initial_absorption import absorption_of_cells
 from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
-from appearance.inverse_rendering.problem import Objective, Problem, ValidationSet
+from appearance.inverse_rendering.problem import FitProblem, Objective, ValidationSet
 from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
@@ -79,7 +79,7 @@ class Monitor:
 
 
 def run(
-    problem: Problem,
+    problem: FitProblem,
     maps: HairMaps,
     lights: LightDeviations | None = None,
     *,
@@ -96,7 +96,7 @@ def run(
 class _Fit:
     def __init__(
         self,
-        problem: Problem,
+        problem: FitProblem,
         maps: HairMaps,
         lights: LightDeviations,
         options: InverseRenderingOptions,

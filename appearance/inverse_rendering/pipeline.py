@@ -12,7 +12,7 @@ from appearance.inverse_rendering.found_lights import lights_as_found, save_ligh
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import Monitor, Outcome, run
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
 from appearance.observations import HeldOut, observe_hair
@@ -63,7 +63,7 @@ def fit_maps(
             found = bounce_limit(scene, o.camera, 0.01, pixels=o.pixels, seed=seed)
             depth = min(found.depth, MOST_DEPTH)
         options = replace(request.fit, effort=replace(request.fit.effort, max_depth=depth))
-        problem = Problem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
+        problem = FitProblem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
         start = HairMaps.of(fitted.hair)
         fit = _Fit(problem, model, stage, progress, seed)
         one_colour = fit.run(replace(options, variant="original"), start, None, (0.05, 0.3))
@@ -108,7 +108,7 @@ def root_uv(model: Model, strands: Strands, head: Mesh | None) -> Array:
 class _Fit:
     """What the fit of one colour and that of the maps share."""
 
-    problem: Problem
+    problem: FitProblem
     model: Model
     stage: Stage
     progress: Progress

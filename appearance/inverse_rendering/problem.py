@@ -32,7 +32,7 @@ ValidationSet = Sequence[tuple[Patch, Array]]
 class Objective:
     """What a step minimises, by the numbers called `free`.
 
-    `error` is about what `Problem.error` says, of which the root is taken; `smooth` adds the
+    `error` is about what `FitProblem.error` says, of which the root is taken; `smooth` adds the
     smoothness along strands.
     """
 
@@ -41,7 +41,7 @@ class Objective:
     smooth: bool = False
 
 
-class Problem:
+class FitProblem:
     """Hair pixels of `views` under `lights`, the geometry, and the exposure `scale`.
 
     All views have the same lights; `skin (3,)`. Rendered and captured values are in exposure units

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.render.lights import LightBank
+from appearance.render.lights import PackedLights
 from appearance.render.paths import Surface, Wave, continue_path, each_sample, pixel_indices
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, HairScene
@@ -73,7 +73,7 @@ class DifferentiableOlat:
         self.guide = guide
         self.index = pixel_indices(camera, pixels)
         self.sampling = sampling
-        self._bank = LightBank.of(self.lights)
+        self._bank = PackedLights.of(self.lights)
 
     def parameters(self) -> dict[str, Any]:
         """Copies of the values that scene and lights have, by name, for `dr.enable_grad`.
@@ -120,7 +120,7 @@ class DifferentiableOlat:
         return mi.traverse(self.scene.hair_bsdf) if self.scene.hair_bsdf is not None else {}
 
     @contextmanager
-    def _applied(self, values: Mapping[str, Any]) -> Iterator[tuple[Surface, LightBank]]:
+    def _applied(self, values: Mapping[str, Any]) -> Iterator[tuple[Surface, PackedLights]]:
         """Surface and lights with these values, in scene units; the BSDF gets its own back."""
         before = self.parameters()
         self._set_hair(values)
@@ -251,7 +251,7 @@ class _Walk:
 
     owner: DifferentiableOlat
     surface: Surface
-    bank: LightBank
+    bank: PackedLights
     paths: Wave
     film: Any | None
     share: Any | None

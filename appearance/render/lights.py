@@ -21,7 +21,7 @@ from reconstruction.geometry.light_profiles import POLAR_FRAMES, LightProfile
 
 
 @dataclass(frozen=True)
-class LightBank:
+class PackedLights:
     """Lights in scene units, an array of one number after the other for each property.
 
     `positions`, `intensities (3 L,)` are there always. `orientations (9 L,)`, `radii (L,)`,
@@ -42,7 +42,7 @@ class LightBank:
     turns: Any | None = None
 
     @classmethod
-    def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> LightBank:
+    def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> PackedLights:
         """The bank of `lights`, their intensities times `weights`, which broadcast to `(L, 3)`."""
         position, intensity = light_arrays(lights)
         intensity = (intensity * np.asarray(weights, float)).astype(np.float32)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment import Sky
 from appearance.render.environment_maps import check_environment
-from appearance.render.lights import LightBank
+from appearance.render.lights import PackedLights
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface
 from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
@@ -65,7 +65,7 @@ def render_mixed(
         gather = _Gather(
             Surface(scene),
             dr.zeros(mi.Float, 3 * len(index)),
-            LightBank.of(lights, weight / choice[:, None]) if lights else None,
+            PackedLights.of(lights, weight / choice[:, None]) if lights else None,
             mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if lights else None,
             [
                 (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
@@ -105,7 +105,7 @@ class _Gather:
 
     surface: Surface
     film: Any
-    bank: LightBank | None
+    bank: PackedLights | None
     choice: Any
     skies: Sequence[tuple[Sky, Array]]
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
-from appearance.render.lights import LightBank
+from appearance.render.lights import PackedLights
 from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
 from appearance.render.tracing import (
     PathLimits,
@@ -113,7 +113,7 @@ class _Plan:
         """Mean over `spp` paths a pixel: `(L, P, 3)`."""
         count, slots = len(self.lights), opaque_index(len(index))
         film, surface = dr.zeros(mi.Float, 3 * count * len(index)), Surface(self.scene)
-        bank, dim = LightBank.of(self.lights), mi.Float(self.dim)
+        bank, dim = PackedLights.of(self.lights), mi.Float(self.dim)
         gather = _Gather(surface, film, slots, bank, dim, self.counts)
         follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
         image = np.array(film).reshape(count, 3, len(index)).transpose(0, 2, 1)
@@ -164,7 +164,7 @@ class _Gather:
     surface: Surface
     film: Any
     slots: Any
-    bank: LightBank
+    bank: PackedLights
     dim: Any
     counts: tuple[int, int]
 

@@ -24,8 +24,8 @@ from appearance.sun_fit.mirror_samples import MirrorSamples, binned, mirror_ligh
 from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import (
     Colours,
+    FitPixels,
     Lobe,
-    Pixels,
     fit_colour,
     fit_lobe,
     fit_lobe_as_printed,
@@ -97,7 +97,7 @@ def _observed(
     stage: Stage,
     progress: Progress,
     seed: int,
-) -> Pixels:
+) -> FitPixels:
     rng = np.random.default_rng(seed)
     cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
     hair, skin, seen = [], [], 0
@@ -127,10 +127,10 @@ def _observed(
             "means and lobes are known to a per cent from the others",
             f"{1 - kept / seen:.0%} of the renderings",
         )
-    return Pixels(hair, skin)
+    return FitPixels(hair, skin)
 
 
-def _reached(training: Capture, pixels: Pixels, exposure: Exposure, stage: Stage) -> Pixels:
+def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
     """Leave out the lights that reach no hair pixel of any camera."""
     hair, noise = pixels.hair, 0.0
     for o in hair[:1]:
@@ -151,7 +151,7 @@ def _reached(training: Capture, pixels: Pixels, exposure: Exposure, stage: Stage
     if len(lit) == 0:
         raise ValueError(f"{training.path}: no light reaches a hair pixel")
     stage.figures["lights_that_reach_hair"] = len(lit)
-    return Pixels([o.under(lit) for o in hair], [o.under(lit) for o in pixels.skin])
+    return FitPixels([o.under(lit) for o in hair], [o.under(lit) for o in pixels.skin])
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class SunFit:
     """The observations and the geometry that the two fits share."""
 
     scene: HairScene
-    pixels: Pixels
+    pixels: FitPixels
     options: FitOptions
     seed: int
     progress: Progress

@@ -120,7 +120,7 @@ def match_roughness(
 
 
 @dataclass(frozen=True, eq=False)
-class Pixels:
+class FitPixels:
     """What the cameras observed: hair, and skin where they see some."""
 
     hair: Sequence[Observed]
@@ -144,7 +144,7 @@ class Colours:
 
 def fit_colour(
     scene: HairScene,
-    pixels: Pixels,
+    pixels: FitPixels,
     *,
     start: Array | None = None,
     iterations: int = 5,

@@ -47,7 +47,7 @@ class MissingFrame(CaptureError):
 class Step:
     """One commanded exposure of every camera.
 
-    `level` scales the lamps (`olat`, `all_on`) or the projector (`scanline`, `tracking`: all
+    `level` scales the lights (`olat`, `all_on`) or the projector (`scanline`, `tracking`: all
     projectors on), 0 to 1; `exposure` is in seconds.
     """
 
@@ -121,7 +121,7 @@ class Capture:
         """The capture as if it had only these `cameras` and `lights`, and with pinholes if asked.
 
         Both in the rig's order; None keeps those that this view has. `lights` are those that are
-        shot one at a time; the rig keeps its lamps. `undistorted` resamples frames and masks of
+        shot one at a time; the rig keeps its lights. `undistorted` resamples frames and masks of
         lenses that bend lines as they are read; False takes them as shot. The view reads the same
         folder; this one stays as it is. Raises `CaptureError` for names that are not there.
         """
@@ -189,7 +189,7 @@ class Capture:
         return record is not None and record.file is not None
 
     def frame(self, step: Step, camera: str) -> Floats:
-        """Scene-linear radiance `(H, W, 3)`, W/(sr m²), as exposed: at the step's lamp level.
+        """Scene-linear radiance `(H, W, 3)`, W/(sr m²), as exposed: at the step's light level.
 
         Noise may push dark pixels below zero. Raises `MissingFrame`.
         """

@@ -124,6 +124,11 @@ def _refuse_others(table: dict[str, Any], known: set[str], where: str) -> None:
         raise RigError(f"{where}: unknown fields {sorted(unknown)}; known are {sorted(known)}")
 
 
+_DOME_FIELDS = {
+    *("lights", "intensity", "radius", "lowest_deg", "beside_cameras_at"),
+    *("profile", "size", "roll_deg", "light_radius"),
+}
+
 _OWN_FIELDS: dict[type[Pinhole], tuple[str, ...]] = {
     Camera: ("distortion", "filter_sigma"),
     Projector: ("intensity", "line_sigma"),
@@ -221,6 +226,7 @@ def _lights(
     if dome is None:
         return lights
     count, intensity, radius = _take(dome, "[dome]", "lights", "intensity", "radius")
+    _refuse_others(dome, _DOME_FIELDS, "[dome]")
     positions = dome_positions(int(count), float(radius), float(dome.get("lowest_deg", -90.0)))
     beside: dict[int, str] = {}
     offset = float(dome.get("beside_cameras_at", 0.0))
@@ -232,8 +238,8 @@ def _lights(
             beside[nearest] = camera.name
             positions[nearest] = camera.center - offset * camera.R[1]
     shared = {f: dome[f] for f in ("profile", "size", "roll_deg") if f in dome}
-    if "lamp_radius" in dome:  # the dome's own `radius` is how far out the lights stand
-        shared["radius"] = dome["lamp_radius"]
+    if "light_radius" in dome:  # the dome's own `radius` is how far out the lights stand
+        shared["radius"] = dome["light_radius"]
     shared["intensity"] = intensity
     for i, p in enumerate(positions):
         table = {"name": f"light_{i:03d}", "position": p, "beside": beside.get(i), **shared}

@@ -1,6 +1,6 @@
-"""What tells hair from skin without geometry: how pixels answer lamps, and how fine lines are.
+"""What tells hair from skin without geometry: how pixels answer lights, and how fine lines are.
 
-A matte surface answers half of the lamps by `albedo n·l`; fibres mirror a few lamps and hide from
+A matte surface answers half of the lights by `albedo n·l`; fibres mirror a few lights and hide from
 the others. Skin is smooth at the width of a few pixels; fibres are lines there.
 """
 
@@ -27,18 +27,18 @@ _ONE_CLASS = 3.0
 
 
 def light_contrast(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Array | None:
-    """How unlike a matte surface each pixel answers single lamps: log ratio `(H, W)`, 0 for matte.
+    """How unlike a matte surface each pixel answers single lights: log ratio `(H, W)`, 0 for matte.
 
-    The deviation over the mean of the answers to a dome of lamps is 1.29 for a matte surface in the
-    open, up to 2 with half of the lamps in its own shadow; fibres mirror few and reach 2 to 7.
-    Smoothed over 3×3 pixels. None where under eight lamps were shot.
+    The deviation over the mean of the answers to a dome of lights is 1.29 for a matte surface in
+    the open, up to 2 with half of the lights in its own shadow; fibres mirror few: 2 to 7.
+    Smoothed over 3×3 pixels. None where under eight lights were shot.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
     if len(names) < 8:
         return None
     names = names[:: max(1, len(names) // lights)]
-    lamps = [capture.rig.light(n).intensity_towards(np.zeros(3)) for n in names]
-    power = np.array([max(intensity.mean(), 1e-12) for intensity in lamps])
+    intensities = [capture.rig.light(n).intensity_towards(np.zeros(3)) for n in names]
+    power = np.array([max(intensity.mean(), 1e-12) for intensity in intensities])
     values = capture.olat(camera, names).mean(axis=-1) / power[:, None, None]
     mean = np.maximum(values.mean(axis=0), 0)
     ratio = np.divide(values.std(axis=0), mean, out=np.ones_like(mean), where=mean > 0)

@@ -72,7 +72,7 @@ def lit_image(capture: Capture, camera: str) -> Floats:
 
 
 def lit_rgb(capture: Capture, camera: str) -> Floats:
-    """The subject under as many lamps as the capture has, less the dark frame `(H, W, 3)`.
+    """The subject under as many lights as the capture has, less the dark frame `(H, W, 3)`.
 
     The all-on frames' mean at full level, else the sum of the OLAT frames, else the first tracking
     frame. Raises `NoSilhouette` where the camera has none of them.

@@ -19,7 +19,7 @@ from simulators.peers.modbus_rtu import ModbusRtuPeer
 from simulators.peers.modbus_tcp import ModbusTcpPeer
 from simulators.peers.modbus_unit import DisturbedUnit, ModbusUnit
 from simulators.peers.serial_peer import SerialPeer
-from simulators.peers.trigger_box import TriggerBox
+from simulators.peers.trigger_box import SimulatedTriggerBox
 from simulators.world import World
 from stage_service.config import (
     DevicesConfig,
@@ -85,7 +85,7 @@ class SimulatedStage:
         cameras = CameraLink(world, self.sensor, camera_host, camera_port)
         stack.callback(cameras.stop)
         camera_port = cameras.start()
-        trigger = TriggerBox(world, world.faults)
+        trigger = SimulatedTriggerBox(world, world.faults)
         stack.callback(trigger.stop)
         serial = {"trigger": trigger.reply, "projectors": world.projectors.reply}
         paths = {}

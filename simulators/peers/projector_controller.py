@@ -52,7 +52,7 @@ class Entry:
 DARK = (Show(), "OFF")
 
 
-class ProjectorController:
+class SimulatedProjectorController:
     """Answers lines; `SerialPeer` carries them. Safe to call from several threads.
 
     The watchdog needs no thread of its own: whoever looks first puts the projectors dark where the

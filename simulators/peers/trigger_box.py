@@ -76,7 +76,7 @@ class _Stopped(Exception):
     """The table was stopped while a step waited."""
 
 
-class TriggerBox:
+class SimulatedTriggerBox:
     """Answers lines, which `SerialPeer` carries, and runs its table on a thread of its own.
 
     End with `stop`. The lock is held while the table acts and released while it waits.

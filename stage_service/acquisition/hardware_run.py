@@ -10,7 +10,7 @@ from typing import Literal
 
 from reconstruction import Step
 from stage_service.devices.cameras.fan_out import FanOut
-from stage_service.devices.cameras.interface import Camera, Frame
+from stage_service.devices.cameras.interface import CameraDevice, Frame
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, IndexShift, SafetyRefusal
 from stage_service.devices.lights.interface import LightBank, Lit
@@ -97,7 +97,7 @@ class HardwareRun:
         return Shots(frames, progress, early)
 
     def _collect(
-        self, camera: Camera, over: threading.Event, cancel: threading.Event
+        self, camera: CameraDevice, over: threading.Event, cancel: threading.Event
     ) -> list[Frame]:
         frames: list[Frame] = []
         while True:

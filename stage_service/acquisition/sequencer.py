@@ -18,7 +18,7 @@ from stage_service.acquisition.sentinels import check_sentinels
 from stage_service.acquisition.states import Machine, Outcome, State, WrongState
 from stage_service.acquisition.timings import Timings
 from stage_service.devices.cameras.fan_out import FanOut
-from stage_service.devices.cameras.interface import Camera, Frame
+from stage_service.devices.cameras.interface import CameraDevice, Frame
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
@@ -309,7 +309,7 @@ class Sequencer:
             again = attempt < self._retries
             self._notify("capture.frame_missing", {**lost, "shot_again": again})
 
-    def _account(self, camera: Camera, frame: Frame | None, pulse: Pulse) -> None:
+    def _account(self, camera: CameraDevice, frame: Frame | None, pulse: Pulse) -> None:
         account = self._accounts[camera.name]
         if frame is None:
             # It may still come, and must not pass for the next pulse's.
@@ -331,7 +331,7 @@ class Sequencer:
             account.armed()
         self._armed, self._doubtful = exposure, False
 
-    def _drain(self, camera: Camera) -> None:
+    def _drain(self, camera: CameraDevice) -> None:
         """Drop frames that came late for pulses counted as missed; others raise `IndexShift`, and
         the frames since the last time are taken back: resumed, the capture shoots them again."""
         try:

@@ -7,6 +7,7 @@ import argparse
 import json
 import shutil
 import time
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +52,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     its job, which judges the result against the truth, and print the figures. Everything is left in
     OUT; an earlier demo's results there are replaced.
     """
-    from reconstruction import Rig
+    from reconstruction import Model, Rig
     from reconstruction.array_backend import chosen_variant
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
@@ -80,7 +81,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
             job = _job(children, service, capture["job"], out)
         memory = children.peak_memory_gb()
 
-    model = out / "model"
+    model = Model(out / "model")
     results = {
         "seconds": time.perf_counter() - begin,
         "subject": args.subject,
@@ -93,11 +94,11 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
             for key in ("id", "seconds", "frames_planned", "frames_written", "frames_missing")
         },
         "job": job["id"],
-        **json.loads((model / "results.json").read_text()),
+        **model.json("results.json"),
         "files": {
             "capture": "capture",
             "model": [f"model/{name}" for name in FILES],
-            "pictures": sorted(f"model/{path.name}" for path in model.glob("*.png")),
+            "pictures": [f"model/{n}" for n in model.artifacts() if fnmatch(n, "*.png")],
         },
     }
     (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")

@@ -15,7 +15,7 @@ from stage_service.config import (
 )
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.fan_out import FanOut
-from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.cameras.interface import CameraDevice
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
@@ -28,7 +28,7 @@ from stage_service.devices.projectors.serial_controller import SerialProjectorCo
 from stage_service.devices.trigger.interface import TriggerBox
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
-Device = LightBank | TriggerBox | ProjectorController | Camera
+Device = LightBank | TriggerBox | ProjectorController | CameraDevice
 D = TypeVar("D", bound=Device)
 
 
@@ -43,7 +43,7 @@ class DeviceSet:
     lights: LightBank
     trigger: TriggerBox
     projectors: ProjectorController | None
-    cameras: tuple[Camera, ...]
+    cameras: tuple[CameraDevice, ...]
     powers: tuple[PjLinkProjector, ...] = ()
 
     @classmethod
@@ -60,7 +60,7 @@ class DeviceSet:
         else:
             lights = ModbusLightBank(config.lights, len(rig.lights))
         if isinstance(config.cameras, BaslerConfig):
-            cameras: list[Camera] = [BaslerCamera(config.cameras, c) for c in rig.cameras]
+            cameras: list[CameraDevice] = [BaslerCamera(config.cameras, c) for c in rig.cameras]
         else:
             cameras = [LinkCamera(config.cameras, c) for c in rig.cameras]
         projectors = None

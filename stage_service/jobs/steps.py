@@ -131,7 +131,7 @@ def results(context: StepContext) -> Figures:
             if key in geometry:
                 figures[key] = geometry.pop(key)
         figures["geometry"] = geometry
-        plot_geometry({"ours": geometry, **figures["baselines"]}, plots / "geometry.png")
+        plot_geometry({"ours": geometry, **figures["baselines"]}, model.file("plots/geometry.png"))
     figures["warnings"] = [f"{s.name}: {w}" for s in report.stages for w in s.warnings]
     model.write_json("results.json", figures)
     return {"results": "results.json"}

@@ -15,9 +15,9 @@ from waiting import slowed
 
 from reconstruction import Projector
 from simulators.peers.faults import Fault, Faults
-from simulators.peers.projector_controller import ProjectorController
+from simulators.peers.projector_controller import SimulatedProjectorController
 from simulators.peers.serial_peer import SerialPeer
-from simulators.peers.trigger_box import TriggerBox
+from simulators.peers.trigger_box import SimulatedTriggerBox
 from stage_service.config import SerialConfig
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
@@ -33,7 +33,9 @@ class Wires:
     """What a simulated trigger box is wired to; keeps the edges of its outputs."""
 
     class Gate:
-        def __init__(self, edges: list[Edge], name: str, device: ProjectorController | None):
+        def __init__(
+            self, edges: list[Edge], name: str, device: SimulatedProjectorController | None
+        ):
             self.edges, self.name, self.device = edges, name, device
 
         def gate(self, is_open: bool) -> None:
@@ -45,7 +47,7 @@ class Wires:
         def trigger_out(self) -> bool:
             return self.device is not None and self.device.trigger_out
 
-    def __init__(self, controller: ProjectorController, faults: Faults) -> None:
+    def __init__(self, controller: SimulatedProjectorController, faults: Faults) -> None:
         self.edges: list[Edge] = []
         self.pulses = self.fired = 0
         self.faults = faults
@@ -79,9 +81,9 @@ class SerialStage:
         rig = [Projector.look_at(n, 8, 768, p, [0, 0, 0], 20.0) for n, p in places.items()]
         self.folder, self.faults = folder, faults
         self.timeout_s, self.now = timeout_s, 0.0
-        self.controller = ProjectorController(rig, self.blank, lambda: self.now)
+        self.controller = SimulatedProjectorController(rig, self.blank, lambda: self.now)
         self.wires = Wires(self.controller, faults)
-        self.box = TriggerBox(self.wires, faults)
+        self.box = SimulatedTriggerBox(self.wires, faults)
         stack.callback(self.box.stop)
         replies = {"trigger": self.box.reply, "projectors": self.controller.reply}
         for name, reply in replies.items():

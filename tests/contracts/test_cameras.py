@@ -14,7 +14,7 @@ import pytest
 from reconstruction import Camera as Geometry
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
-from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.cameras.interface import CameraDevice
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError
 
@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 16, 12
 class Rig:
     """A camera that is not connected yet, and what fires it."""
 
-    camera: Camera
+    camera: CameraDevice
     fire: Callable[[], object]
 
 

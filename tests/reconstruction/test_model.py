@@ -64,7 +64,7 @@ def test_a_crash_in_the_middle_leaves_the_old_file(
     with pytest.raises(ValueError, match="not JSON compliant"):
         model.write_json("results.json", {"f": float("nan")})
     assert model.json("results.json") == {"f": 1.0}
-    assert [str(p) for p in model.listing()] == ["head.obj", "results.json"]
+    assert list(model.artifacts()) == ["head.obj", "results.json"]
 
 
 def test_a_missing_file_is_named_with_the_command_that_makes_it(
@@ -120,7 +120,7 @@ def test_new_strands_leave_nothing_that_was_made_of_others(model: Model) -> None
     for name in ("comparison.png", "relit.png", "render.png", "plots/geometry.png"):
         model.write_png(name, np.zeros((2, 2), np.uint8))
     model.write_strands(HAIR)
-    assert [str(p) for p in model.listing()] == kept
+    assert list(model.artifacts()) == kept
 
 
 def test_what_is_listed_is_whole_and_inside(model: Model, tmp_path: Path) -> None:
@@ -132,6 +132,6 @@ def test_what_is_listed_is_whole_and_inside(model: Model, tmp_path: Path) -> Non
     (tmp_path / "secret").write_text("of somebody else")
     (model.path / "relit.png").symlink_to(tmp_path / "secret")
     listed = "masks/left_hair.png points.npz report.json strands.hair strands.npz strands.usdc"
-    assert [str(p) for p in model.listing()] == listed.split()
+    assert list(model.artifacts()) == listed.split()
     np.testing.assert_array_equal(model.strands().points, HAIR.points)
     assert len(model.points()) == 0

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from reconstruction import Camera as CameraGeometry
+from reconstruction import Camera
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras import pixel_formats
 from stage_service.devices.cameras.genicam_nodes import Nodes
@@ -49,12 +49,12 @@ OURS = {
 
 
 class BaslerCamera:
-    """Implements `Camera` on pylon; see there for the contract.
+    """Implements `CameraDevice` on pylon; see there for the contract.
 
     `capabilities.timestamps` is known after `connect`.
     """
 
-    def __init__(self, config: BaslerConfig, geometry: CameraGeometry) -> None:
+    def __init__(self, config: BaslerConfig, geometry: Camera) -> None:
         self.name = geometry.name
         self.serial = config.serials.get(geometry.name)
         self.device = f"camera {geometry.name} (Basler {self.serial})"

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
-from stage_service.devices.cameras.interface import Camera
+from stage_service.devices.cameras.interface import CameraDevice
 from stage_service.devices.errors import Cancelled
 
 T = TypeVar("T")
-Work = queue.SimpleQueue[tuple[Callable[[Camera], Any], Future[Any]] | None]
+Work = queue.SimpleQueue[tuple[Callable[[CameraDevice], Any], Future[Any]] | None]
 
 
 class FanOut:
@@ -22,14 +22,14 @@ class FanOut:
     capture still has to be stopped in order.
     """
 
-    def __init__(self, cameras: Sequence[Camera]) -> None:
+    def __init__(self, cameras: Sequence[CameraDevice]) -> None:
         self.cameras = tuple(cameras)
         self._work: list[Work] = [queue.SimpleQueue() for _ in self.cameras]
         for camera, work in zip(self.cameras, self._work, strict=True):
             name = f"camera-{camera.name}"
             threading.Thread(target=_serve, args=(camera, work), name=name, daemon=True).start()
 
-    def __call__(self, call: Callable[[Camera], T]) -> dict[str, T]:
+    def __call__(self, call: Callable[[CameraDevice], T]) -> dict[str, T]:
         """`call(camera)` for every camera, by name, when all are done.
 
         Raises the error of the only camera that failed, or an `ExceptionGroup` of all that did;
@@ -52,7 +52,7 @@ class FanOut:
             work.put(None)
 
 
-def _serve(camera: Camera, work: Work) -> None:
+def _serve(camera: CameraDevice, work: Work) -> None:
     while (item := work.get()) is not None:
         call, answer = item
         try:

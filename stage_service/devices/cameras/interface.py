@@ -68,7 +68,7 @@ class CameraCapabilities:
     block_wrap: int
 
 
-class Camera(Protocol):
+class CameraDevice(Protocol):
     """One camera that waits for hardware triggers. Every call raises `DeviceError`."""
 
     name: str

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction import Camera as CameraGeometry
+from reconstruction import Camera
 from stage_service.config import LinkCamerasConfig
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
@@ -24,9 +24,9 @@ POLL_S = (0.001, 0.05)
 
 
 class LinkCamera:
-    """Implements `Camera` on a TCP connection of its own; see there for the contract."""
+    """Implements `CameraDevice` on a TCP connection of its own; see there for the contract."""
 
-    def __init__(self, config: LinkCamerasConfig, geometry: CameraGeometry) -> None:
+    def __init__(self, config: LinkCamerasConfig, geometry: Camera) -> None:
         self.capabilities = CameraCapabilities(config.buffers, True, BLOCK_WRAP)
         self.name = geometry.name
         self.device = f"camera {geometry.name} ({config.host}:{config.port})"

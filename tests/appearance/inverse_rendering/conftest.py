@@ -10,7 +10,7 @@ import pytest
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
 from reconstruction import Camera, Light
@@ -58,7 +58,7 @@ def tufted(small):
         lights = dome(8) if lights is None else lights
         shown = mapped.with_maps(maps)
         seen = [observed(shown, c, lights, spp) for c in cameras(views)]
-        return Problem(mapped, seen, exposure(seen), SKIN)
+        return FitProblem(mapped, seen, exposure(seen), SKIN)
 
     return SimpleNamespace(
         mapped=mapped,

@@ -12,7 +12,7 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Batch
 from appearance.inverse_rendering.loop import run
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Objective, Problem
+from appearance.inverse_rendering.problem import FitProblem, Objective
 from appearance.inverse_rendering.unknowns import LightDeviations
 
 START = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
@@ -24,7 +24,7 @@ ENOUGH = replace(OPTIONS, effort=Effort(pixels=80, spp=16, gradient_spp=4, max_d
 
 
 def check(
-    problem: Problem, start: HairMaps, options: InverseRenderingOptions = OPTIONS
+    problem: FitProblem, start: HairMaps, options: InverseRenderingOptions = OPTIONS
 ) -> HairMaps:
     found = run(problem, start, options=options)
     assert found.error < found.start_error
@@ -69,7 +69,7 @@ def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain, tufte
         bright = o.radiance.max(axis=-1) > np.percentile(o.radiance, 95)
         radiance = np.where(bright[..., None], 1e9, o.radiance).astype(np.float32)
         views.append(replace(o, radiance=radiance, valid=~bright))
-    cut = Problem(plain.mapped, views, plain.scale, plain.skin)
+    cut = FitProblem(plain.mapped, views, plain.scale, plain.skin)
     assert off(check(cut, HairMaps.of(START), ENOUGH), tufted.truth) < 0.4
 
 
@@ -77,7 +77,7 @@ def test_a_cell_that_no_ray_meets_stays_at_its_prior(tufted, plain):
     # the cells beyond the last strand's column hold no strand
     uv = tufted.mapped.root_uv * [0.4, 1.0]
     mapped = type(tufted.mapped).of(tufted.scene, tufted.strands, uv)
-    problem = Problem(mapped, plain.views, plain.scale, plain.skin)
+    problem = FitProblem(mapped, plain.views, plain.scale, plain.skin)
     start = HairMaps.of(START, (2, 2, 1))
     options = replace(OPTIONS, variant="correctives", shape=(2, 2, 1), steps=6)
     found = run(problem, start, options=options).maps
@@ -104,13 +104,13 @@ def test_lights_at_a_third_of_the_distance(tufted):
 
 def test_a_bright_constant_image_makes_the_hair_lighter(plain):
     views = [replace(o, radiance=np.full_like(o.radiance, 0.5 / plain.scale)) for o in plain.views]
-    grey = Problem(plain.mapped, views, plain.scale, plain.skin)
+    grey = FitProblem(plain.mapped, views, plain.scale, plain.skin)
     assert check(grey, HairMaps.of(START), ENOUGH).sigma_a.max() < START.sigma_a[0]
 
 
 def test_black_frames_end_the_fit_at_once_with_the_reason(plain):
     views = [replace(o, radiance=np.zeros_like(o.radiance)) for o in plain.views]
     start = HairMaps.of(START)
-    found = run(Problem(plain.mapped, views, 1.0, plain.skin), start, options=OPTIONS)
+    found = run(FitProblem(plain.mapped, views, 1.0, plain.skin), start, options=OPTIONS)
     assert (found.ended, found.steps) == ("no pair of camera and light shows lit hair", 0)
     assert found.maps is start

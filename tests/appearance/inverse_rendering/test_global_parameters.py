@@ -12,14 +12,14 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Pairs
 from appearance.inverse_rendering.global_parameters import Evidence, solve_global_parameters
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import LightDeviations, decode
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
 EFFORT = Effort(pixels=100, spp=64, max_depth=6)
 
 
-def solve(problem: Problem, hair: HairAppearance, names=COLOUR, effort: Effort = EFFORT):
+def solve(problem: FitProblem, hair: HairAppearance, names=COLOUR, effort: Effort = EFFORT):
     raw = problem.encode(HairMaps.of(hair), LightDeviations.calibrated(len(problem.lights)))
     pairs = problem.spread(Pairs(problem.views, problem.scale), 2, 8)
     found, gain = solve_global_parameters(
@@ -60,7 +60,7 @@ def test_intensities_are_found_and_their_mean_is_kept(tufted):
     off = np.exp(0.06 * np.array([1, -1, 1, -1, 1, -1, 1, -1]))
     lights = [replace(x, intensity=x.intensity * f) for x, f in zip(plain.lights, off, strict=True)]
     views = [replace(o, lights=tuple(lights)) for o in plain.views]
-    problem = Problem(plain.mapped, views, plain.scale, plain.skin)
+    problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
     many = replace(EFFORT, spp=256)
     _, _, _, gain = solve(problem, tufted.truth, (*COLOUR, "gain"), many)
     assert np.log(gain).mean() == pytest.approx(0, abs=1e-9)
@@ -82,7 +82,7 @@ def test_the_same_seed_gives_the_same_numbers(plain, tufted):
 
 def test_what_no_pixel_tells_stays(plain, tufted):
     views = [replace(o, valid=np.zeros_like(o.valid)) for o in plain.views]
-    problem = Problem(plain.mapped, views, plain.scale, plain.skin)
+    problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
     raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
     pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
     found, gain = solve_global_parameters(
@@ -95,7 +95,7 @@ def test_what_no_pixel_tells_stays(plain, tufted):
 
 def test_a_frame_that_is_not_a_number_changes_nothing(plain, tufted):
     views = [replace(o, radiance=np.full_like(o.radiance, np.nan)) for o in plain.views]
-    problem = Problem(plain.mapped, views, plain.scale, plain.skin)
+    problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
     raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
     pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
     found, _ = solve_global_parameters(

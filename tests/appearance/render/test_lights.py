@@ -17,7 +17,7 @@ from appearance import (
     render_olat,
 )
 from appearance.render.environment_maps import studio
-from appearance.render.lights import LightBank
+from appearance.render.lights import PackedLights
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_scene import SCALE
 from reconstruction import Camera, Light, Mesh
@@ -44,7 +44,7 @@ BEAM = LightProfile(
 def irradiance(light, point, normal, samples=1 << 16):
     """Mean irradiance `(3,)` at `point` on a surface with `normal`, by sampling the light."""
     ensure_backend()
-    bank = LightBank.of([light])
+    bank = PackedLights.of([light])
     generator = mi.PCG32(samples, 1)
     p = mi.Point3f((np.asarray(point, float) * SCALE).tolist())
     target, intensity = bank.sample(mi.UInt32(0), p, generator, mi.Bool(True))
@@ -68,7 +68,7 @@ def test_a_sphere_shines_like_a_point_on_what_faces_it():
 def test_the_shadow_ray_ends_on_the_sphere():
     ensure_backend()
     light = Light("l", np.array([0.1, 0.2, 0.3]), np.ones(3), radius=0.04)
-    bank = LightBank.of([light])
+    bank = PackedLights.of([light])
     p = mi.Point3f(-0.1 * SCALE, 0, 0)
     target, _ = bank.sample(mi.UInt32(0), p, mi.PCG32(10000, 1), mi.Bool(True))
     away = np.array(target).T / SCALE - light.position
@@ -106,7 +106,7 @@ def test_a_panel_is_the_sum_of_its_points(profile):
 
 
 def test_profiles_are_those_of_the_rig():
-    """`LightBank` and `Light.intensity_towards` are two writings of one thing."""
+    """`PackedLights` and `Light.intensity_towards` are two writings of one thing."""
     ensure_backend()
     rng = np.random.default_rng(0)
     kinds = [
@@ -131,7 +131,7 @@ def test_profiles_are_those_of_the_rig():
     ]
     points = rng.normal(size=(5000, 3)).astype(np.float32)
     which = rng.integers(8, size=5000)
-    _, found = LightBank.of(lights).sample(
+    _, found = PackedLights.of(lights).sample(
         mi.UInt32(which), mi.Point3f((points * SCALE).T), None, mi.Bool(True)
     )
     expected = np.array(

@@ -17,7 +17,7 @@ from appearance.sun_fit.mirror_samples import (
     mirror_samples,
 )
 from appearance.sun_fit.roughness_and_colour import (
-    Pixels,
+    FitPixels,
     fit_colour,
     fit_diffuse,
     fit_lobe,
@@ -185,7 +185,7 @@ def test_colour_of_rendered_hair_is_recovered(wisp):
     scene = build_scene(strands, None, hair=truth)
     o = observed(scene, camera, lights[::3], 64)
     start = scene.with_hair(replace(truth, sigma_a=(0.5, 0.5, 0.5)))
-    found = fit_colour(start, Pixels([o]))
+    found = fit_colour(start, FitPixels([o]))
     np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.12)
     assert found.errors[-1] < 0.06  # of two noisy renderings; 0.036 measured
     assert found.errors[-1] < found.errors[0]
@@ -202,7 +202,7 @@ def test_fit_colour_refuses_diffuse_fibres(wisp):
     strands, camera, lights = wisp
     scene = build_scene(strands, None, hair=DiffuseHair((0.6, 0.4, 0.2)))
     with pytest.raises(TypeError, match="HairAppearance"):
-        fit_colour(scene, Pixels([observed(scene, camera, lights[:2], 1)]))
+        fit_colour(scene, FitPixels([observed(scene, camera, lights[:2], 1)]))
 
 
 def test_bins_average_the_lobe_over_the_tangents_of_a_pixel():

@@ -19,7 +19,7 @@ from appearance import InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.loop import Monitor, run
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.observations import Observed
 from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
 from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
@@ -155,7 +155,9 @@ def from_afar(
 ) -> list[dict[str, Any]]:
     """What the variant "original" finds of one colour from `STARTS`, and in what time."""
     true, out = captured.truth.mean(), []
-    problem = Problem(captured.mapped, captured.training(), captured.exposure.scale, captured.skin)
+    problem = FitProblem(
+        captured.mapped, captured.training(), captured.exposure.scale, captured.skin
+    )
     for beta_m, beta_n, eta, (r, g, b) in STARTS:
         sigma_a = (r * true.sigma_a[0], g * true.sigma_a[1], b * true.sigma_a[2])
         start = replace(true, sigma_a=sigma_a, beta_m=beta_m, beta_n=beta_n, eta=eta)
@@ -230,7 +232,7 @@ def error_against_time(
         progress(f"time: {name}", 0.0)
         views = [_framed(o) for o in training] if name == "plain" else training
         points: list[tuple[float, HairMaps]] = []
-        problem = Problem(captured.mapped, views, scale, skin)
+        problem = FitProblem(captured.mapped, views, scale, skin)
         run(
             problem,
             start,

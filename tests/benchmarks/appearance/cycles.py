@@ -22,7 +22,7 @@ from appearance import (
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.loop import Monitor, run
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
 from appearance.sun_fit.options import FitOptions
@@ -110,7 +110,7 @@ def fit_cycles(
     start = start or found_start
     strands = frames.subject.strands
     mapped = MappedStrands.of(frames.scene, strands, scalp_coordinates(strands, None))
-    problem = Problem(mapped, frames.hair, exposure.scale, albedo)
+    problem = FitProblem(mapped, frames.hair, exposure.scale, albedo)
     found = run(
         problem, HairMaps.of(start), options=options, monitor=Monitor(progress), seed=frames.seed
     )

@@ -10,7 +10,7 @@ from appearance import HairAppearance, HairScene
 from appearance.observations import Observed
 from appearance.sun_fit.fit import BETA_N, SunFit
 from appearance.sun_fit.options import FitOptions
-from appearance.sun_fit.roughness_and_colour import Pixels
+from appearance.sun_fit.roughness_and_colour import FitPixels
 from reconstruction import Progress, Stage, silent
 from reconstruction.arrays import Array
 
@@ -36,7 +36,7 @@ def hair_inverse(
     options, stage = options or FitOptions(), stage or Stage("start")
     few = [_thinned(o, options.hair_pixels, seed) for o in hair]
     base = scene.with_hair(HairAppearance((0.1, 0.1, 0.1), GUESS, BETA_N))
-    fitting = SunFit(base, Pixels(few, skin), options, seed, progress)
+    fitting = SunFit(base, FitPixels(few, skin), options, seed, progress)
     try:
         _, _, beta_m, first = fitting.roughness(stage)
         start: Array | None = np.array(first.colour)

@@ -13,7 +13,7 @@ from appearance import InverseRenderingOptions, render_olat, scores
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
 from appearance.inverse_rendering.options import Variant
-from appearance.inverse_rendering.problem import Problem
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import mean_scores, scores_unavailable
 from appearance.observations import Observed
@@ -72,7 +72,7 @@ class Table:
         self.score_maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
         self.variants["HairInverse"]["warnings"] = stage.warnings
         lights = None
-        problem = Problem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
+        problem = FitProblem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
         for variant in variants:
             begun = time.perf_counter()
             self.progress(variant, 0.0)

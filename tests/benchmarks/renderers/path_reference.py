@@ -21,7 +21,7 @@ _LANES = 1 << 20
 
 
 class PathReference:
-    """A scene's geometry under one Mitsuba point light that moves from lamp to lamp.
+    """A scene's geometry under one Mitsuba point light that moves from light to light.
 
     Built once for many lights, so that its time against `render_olat`'s is spent on paths only.
     """
@@ -46,10 +46,10 @@ class PathReference:
     ) -> Floats:
         """Radiance `(L, P, 3)` of the flat `pixels (P,)` under each light alone, W/(sr m²).
 
-        Raises `ValueError` for lamps that are not isotropic points.
+        Raises `ValueError` for lights that are not isotropic points.
         """
         if shaped := [x.name for x in lights if x.radius or x.size or x.profile]:
-            raise ValueError(f"the reference knows point lamps only, and {shaped} are none")
+            raise ValueError(f"the reference knows point lights only, and {shaped} are none")
         out = np.empty((len(lights), len(pixels), 3), np.float32)
         positions, intensities = light_arrays(lights)
         for i in range(len(lights)):

@@ -197,10 +197,14 @@ def test_the_domes_radius_is_not_that_of_its_lamps(tmp_path):
         rig = Rig.load(DEMO.with_name(f"{name}.toml"))
         assert {light.radius for light in rig.lights} == {0.0}
     (tmp_path / "rig.toml").write_text(
-        "[dome]\nlights = 5\nradius = 1.2\nlamp_radius = 0.02\nintensity = [1.0, 1.0, 1.0]\n"
+        "[dome]\nlights = 5\nradius = 1.2\nlight_radius = 0.02\nintensity = [1.0, 1.0, 1.0]\n"
         '[[cameras]]\nname = "c"\nposition = [0, -1, 0]\ntarget = [0, 0, 0]\nfov_deg = 20\n'
         "width = 8\nheight = 8\n"
     )
     lights = Rig.load(tmp_path / "rig.toml").lights
     assert {light.radius for light in lights} == {0.02}
     np.testing.assert_allclose([np.linalg.norm(x.position) for x in lights], 1.2)
+    text = (tmp_path / "rig.toml").read_text()
+    (tmp_path / "rig.toml").write_text(text.replace("light_radius", "lamp_size"))
+    with pytest.raises(RigError, match=r"\[dome\]: unknown fields \['lamp_size'\]"):
+        Rig.load(tmp_path / "rig.toml")

@@ -8,7 +8,7 @@ from waiting import until
 
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps
-from simulators.peers.trigger_box import TriggerBox
+from simulators.peers.trigger_box import SimulatedTriggerBox
 from simulators.world import World
 
 
@@ -28,7 +28,7 @@ def stage(tiny_rig):
         world = World(tiny_rig, Lamps(5), used, make)
         world.shots = shots
         world.arm("cam_a", 0.01)
-        box = TriggerBox(world, used)
+        box = SimulatedTriggerBox(world, used)
         running.append((box, world))
         return world, box
 
