@@ -62,6 +62,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     start = time.perf_counter()
     if args.out is not None and args.out.suffix not in (".png", ".exr"):
         raise ValueError(f"--out {args.out}: expected .png or .exr")
+    if args.seed < 0:
+        raise ValueError(f"--seed {args.seed}: expected 0 or more")
     capture = Capture(args.capture) if args.capture is not None else None
     if capture is None and (args.camera is not None or args.light):
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")

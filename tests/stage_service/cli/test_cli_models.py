@@ -201,3 +201,8 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     code, found = run(capsys, "export", made.model, "--to", "hair", "--out", tmp_path / "x.usd")
     assert code == 3
     assert ".hair" in found["error"]["detail"]
+
+
+def test_a_negative_seed_is_refused(tmp_path, capsys):
+    assert main(["render", str(tmp_path), "--seed", "-1"]) == 3
+    assert "--seed -1: expected 0 or more" in capsys.readouterr().err
