@@ -106,20 +106,28 @@ class _Server(uvicorn.Server):
         self._ready()
 
 
+def listening(port: int) -> socket.socket:
+    """A socket on 127.0.0.1:`port` (0: any free one). Raises `OSError` when the port is taken."""
+    # With the protocol named: asyncio sets TCP_NODELAY on what such a socket accepts and no other.
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((LOOPBACK, port))
+    except OSError as error:
+        listener.close()
+        raise OSError(
+            f"port {port} on {LOOPBACK} cannot be used ({error.strerror}): is another service "
+            "running? choose another with --port"
+        ) from error
+    return listener
+
+
 def serve(service: Service, port: int, ready: Callable[[str], Any] = lambda _url: None) -> None:
     """Serve `service` on 127.0.0.1:`port` (0: any free one) until SIGTERM or SIGINT.
 
     `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((LOOPBACK, port))
-        except OSError as error:
-            raise OSError(
-                f"port {port} on {LOOPBACK} cannot be used ({error.strerror}): is another service "
-                "running? choose another with --port"
-            ) from error
+    with listening(port) as listener:
         url = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
         config = uvicorn.Config(
             create_app(service), log_level="warning", access_log=False, timeout_graceful_shutdown=3
