@@ -14,6 +14,7 @@ import cv2
 from pydantic import ValidationError
 
 from reconstruction import Capture, Model, Rig, read_obj
+from reconstruction.containment import inside, is_file_name, plain_file
 from stage_service.acquisition.captures import CaptureManager, UnknownCapture
 from stage_service.acquisition.control import Caller, Control
 from stage_service.acquisition.states import CaptureStatus
@@ -194,11 +195,12 @@ class Service:
         try:
             return self._captures.path(capture_id)
         except UnknownCapture:
-            folder = (self.root / "captures").resolve()
-            path = (folder / capture_id).resolve()
-            if path.parent == folder and (path / "plan.json").is_file():
-                return path
-            raise
+            if not is_file_name(capture_id):
+                raise
+            path = inside(self.root / "captures", capture_id)
+            if not (path / "plan.json").is_file():
+                raise
+            return path.resolve()
 
     def submit(self, request: JobRequest) -> Job:
         """Enqueue a pipeline on a capture. Raises `UnknownCapture`, `NotFinished`, `BadInput`."""
@@ -301,7 +303,7 @@ class Service:
             path = folder / f"{camera.name}.png"
             if not path.is_file():
                 continue
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            image = cv2.imread(str(plain_file(path)), cv2.IMREAD_GRAYSCALE)
             if image is None or image.shape != (camera.height, camera.width):
                 found = "not an image" if image is None else f"{image.shape[1]}x{image.shape[0]}"
                 raise BadInput(

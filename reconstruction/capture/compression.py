@@ -64,7 +64,7 @@ def _journal_to_ourselves(path: Path, progress: Progress) -> FileIO:
 def _compress(capture: Capture, record: FrameRecord, journal: FileIO) -> int:
     """Compress one frame, or end what a crash interrupted; returns the bytes saved."""
     assert record.file is not None
-    current = capture.path / record.file
+    current = capture.file_of(record)
     old, new = (current.with_name(record.camera + s) for s in (".exr", ".zip.exr"))
     if current == new:
         old.unlink(missing_ok=True)

@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats
+from reconstruction.containment import NotContained, inside, plain_file
 from reconstruction.files.exr import read_exr
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
@@ -105,8 +106,8 @@ class Capture:
         self.path = Path(path)
         if not (self.path / "rig.json").is_file() or not (self.path / "plan.json").is_file():
             raise CaptureError(f"{self.path} is not a capture: expected rig.json and plan.json")
-        self.rig = Rig.load(self.path / "rig.json")
-        self.plan: dict[str, Any] = json.loads((self.path / "plan.json").read_text())
+        self.rig = Rig.load(self._own("rig.json"))
+        self.plan: dict[str, Any] = json.loads(self._own("plan.json").read_text())
         self.steps = tuple(Step.from_dict(s) for s in self.plan["steps"])
         self.records = dict(self._journal())
         self._lenses: dict[str, Lens] = {}
@@ -166,7 +167,7 @@ class Capture:
 
     def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:
         """Records by (step, camera); later lines win. A torn last line is what a crash leaves."""
-        path = self.path / "journal.jsonl"
+        path = self._own("journal.jsonl")
         lines = path.read_text().splitlines() if path.is_file() else []
         for number, line in enumerate(lines, 1):
             try:
@@ -180,7 +181,7 @@ class Capture:
     @cached_property
     def manifest(self) -> dict[str, Any] | None:
         """The manifest, or None while the capture is not finished."""
-        path = self.path / "manifest.json"
+        path = self._own("manifest.json")
         return json.loads(path.read_text()) if path.is_file() else None
 
     def has(self, step: Step, camera: str) -> bool:
@@ -280,7 +281,19 @@ class Capture:
         if record is None or record.file is None:
             why = record.reason if record is not None else "it was never shot"
             raise MissingFrame(f"{self.path}: step {step.index} ({step.kind}), {camera}: {why}")
-        return self.path / record.file
+        return self.file_of(record)
+
+    def file_of(self, record: FrameRecord) -> Path:
+        """Where a frame that was written lies. Raises `CaptureError` where that is elsewhere."""
+        return self._own(record.file or "")
+
+    def _own(self, name: str) -> Path:
+        """The path of one of this folder's files."""
+        try:
+            path = inside(self.path, name)
+            return plain_file(path) if path.exists() else path
+        except NotContained as error:
+            raise CaptureError(f"{self.path}: {error}") from error
 
     def _read(self, step: Step, camera: str) -> tuple[Floats, dict[str, float | str]]:
         return self.read_file(step, camera, read_exr)
@@ -309,7 +322,7 @@ class Capture:
 
     def mask(self, camera: str) -> Bools | None:
         """The user's hair mask `(H, W)` (half grey and above), or None when there is none."""
-        path = self.path / "masks" / f"{camera}.png"
+        path = self._own(f"masks/{camera}.png")
         if not path.is_file():
             return None
         return self.mask_in_view(camera, read_mask(path, self._shape_as_shot(camera)))
@@ -317,7 +330,7 @@ class Capture:
     @cached_property
     def head(self) -> Mesh | None:
         """The digitised head, or None when the capture has none."""
-        path = self.path / "head.obj"
+        path = self._own("head.obj")
         return read_obj(path) if path.is_file() else None
 
     def _shape_as_shot(self, camera: str) -> tuple[int, int]:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture, CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter
+from reconstruction.containment import is_file_name
 from reconstruction.files.exr import read_exr
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -128,7 +129,7 @@ def _id(entry: dict[str, Any], prefix: str, where: str) -> tuple[str | int, str]
     value = _take(entry, "id", where)
     if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
         return value, f"{prefix}_{value:02d}"
-    if isinstance(value, str) and value and not set(value) & set("/\\\0") and value[0] != ".":
+    if isinstance(value, str) and is_file_name(value):
         return value, value
     raise ImportProblem(f"{where}.id: expected a name or a number >= 0, got {value!r}")
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from reconstruction.capture.folder import Capture, FrameRecord
+from reconstruction.capture.folder import Capture, CaptureError, FrameRecord
 from reconstruction.capture.writer import sha256
 from reconstruction.files.exr import read_exr
 from reconstruction.report.report import Progress, silent
@@ -29,7 +29,10 @@ def verify(path: str | Path, progress: Progress = silent) -> list[str]:
     problems = [*_journal(path / "journal.jsonl"), *_manifest(capture)]
     recorded = [r for r in capture.records.values() if r.file is not None]
     for i, record in enumerate(recorded):
-        problems += _frame(capture, _now(capture, record))
+        try:
+            problems += _frame(capture, _now(capture, record))
+        except CaptureError as error:
+            problems.append(f"Step {record.step}, {record.camera}: {error}.")
         progress("verifying frames", (i + 1) / len(recorded))
     return [*problems, *_absent(capture), *_left_over(path)]
 
@@ -74,7 +77,7 @@ def _manifest(capture: Capture) -> Iterator[str]:
 def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
     """The record as it is now, where compression has put another file in its place."""
     assert record.file is not None
-    if (capture.path / record.file).exists():
+    if capture.file_of(record).exists():
         return record
     now = Capture(capture.path).records[record.step, record.camera]
     return record if now.file is None else now
@@ -107,7 +110,7 @@ def _frame(capture: Capture, record: FrameRecord) -> list[str]:
         camera = capture.rig.camera(record.camera)
     except KeyError:
         return [f"{what}: the rig has no such camera."]
-    file = capture.path / record.file
+    file = capture.file_of(record)
     if not file.is_file():
         return [f"{what} is missing; the journal lists it."]
     if sha256(file) != record.sha256:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError, FrameRecord, Step
+from reconstruction.containment import inside
 from reconstruction.files.durable import (
     PART,
     RESERVE,
@@ -115,7 +116,9 @@ class CaptureWriter:
         """Continue a capture that was interrupted: a torn last journal line is cut off, the
         manifest, if there is one, is removed until `finish` writes it anew. Raises `CaptureError`
         where there is no capture, or another process writes or compresses it."""
-        Capture(path)
+        before = Capture(path)
+        for folder in ("masks", *(f"frames/{f.name}" for f in before.path.glob("frames/*"))):
+            inside(before.path, folder)
         journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
@@ -231,7 +234,7 @@ class CaptureWriter:
             return
         gone = replace(record, file=None, sha256=None, recorded=utc_now(), reason=reason)
         self.commit([gone])
-        (self.path / record.file).unlink()
+        inside(self.path, record.file).unlink()
 
     def finish(self, outcome: str, extra: dict[str, Any] | None = None) -> dict[str, Any]:
         """Write `manifest.json`, close the journal and return the manifest.
@@ -282,13 +285,14 @@ def open_journal(path: Path) -> FileIO:
     What a crash or a full disk left of a last line is cut off. Raises `CaptureError` where
     another process (or another writer of this one) has it open.
     """
-    journal = (path / "journal.jsonl").open("ab", buffering=0)
+    file = inside(path, "journal.jsonl")
+    journal = file.open("ab", buffering=0)
     try:
         fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         journal.close()
         raise JournalInUse(f"{path}: it is being written or compressed; wait for that") from None
-    data = (path / "journal.jsonl").read_bytes()
+    data = file.read_bytes()
     journal.truncate(data.rfind(b"\n") + 1)
     return journal
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from reconstruction.arrays import Array
+from reconstruction.containment import plain_file
 
 SUFFIXES = (".obj", ".ply", ".csv", ".npy")
 _KINDS = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
@@ -31,7 +32,7 @@ def read_points(path: str | Path) -> tuple[Array, Array | None]:
     if path.suffix.lower() not in readers:
         raise ValueError(f"{path}: expected a file of points ({', '.join(SUFFIXES)})")
     try:
-        rows = np.asarray(readers[path.suffix.lower()](path), np.float64)
+        rows = np.asarray(readers[path.suffix.lower()](plain_file(path)), np.float64)
     except (ValueError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: {error}") from error
     if rows.ndim != 2 or rows.shape[1] not in (3, 6) or not len(rows):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import Array, Bools, Ints
+from reconstruction.containment import plain_file
 from reconstruction.geometry.strands import unit_or_zero
 
 
@@ -69,7 +70,7 @@ def read_obj(path: str | Path) -> Mesh:
     faces: list[list[int]] = []
     scalp: list[bool] = []
     in_scalp = {"g": False, "o": False, "usemtl": False}
-    for number, line in enumerate(Path(path).read_text().splitlines(), 1):
+    for number, line in enumerate(plain_file(path).read_text().splitlines(), 1):
         words = line.split()
         if not words:
             continue

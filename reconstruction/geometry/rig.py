@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from reconstruction.containment import inside, is_file_name, plain_file
 from reconstruction.geometry.cameras import Camera, Pinhole, facing
 from reconstruction.geometry.ies import read_ies
 from reconstruction.geometry.light_profiles import LightProfile
@@ -38,6 +39,10 @@ class Rig:
             twice = {n for n in names if names.count(n) > 1}
             if twice:
                 raise RigError(f"rig {self.name}: {kind} must have distinct names, twice: {twice}")
+            for name in names:
+                if not is_file_name(name):
+                    shown = repr(name)[:60]
+                    raise RigError(f"{kind}: {shown} is no name: files are called by it")
         kept = self.profiles
         for profile in (x.profile for x in self.lights if x.profile is not None):
             if kept[profile.name] is not profile:
@@ -172,11 +177,13 @@ def _profiles(data: dict[str, Any], folder: Path) -> dict[str, LightProfile]:
             unit = table.get("unit")
             of_file = None if unit == "relative" else unit
             profile = read_ies(
-                folder / table["file"], unit=of_file, tilt_deg=float(table.get("tilt_deg", 0.0))
+                plain_file(inside(folder, table["file"])),
+                unit=of_file,
+                tilt_deg=float(table.get("tilt_deg", 0.0)),
             )
             profile = profile.relative() if unit == "relative" else profile
             out[name] = replace(profile, name=name)
-        except (ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError) as error:
             raise RigError(f"{where}: {error}") from error
     return out
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.containment import inside
 from reconstruction.files.points import read_points
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head
@@ -59,7 +60,7 @@ def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | 
 
     Raises `ValueError` naming the file where it cannot be read.
     """
-    file = Path(path) if path is not None else capture.path / "scalp.obj"
+    file = Path(path) if path is not None else inside(capture.path, "scalp.obj")
     if path is None and not file.is_file():
         return None
     points, normals = read_points(file)

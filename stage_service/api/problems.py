@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 
 from reconstruction import CaptureError, MissingFrame
 from reconstruction.capture.writer import JournalInUse
+from reconstruction.containment import NotContained
 from stage_service.acquisition.captures import Busy, UnknownCapture
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
@@ -106,6 +107,7 @@ KINDS = {kind.slug: kind for kind in _kinds()}
 BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",
     BadInput: "bad-input",
+    NotContained: "bad-input",
     Busy: "busy",
     JournalInUse: "journal-in-use",
     FlashRefusal: "flash-rate",

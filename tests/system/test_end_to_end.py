@@ -7,6 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+
+def modes(root: Path) -> dict[str, set[int]]:
+    """The permissions of all that lies in and under `root`."""
+    found: dict[str, set[int]] = {"folder": {root.stat().st_mode & 0o777}, "file": set()}
+    for path in root.rglob("*"):
+        found["folder" if path.is_dir() else "file"].add(path.stat().st_mode & 0o777)
+    return found
+
+
 OPTIONS = {"held_out_cameras": ["cam_2"], "held_out_lights": ["light_004"]}
 
 
@@ -22,6 +31,7 @@ def test_a_capture_becomes_relit_hair(running):
     assert (capture["outcome"], capture["error"]) == ("completed", None)
     assert (capture["frames_written"], capture["frames_missing"]) == (running.FRAMES, 0)
     assert running.lamps_lit() == 0
+    assert modes(running.root) == {"folder": {0o750}, "file": {0o640}}  # people's faces
     assert running.verify(Path(capture["path"])) == []
 
     # Each lamp lights something else: the commanded state makes the picture, nothing else does.

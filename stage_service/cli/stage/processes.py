@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import signal
 import sys
 import time
@@ -12,6 +13,8 @@ from pathlib import Path
 from stage_service.cli.support.commands import Commands, Output, add_command, rig_path
 
 DEFAULT_PORT = 8331
+PRIVATE = 0o027
+"""Frames are people's faces: what a stage writes is for its user, and to be read by its group."""
 RIG_HELP = "rig file, or one that comes with hairstage: demo, stage331"
 
 
@@ -49,6 +52,7 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     from stage_service.service import Service
 
     exit_on_sigterm()
+    os.umask(PRIVATE)
     service = Service(load_rig_file(args.rig, args.devices), args.root)
 
     def ready(url: str) -> None:
@@ -67,6 +71,7 @@ def run_worker(args: argparse.Namespace, output: Output) -> None:
     log_to_stderr()
     from stage_service.jobs.worker import run_worker as work
 
+    os.umask(PRIVATE)
     args.root.mkdir(parents=True, exist_ok=True)
     work(
         args.root,

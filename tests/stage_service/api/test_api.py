@@ -222,6 +222,17 @@ def test_artifacts_stay_inside_the_model_folder(http, server, tmp_path):
     problem(http.get("/jobs/job-2/report"), "unknown-job")
 
 
+def test_frames_are_those_of_the_capture(http, tmp_path):
+    """A capture folder that was put there, whose journal names another file of this machine."""
+    done = capture_done(http, {"plan": SHORT})
+    folder = Path(done["path"])
+    (tmp_path / "secret").write_text("secret")
+    journal = folder / "journal.jsonl"
+    journal.write_text(journal.read_text().replace("frames/00000/cam_0.exr", "../../../secret"))
+    problem(http.get(f"/captures/{done['id']}/frames/0/cam_0.exr"), "damaged-capture")
+    assert http.get(f"/captures/{done['id']}/frames/0/cam_1.exr").status_code == 200
+
+
 def read_events(http: httpx.Client, count: int, headers: dict[str, str]) -> list[dict[str, Any]]:
     """The first `count` events of the stream, each checked against its frame."""
     events: list[dict[str, Any]] = []
