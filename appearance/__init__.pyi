@@ -8,6 +8,7 @@ from .metrics.scores import ssim as ssim
 from .model.assess import assess as assess
 from .model.fitted_model import FittedModel as FittedModel
 from .model.relight import relight as relight
+from .model.validated import fit_validated as fit_validated
 from .observations import HeldOut as HeldOut
 from .render.differentiable import DifferentiableOlat as DifferentiableOlat
 from .render.environment import render_environment as render_environment

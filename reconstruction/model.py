@@ -39,6 +39,7 @@ FILES = {
     "appearance.json": "the hair as one material, the skin, the exposure (Sun's fit)",
     "hair_maps.npz": "the hair's material over the scalp (inverse rendering)",
     "lights.json": "the lights as inverse rendering found them",
+    "rejected": "the same two files, where validation frames prefer Sun's fit",
     "comparison.png": "held-out frames, captured and rendered",
     "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",
     "relit.png": "the hair under an environment map",
@@ -56,6 +57,7 @@ _OF_APPEARANCE = (
     "appearance.json",
     "hair_maps.npz",
     "lights.json",
+    "rejected",
     "comparison.png",
     "inverse_rendering.png",
     "relit.png",
@@ -107,6 +109,16 @@ class Model:
         """Remove every fit to the strands, and the pictures and figures of it."""
         for name in _OF_APPEARANCE:
             self.remove(name)
+
+    def rejected(self) -> Model:
+        """Where hair maps and lights lie that are not to be rendered: a folder like a model's."""
+        return Model(self.file("rejected"))
+
+    def reject_maps(self) -> None:
+        """Put hair maps and lights where nothing renders them: into `rejected`."""
+        folder = self.rejected().create()
+        for name in ("hair_maps.npz", "lights.json"):
+            self.file(name).replace(folder.file(name))
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:

@@ -29,15 +29,19 @@ class Judged:
 
 
 def held_out_frames(capture: Capture, model: Model, held_out: HeldOut, most: int) -> list[Observed]:
-    """Held-out cameras under held-out lights; where one of them is missing, under all others."""
+    """At most three held-out cameras under held-out lights, `most` frames, spread evenly.
+
+    Where no camera or no light is held out, all there are take their place.
+    """
     cameras = held_out.cameras or tuple(c.name for c in capture.rig.cameras)
     lights = held_out.lights or tuple(capture.olat_lights())
     if not (held_out.cameras or held_out.lights):
         return []
     out = []
-    for name in cameras[:2]:
+    cameras = cameras[:: -(-len(cameras) // 3)]
+    for name in cameras:
         there = [x for x in lights if capture.has_light(x, name)]
-        some = there[:: max(1, -(-len(there) // max(1, most // min(2, len(cameras)))))]
+        some = there[:: max(1, -(-len(there) // max(1, most // len(cameras))))]
         pixels = np.flatnonzero(model.mask(name, "hair", capture))
         if len(pixels) and some:
             out.append(observe(capture, name, some, pixels))

@@ -62,11 +62,14 @@ class InverseRenderingOptions:
 class InverseRenderingRequest:
     """What a job may ask for.
 
-    `hair_pixels` a camera are fitted, one colour before the volume. `max_depth` is the number of
-    vertices a path may have; None measures what the hair needs. Held-out images are judged with
-    `judged_spp` paths a pixel. `fit` is how the fit is run.
+    Of the training lights `lights` are fitted and `validation_lights` decide whether the result is
+    rendered (see `fit_validated`). `hair_pixels` a camera are fitted, one colour before the volume.
+    `max_depth` is the number of vertices a path may have; None measures what the hair needs.
+    Held-out images are judged with `judged_spp` paths a pixel. `fit` is how the fit is run.
     """
 
+    lights: Count = 24
+    validation_lights: Count = 6
     hair_pixels: Count = 4000
     judged_spp: Count = 48
     max_depth: Count | None = None

@@ -24,7 +24,7 @@ from reconstruction import Capture, Mesh, Model, Progress, Stage, Strands, silen
 from reconstruction.arrays import Array
 from reconstruction.report.report import Series
 
-JUDGED_IMAGES = 6
+JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
 

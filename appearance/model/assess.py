@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from appearance.metrics.scores import (
     scores_unavailable,
     ssim,
 )
+from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.options import AssessOptions
 from appearance.model.relight import relight
@@ -28,11 +28,19 @@ from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
-from reconstruction import Capture, Light, Model, Progress, Stage, silent
-from reconstruction.arrays import AnyFloats, Bools
+from reconstruction import Camera, Capture, Light, Model, Progress, Stage, silent
+from reconstruction.arrays import AnyFloats, Array, Bools
 
-METHODS = ("ours", "mean_colour", "diffuse", "three_nearest")
-COLUMNS = ("captured", "ours", "diffuse", "three_nearest")
+FITS = ("ours", "sun_fit", "inverse_rendering")
+"""Names in the results that are no baselines."""
+OWN_FRAMES = "three_nearest_own_frames"
+"""What has the held-out camera's own frames, which nothing else has: beaten or not, no warning."""
+INTERPOLATED = {
+    "three_nearest": "three nearest lights",
+    "nearest_cameras": "three nearest cameras",
+}
+SHOWN = {"held_out_lights": 4, "held_out_camera": 2}
+"""Rows of the comparison by group."""
 MAX_DEPTH = 16
 
 
@@ -40,8 +48,8 @@ MAX_DEPTH = 16
 class _Compared:
     """One frame by every method, radiance `(H, W, 3)`, and where the hair is."""
 
-    camera: str
-    light: str
+    camera: Camera
+    light: Light
     frames: dict[str, AnyFloats]
     mask: Bools
 
@@ -60,16 +68,25 @@ def assess(
 
     The model is judged as `FittedModel` renders it: with hair maps and lights as found where there
     are any. Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}},
-    "held_out_camera": …}` with the methods "ours", "mean_colour" (one colour: the mean over
-    training frames and hair pixels), "diffuse" (Lambertian fibres on our strands whose albedo
-    reproduces that mean) and "three_nearest" (the camera's own captured frames under the three
-    nearest other training lights, interpolated: a baseline that needs the camera's frames, also
-    where that camera is held out). Means over images, each over the captured hair mask. A group
-    with nothing held out is left out. "lpips" is a score like the others where its weights are
-    given (`appearance.metrics.lpips`), and a reason beside the groups where not.
+    "held_out_camera": …}`, means over images, each over the captured hair mask. The methods are
+    "ours"; where inverse rendering was run, also "sun_fit" and "inverse_rendering" by themselves
+    ("rendered", beside the groups, names the one that is ours); and the baselines
 
-    Writes `comparison.png` where there is something to compare, `relit.png` and `relit.exr` (see
-    `relight`) and the stage "images" of the report.
+    - "mean_colour": one colour, the mean over training frames and hair pixels
+    - "diffuse": Lambertian fibres on our strands, with the albedo that reproduces that mean
+    - "three_nearest", of held-out lights: the camera's own frames under the three nearest training
+      lights, interpolated
+    - "nearest_cameras", of a held-out camera: other cameras' frames laid on our geometry, see
+      `NearestCameras`; left out where there is no other camera
+    - "three_nearest_own_frames", of a held-out camera: its own frames, which no other method has,
+      under the three nearest other training lights
+
+    A group with nothing held out is left out. "lpips" is a score like the others where its weights
+    are given (`appearance.metrics.lpips`), and a reason beside the groups where not.
+
+    Writes `comparison.png` where there is something to compare (lights: `front_lights`),
+    `relit.png` and `relit.exr` (see `relight`) and the stage "images" of the report, which warns of
+    every baseline that is not beaten.
     """
     options = options or AssessOptions()
     training = held_out.training(capture)
@@ -104,26 +121,42 @@ class _Comparison:
 
     def run(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """The scores by group and method; writes `comparison.png`."""
-        scene, exposure = self.fitted.scene(), self.fitted.appearance.exposure
+        exposure = self.fitted.appearance.exposure
         progress("fitting the baselines", 0.0)
         training = self._observed()
         colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
+        scene = self.fitted.scene()
         albedo = fit_diffuse(scene, training, seed=self.seed)
-        scenes = {"ours": scene, "diffuse": scene.with_hair(DiffuseHair(albedo))}
+        both = FittedModel.alternatives(self.model, self.capture)
+        lit = {name: (fit.scene(), fit) for name, fit in both.items()}
+        lit = lit or {"ours": (scene, self.fitted)}
+        lit["diffuse"] = scene.with_hair(DiffuseHair(albedo)), self.fitted
+        rendered = "inverse_rendering" if self.model.has("hair_maps.npz") else "sun_fit"
         groups: dict[str, list[_Compared]] = {}
         for group, views in self._views().items():
             groups[group] = []
             for i, (camera, lights) in enumerate(views):
                 progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
-                groups[group] += self._compared(camera, lights, scenes, colour)
+                for image in self._rendered(camera, lights, lit):
+                    if both:
+                        image.frames["ours"] = image.frames[rendered]
+                    image.frames["mean_colour"] = np.broadcast_to(colour, (*image.mask.shape, 3))
+                    groups[group].append(image)
+            self._interpolate(groups[group], scene, own=group == "held_out_lights")
         result: dict[str, Any] = {
-            group: {name: _scores(images, name, exposure) for name in METHODS}
+            group: {n: _scores(images, n, exposure) for n in images[0].frames if n != "captured"}
             for group, images in groups.items()
+            if images
         }
         judge(result, stage)
+        if both:
+            result["rendered"] = rendered
         stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
+        others = [name for name in both if name != rendered]
+        columns = ["captured", "ours", *others, "diffuse", "interpolated"]
+        rows = [r for g, images in groups.items() for r in self._rows(g, images, exposure)]
         with self.model.writing("comparison.png") as part:
-            comparison_picture(part, _rows(groups, exposure), COLUMNS)
+            comparison_picture(part, rows, columns)
         return result
 
     def _observed(self) -> list[Observed]:
@@ -150,57 +183,89 @@ class _Comparison:
             views["held_out_camera"] = [(camera, both) for camera in cameras]
         return views
 
-    def _compared(
-        self, camera: str, names: Sequence[str], scenes: dict[str, HairScene], colour: AnyFloats
+    def _rendered(
+        self, name: str, lights: Sequence[str], lit: Mapping[str, tuple[HairScene, FittedModel]]
     ) -> list[_Compared]:
-        """The frames of one camera under the lights `names`, by every method."""
-        capture = self.capture
-        mask = self.model.mask(camera, "hair", capture)
-        names = [n for n in names if capture.has_light(n, camera)]
+        """The frames of one camera under `lights`: captured, and of each scene under its lights."""
+        capture, camera = self.capture, self.capture.rig.camera(name)
+        mask = self.model.mask(name, "hair", capture)
+        names = [n for n in lights if capture.has_light(n, name)]
         if not names or not mask.any():
             return []
-        device, lights = capture.rig.camera(camera), self.fitted.lights(names)
         sampling = Sampling(self.options.spp, MAX_DEPTH, self.seed)
-        rendered = {m: olat_smoothed(s, device, lights, sampling) for m, s in scenes.items()}
-        training = self.training.olat_lights()
+        images = {
+            method: olat_smoothed(scene, camera, fit.lights(names), sampling)
+            for method, (scene, fit) in lit.items()
+        }
         out = []
-        for i, name in enumerate(names):
-            captured = capture.light(name, camera)[0]
-            frames = {
-                "captured": captured,
-                **{method: images[i] for method, images in rendered.items()},
-                "mean_colour": np.broadcast_to(colour, captured.shape),
-                "three_nearest": three_nearest(capture, camera, capture.rig.light(name), training),
-            }
-            out.append(_Compared(camera, name, frames, mask))
+        for i, n in enumerate(names):
+            frames: dict[str, AnyFloats] = {"captured": capture.light(n, name)[0]}
+            frames |= {method: rendered[i] for method, rendered in images.items()}
+            out.append(_Compared(camera, capture.rig.light(n), frames, mask))
         return out
 
+    def _interpolate(self, images: Sequence[_Compared], scene: HairScene, *, own: bool) -> None:
+        """Add the baselines made of frames; `own` where the camera is one of the training's."""
+        training, views = self.training.olat_lights(), dict[str, NearestCameras | None]()
+        for image in images:
+            camera, light = image.camera, image.light
+            mixed = three_nearest(self.capture, camera.name, light, training)
+            image.frames["three_nearest" if own else OWN_FRAMES] = mixed
+            if own:
+                continue
+            if camera.name not in views:
+                views[camera.name] = NearestCameras.of(self.training, camera, scene, image.mask)
+            view = views[camera.name]
+            if view is not None:
+                image.frames["nearest_cameras"] = view(light)
 
-def three_nearest(
-    capture: Capture, camera: str, light: Light, training: Sequence[str]
-) -> AnyFloats:
-    """`camera`'s frames `(H, W, 3)` under the three `training` lights nearest to `light`, mixed.
+    def _rows(self, group: str, images: Sequence[_Compared], exposure: Exposure) -> list[Row]:
+        """`SHOWN` rows of a group for the picture, with their scores."""
+        middle = self.fitted.strands.points.mean(axis=0).astype(float)
+        by_camera: dict[str, list[_Compared]] = {}
+        for image in images:
+            by_camera.setdefault(image.camera.name, []).append(image)
+        rows: list[Row] = []
+        for shown in by_camera.values():
+            camera, lights = shown[0].camera, [image.light for image in shown]
+            for k, angle in front_lights(
+                camera, lights, middle, -(-SHOWN[group] // len(by_camera))
+            ):
+                image, light = shown[k], lights[k].name
+                pictures: dict[str, AnyFloats] = {n: exposure(f) for n, f in image.frames.items()}
+                how = next(n for n in INTERPOLATED if n in pictures)
+                pictures["interpolated"] = pictures[how]
+                captions = {
+                    n: f"{psnr(p, pictures['captured'], image.mask):.1f} dB  "
+                    f"{ssim(p, pictures['captured'], image.mask):.2f}"
+                    for n, p in pictures.items()
+                    if n != "captured"
+                }
+                captions["interpolated"] += f"  {INTERPOLATED[how]}"
+                label = f"{group.replace('_', ' ')}\n{camera.name}, {light} at {angle:.0f}°"
+                rows.append((label, pictures, captions))
+        return rows[: SHOWN[group]]
 
-    Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
-    distance to what `light` would give. `light` itself is never among the three.
+
+def front_lights(
+    camera: Camera, lights: Sequence[Light], middle: Array, most: int
+) -> list[tuple[int, float]]:
+    """Which `lights` to show: indices, and angles in degrees to the camera's direction.
+
+    Directions are seen from the hair's `middle (3,)`. Of the lights less than 90 degrees from the
+    camera, which light what it sees, the one nearest to it; then, `most` in all, the one furthest
+    from those chosen. Where there are none, the one nearest to the camera.
     """
-    names = [n for n in training if n != light.name and capture.has_light(n, camera)]
-    others = [capture.rig.light(n) for n in names]
-    positions = np.array([o.position for o in others])
-    distance = np.linalg.norm(positions, axis=1)
-    own = float(np.linalg.norm(light.position))
-    cosine = positions @ light.position / (distance * own)
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    nearest = np.argsort(angle)[:3]
-    weights = 1.0 / np.maximum(angle[nearest], 1e-6)
-    weights /= weights.sum()
-    total = np.zeros(1)
-    for k, weight in zip(nearest, weights, strict=True):
-        here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
-        gain = here / np.maximum(there, 1e-12)
-        gain *= (distance[k] / own) ** 2
-        total = total + weight * gain * capture.light(names[k], camera)[0]
-    return np.asarray(total)
+    own = camera.center - middle
+    towards = np.array([light.position for light in lights]) - middle
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    cosine = np.clip(towards @ own / np.linalg.norm(own), -1, 1)
+    left = [int(k) for k in np.argsort(-cosine) if cosine[k] > 0]
+    chosen = left[:1] or [int(np.argmax(cosine))]
+    while len(chosen) < min(most, len(left)):
+        nearest = (towards @ towards[chosen].T).max(axis=1)
+        chosen.append(min((k for k in left if k not in chosen), key=lambda k: float(nearest[k])))
+    return [(k, float(np.degrees(np.arccos(cosine[k])))) for k in chosen]
 
 
 def _scores(images: Sequence[_Compared], method: str, exposure: Exposure) -> dict[str, float]:
@@ -214,32 +279,19 @@ def _scores(images: Sequence[_Compared], method: str, exposure: Exposure) -> dic
     return mean_scores(found)
 
 
-def judge(result: dict[str, Any], stage: Stage) -> None:
-    """Warn where a trivial baseline is not beaten."""
-    pairs = product(("mean_colour", "diffuse"), ("psnr", "ssim"))
-    for (group, rows), (baseline, figure) in product(result.items(), pairs):
-        if rows["ours"][figure] <= rows[baseline][figure]:
-            stage.warn(f"{group}: the baseline {baseline} is not beaten in {figure}")
-
-
-def _rows(groups: dict[str, list[_Compared]], exposure: Exposure) -> list[Row]:
-    """Two rows a group for the picture, with their scores."""
-    rows: list[Row] = []
-    for group, images in groups.items():
-        # the frames that show most: brightly lit hair, and from different cameras where there are
-        ranked = sorted(images, key=lambda c: -float(c.frames["captured"][c.mask].mean()))
-        picked = ranked[:1]
-        picked += [c for c in ranked if c.camera != picked[0].camera][:1] or ranked[1:2]
-        for c in picked:
-            shown: dict[str, AnyFloats] = {k: exposure(v) for k, v in c.frames.items()}
-            captions = {
-                k: f"{psnr(v, shown['captured'], c.mask):.1f} dB  "
-                f"{ssim(v, shown['captured'], c.mask):.2f}"
-                for k, v in shown.items()
-                if k != "captured"
-            }
-            rows.append((f"{group.replace('_', ' ')}\n{c.camera}, {c.light}", shown, captions))
-    return rows
+def judge(result: Mapping[str, Any], stage: Stage) -> None:
+    """Warn of every baseline that is not beaten, but for the one that has the camera's frames."""
+    for group, rows in result.items():
+        for baseline in rows:
+            if baseline in FITS or baseline == OWN_FRAMES:
+                continue
+            for figure, unit in (("psnr", " dB"), ("ssim", "")):
+                ours, other = rows["ours"][figure], rows[baseline][figure]
+                if ours <= other:
+                    stage.warn(
+                        f"{group}: the baseline {baseline} is not beaten in {figure}: "
+                        f"{ours:.3g}{unit} against its {other:.3g}"
+                    )
 
 
 def _spread(items: Sequence[str], most: int) -> list[str]:

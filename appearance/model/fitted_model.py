@@ -56,6 +56,23 @@ class FittedModel:
             rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
         return cls(strands, model.head(capture), appearance, maps, placed, rig)
 
+    @classmethod
+    def alternatives(cls, model: Model, capture: Capture) -> dict[str, FittedModel]:
+        """Both fits, where inverse rendering was run: "sun_fit" and "inverse_rendering".
+
+        One of them is what `load` gives; see `fit_validated`.
+        """
+        ours = cls.load(model, capture)
+        for folder in (model, model.rejected()):
+            if folder.has("hair_maps.npz"):
+                maps, placed = HairMaps.load(folder)
+                lights = tuple(lights_as_found(folder, capture.rig.lights))
+                rig = replace(capture.rig, lights=lights)
+                sun = replace(ours, maps=HairMaps.of(ours.appearance.hair), rig=capture.rig)
+                found = replace(ours, maps=maps, placed=placed, rig=rig)
+                return {"sun_fit": sun, "inverse_rendering": found}
+        return {}
+
     def save(self, model: Model) -> None:
         """Write a model that `load` reads back; the fit's report and pictures are not copied."""
         appearance, hair = self.appearance, self.maps.mean()

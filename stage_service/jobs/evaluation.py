@@ -54,25 +54,35 @@ def evaluate_geometry(
 def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
 
+    Fitted is what is rendered; where inverse rendering was run, both fits also stand by themselves
+    (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells.
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
     from appearance import HairAppearance
     from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
+    from appearance.bsdf.maps import HairMaps
     from appearance.sun_fit.fitted_appearance import FittedAppearance
 
-    def figures(hair: HairAppearance, skin: Sequence[float]) -> dict[str, Any]:
+    def figures(maps: HairMaps, skin: Sequence[float]) -> dict[str, Any]:
+        cells = colour_of_absorption(maps.sigma_a.reshape(-1, 3), maps.beta_n)
         return {
-            "beta_m": hair.beta_m,
-            "v": float(variance_of_roughness(hair.beta_m)),
-            "beta_n": hair.beta_n,
-            "sigma_a": list(hair.sigma_a),
-            "colour": [float(c) for c in colour_of_absorption(hair.sigma_a, hair.beta_n)],
+            "beta_m": maps.beta_m,
+            "v": float(variance_of_roughness(maps.beta_m)),
+            "beta_n": maps.beta_n,
+            "sigma_a": list(maps.mean().sigma_a),
+            "colour": [float(c) for c in cells.mean(axis=0)],
             "skin": list(skin),
         }
 
-    fitted, true = FittedAppearance.load(model), json.loads(truth.read_text())
+    sun, true = FittedAppearance.load(model), json.loads(truth.read_text())
+    out = {"fitted": figures(HairMaps.of(sun.hair), sun.skin)}
+    for folder in (model, model.rejected()):
+        if folder.has("hair_maps.npz"):
+            out["sun_fit"] = out["fitted"]
+            out["inverse_rendering"] = figures(HairMaps.load(folder)[0], sun.skin)
+            out["fitted"] = out["inverse_rendering" if folder is model else "sun_fit"]
     return {
-        "fitted": figures(fitted.hair, fitted.skin),
-        "true": figures(HairAppearance.from_dict(true["hair"]), true["skin"]),
+        **out,
+        "true": figures(HairMaps.of(HairAppearance.from_dict(true["hair"])), true["skin"]),
     }

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 PIPELINES: dict[str, tuple[str, ...]] = {
-    "light_planes": ("compress", "reconstruct", "fit", "assess", "evaluate", "results"),
+    "light_planes": ("reconstruct", "fit", "assess", "evaluate", "results", "compress"),
     "reconstruct": ("reconstruct", "evaluate", "results"),
     "fit": ("fit", "assess", "results"),
     "appearance": ("fit", "inverse_rendering", "assess", "results"),
 }
-"""Each step is a checkpoint: after a crash the job goes on at the step that was under way."""
+"""Each step is a checkpoint: after a crash the job goes on at the step that was under way. What
+nobody waits for comes last: results and pictures are there before frames are compressed."""
 
-STEPS_VERSION = "2"
+STEPS_VERSION = "3"
 """Raise it when a pipeline's steps change: a job begun under other steps is not taken up again."""

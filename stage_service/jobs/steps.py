@@ -73,14 +73,14 @@ def fit(context: StepContext) -> Figures:
 
 
 def inverse_rendering(context: StepContext) -> Figures:
-    """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`.
+    """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`, or in
+    `rejected` where Sun's fit is better on frames that neither was fitted to.
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
-    from appearance import fit_maps as run
+    from appearance import fit_validated as run
 
-    found = run(**context.for_appearance(), request=context.options.inverse_rendering)
-    return {"maps": "hair_maps.npz", "lights": "lights.json", **found}
+    return run(**context.for_appearance(), request=context.options.inverse_rendering)
 
 
 def assess(context: StepContext) -> Figures:

@@ -102,19 +102,34 @@ def run_images(args: argparse.Namespace, output: Output) -> None:
 def run_table(args: argparse.Namespace, output: Output) -> None:
     """The README's table of figures, as Markdown.
 
-    Print a column for each results.json of 'hairstage demo': F of the strands at 1 mm/10° over
+    Print a column for each subject of some 'hairstage demo': F of the strands at 1 mm/10° over
     visible and all points beside the baselines, PSNR / SSIM of held-out lights and camera, fitted
-    and true roughness, and what the job warned of.
+    and true roughness, and what the jobs warned of. Of a subject with several seeds the mean ±
+    the standard deviation over seeds.
     """
-    from stage_service.cli.support.tables import markdown_table
+    from stage_service.cli.support.tables import figures_of, markdown_table
 
-    found = [(path, _demo_results(path)) for path in args.results]
-    names = [f"{results['subject']}, seed {results['seed']}" for _, results in found]
-    results = {
-        name if names.count(name) == 1 else f"{name} ({path})": one
-        for name, (path, one) in zip(names, found, strict=True)
-    }
-    output.result({"results": results}, markdown_table(results))
+    by_subject: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
+    for path in args.results:
+        results = _demo_results(path)
+        by_subject.setdefault(results["subject"], []).append((path, results))
+    columns: dict[str, list[dict[str, Any]]] = {}
+    for subject, found in by_subject.items():
+        seeds = [results["seed"] for _, results in found]
+        if len(set(seeds)) == len(seeds):
+            many = "s" if len(seeds) > 1 else ""
+            name = f"{subject}, seed{many} {', '.join(str(s) for s in sorted(seeds))}"
+            columns[name] = [results for _, results in found]
+        else:  # versions of one demo, not samples
+            for path, results in found:
+                columns[f"{subject}, seed {results['seed']} ({path})"] = [results]
+    output.result(
+        {
+            "results": columns,
+            "figures": {name: figures_of(results) for name, results in columns.items()},
+        },
+        markdown_table(columns),
+    )
 
 
 def _demo_results(path: Path) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Any
 
 from rich.console import Group
@@ -13,6 +15,22 @@ from rich.table import Table
 _THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 _HEADS = [t.replace("mm_", " mm/").replace("deg", "°") for t in _THRESHOLDS]
 _GROUPS = ("held_out_lights", "held_out_camera")
+_SCORES = ("psnr", "ssim")
+_STRANDS = {
+    "ours": "ours",
+    "hull_smooth_field": "hull + smooth field",
+    "hull_vertical": "hull + vertical",
+}
+_PICTURES = {
+    "ours": "ours",
+    "inverse_rendering": "inverse rendering",
+    "sun_fit": "Sun's fit",
+    "diffuse": "diffuse",
+    "mean_colour": "mean colour",
+    "three_nearest": "three nearest lights",
+    "nearest_cameras": "three nearest cameras",
+    "three_nearest_own_frames": "three nearest lights in that camera's own frames",
+}
 _APPEARANCE = {
     "beta_m": "longitudinal roughness β_M",
     "v": "longitudinal variance v (Sun's β_l)",
@@ -25,12 +43,15 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     """The tables of the demo's `results.json` in `out`, and where everything is."""
     geometry = geometry_table({"ours": results["geometry"], **results["baselines"]})
     images = Table("pictures (PSNR / SSIM)", "held-out lights", "held-out camera")
-    for name in results["images"][_GROUPS[0]]:
-        images.add_row(name, *(_picture(results, group, name) for group in _GROUPS))
-    fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]
-    hair = Table("appearance", "fitted", "true")
+    for name, title in _PICTURES.items():
+        found = [results["images"].get(group, {}).get(name) for group in _GROUPS]
+        cells = ["" if f is None else f"{f['psnr']:.1f} dB / {f['ssim']:.2f}" for f in found]
+        if any(cells):
+            images.add_row(title, *cells)
+    fits = results["appearance"]
+    hair = Table("appearance", *(_PICTURES.get(name, name) for name in fits))
     for key, what in _APPEARANCE.items():
-        hair.add_row(what, _numbers(fitted[key]), _numbers(true[key]))
+        hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
     capture = results["capture"]
     return Group(
         geometry,
@@ -44,47 +65,95 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     )
 
 
-def markdown_table(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """The README's table of figures: a column for each of several demos' results by name, and their
-    warnings below it."""
-    figures: dict[str, Callable[[Mapping[str, Any]], str]] = {}
+def markdown_table(columns: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """The README's table of figures: a column for each list of results, one a seed, by its name.
+
+    A cell is the figure of one seed, or mean ± standard deviation (n - 1) over seeds. Warnings
+    stand below, each with the seeds that had it; its numbers are those of the first.
+    """
+    table, notes = [["", *columns], ["---"] * (len(columns) + 1)], []
+    for number, (name, results) in enumerate(columns.items(), 1):
+        seeds_of: dict[str, list[str]] = {}
+        first: dict[str, str] = {}
+        for result in results:
+            for text in result.get("warnings", []):
+                alike = re.sub(r"[\d.]+", "#", text)
+                first.setdefault(alike, text)
+                seeds_of.setdefault(alike, []).append(str(result["seed"]))
+        if first:
+            table[0][number] = f"{name} [{number}]"
+        for alike, text in first.items():
+            of = f" (seed {', '.join(seeds_of[alike])})" if len(results) > 1 else ""
+            notes.append(f"[{number}] {text}{of}")
+    figures = [figures_of(results) for results in columns.values()]
+    for title, parts in _rows().items():
+        cells = [" / ".join(_cell(f[title], parts)) if title in f else "–" for f in figures]
+        if set(cells) != {"–"}:
+            table.append([title, *cells])
+    return "\n\n".join(["\n".join(f"| {' | '.join(row)} |" for row in table), *notes])
+
+
+def figures_of(results: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, float]]]:
+    """The rows of `markdown_table` as numbers, of one seed or several.
+
+    `{row: [{"mean", "n", "std"}, …]}`: of pictures PSNR and SSIM, else one; "std" of several seeds.
+    """
+    out = {}
+    for title, parts in _rows().items():
+        values = [[read(result) for result in results] for read, _, _ in parts]
+        if not any(v is None for of_part in values for v in of_part):
+            out[title] = [
+                _summary([float(v) for v in of_part if v is not None]) for of_part in values
+            ]
+    return out
+
+
+def _summary(values: Sequence[float]) -> dict[str, float]:
+    spread = {"std": stdev(values)} if len(values) > 1 else {}
+    return {"mean": mean(values), "n": len(values), **spread}
+
+
+_Part = tuple[Callable[[Mapping[str, Any]], float | None], str, str]
+"""A figure of a result, None where it has none; the form of the number, and its unit."""
+
+
+def _rows() -> dict[str, list[_Part]]:
+    """The README's rows by title."""
+    rows: dict[str, list[_Part]] = {}
     for over in ("visible", "all"):
         for name, title in _STRANDS.items():
-            figures[f"F at 1 mm/10°, {over} points: {title}"] = partial(_f, over=over, name=name)
-    for group, title in zip(_GROUPS, ("lights", "camera"), strict=True):
-        for method in ("ours", "diffuse", "three_nearest"):
-            label = "three nearest lights" if method == "three_nearest" else method
-            figures[f"held-out {title}: {label}"] = partial(_picture, group=group, name=method)
-    figures["β_M (true)"] = lambda r: " ".join(
-        form.format(r["appearance"][which]["beta_m"])
-        for which, form in (("fitted", "{:.2f}"), ("true", "({:.2f})"))
-    )
-    head, notes = [""], []
-    for number, (name, result) in enumerate(results.items(), 1):
-        warnings = result.get("warnings", [])
-        head.append(f"{name} [{number}]" if warnings else name)
-        notes += [f"[{number}] {w}" for w in warnings]
-    rows = [head, ["---"] * len(head)]
-    rows += [[title, *(figure(r) for r in results.values())] for title, figure in figures.items()]
-    table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-    return "\n\n".join([table, *notes])
+            read = partial(_f, over=over, name=name)
+            rows[f"F at 1 mm/10°, {over} points: {title}"] = [(read, ".1f", " %")]
+    for group in _GROUPS:
+        for name, title in _PICTURES.items():
+            decibels, ssim = (partial(_score, group=group, name=name, score=s) for s in _SCORES)
+            where = group.replace("held_out_", "held-out ")
+            rows[f"{where}: {title}"] = [(decibels, ".1f", " dB"), (ssim, ".2f", "")]
+    for fit in ("fitted", "sun_fit", "true"):
+        title = {"fitted": "ours", "true": "the truth"}.get(fit, _PICTURES.get(fit, fit))
+        rows[f"β_M: {title}"] = [(partial(_beta_m, fit=fit), ".2f", "")]
+    return rows
 
 
-_STRANDS = {
-    "ours": "ours",
-    "hull_smooth_field": "hull + smooth field",
-    "hull_vertical": "hull + vertical",
-}
+def _cell(figures: Sequence[Mapping[str, float]], parts: Sequence[_Part]) -> Iterator[str]:
+    for one, (_, form, unit) in zip(figures, parts, strict=True):
+        spread = f" ± {one['std']:{form}}" if "std" in one else ""
+        yield f"{one['mean']:{form}}{spread}{unit}"
 
 
-def _f(results: Mapping[str, Any], over: str, name: str) -> str:
+def _f(results: Mapping[str, Any], over: str, name: str) -> float:
     scores = results["geometry"] if name == "ours" else results["baselines"][name]
-    return f"{100 * scores[over][_THRESHOLDS[0]]['f']:.1f} %"
+    return 100 * float(scores[over][_THRESHOLDS[0]]["f"])
 
 
-def _picture(results: Mapping[str, Any], group: str, name: str) -> str:
-    scores = results["images"][group][name]
-    return f"{scores['psnr']:.1f} dB / {scores['ssim']:.2f}"
+def _score(results: Mapping[str, Any], group: str, name: str, score: str) -> float | None:
+    found = results["images"].get(group, {}).get(name)
+    return None if found is None else float(found[score])
+
+
+def _beta_m(results: Mapping[str, Any], fit: str) -> float | None:
+    found = results["appearance"].get(fit)
+    return None if found is None else float(found["beta_m"])
 
 
 def _numbers(value: Any) -> str:

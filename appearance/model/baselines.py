@@ -1,0 +1,150 @@
+"""Pictures made of captured frames alone: what a fit has to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from appearance.render.paths import Surface, camera_rays
+from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction import Camera, Capture, Light
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
+
+CAMERAS = 3
+"""Nearest cameras that are asked; lights are three, too."""
+FUZZ = 0.005
+"""Metres of hair before a point that do not hide it: strands are porous, and off by as much."""
+
+
+def three_nearest(
+    capture: Capture, camera: str, light: Light, training: Sequence[str]
+) -> AnyFloats:
+    """`camera`'s frames `(H, W, 3)` under the three `training` lights nearest to `light`, mixed.
+
+    Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
+    distance to what `light` would give. `light` itself is never among the three.
+    """
+    names = [n for n in training if n != light.name and capture.has_light(n, camera)]
+    others = [capture.rig.light(n) for n in names]
+    positions = np.array([o.position for o in others])
+    distance = np.linalg.norm(positions, axis=1)
+    own = float(np.linalg.norm(light.position))
+    nearest, weights = _nearest(positions, light.position, 3)
+    total = np.zeros(1)
+    for k, weight in zip(nearest, weights, strict=True):
+        here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
+        gain = here / np.maximum(there, 1e-12)
+        gain *= (distance[k] / own) ** 2
+        total = total + weight * gain * capture.light(names[k], camera)[0]
+    return np.asarray(total)
+
+
+@dataclass(frozen=True, eq=False)
+class NearestCameras:
+    """View interpolation: what `camera` would see, from the frames of other cameras alone.
+
+    Every pixel's point is where its ray meets `scene` first; where `mask (H, W)` has hair and the
+    scene has none, at the depth of the nearest pixel that meets any. The point's colour is that of
+    the `CAMERAS` cameras of `training` nearest in angle about the head, without `camera`, by the
+    inverse angle: of those that see it, or of all on whose image it falls where none does.
+    """
+
+    training: Capture
+    camera: Camera
+    pixels: Array
+    weights: Array
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, training: Capture, camera: Camera, scene: HairScene, mask: Bools
+    ) -> NearestCameras | None:
+        """Where each pixel lies in the nearest cameras; None where there is no other camera."""
+        others = [c for c in training.rig.cameras if c.name != camera.name]
+        points, met = _first_hits(scene, camera, mask)
+        if not others or not met.any():
+            return None
+        nearest, by_angle = _nearest(np.array([c.center for c in others]), camera.center, CAMERAS)
+        pixels = np.full((len(nearest), *met.shape, 2), -1.0)
+        weights = np.zeros((len(nearest), *met.shape))
+        fallback = np.zeros_like(weights)
+        for k, (i, weight) in enumerate(zip(nearest, by_angle, strict=True)):
+            where, depth = others[i].project(points[met])
+            inside = (depth > 0) & others[i].inside(where)
+            pixels[k][met] = where
+            fallback[k][met] = weight * inside
+            weights[k][met] = weight * (inside & _seen(scene, points[met], others[i]))
+        weights = np.where(weights.any(axis=0), weights, fallback)
+        total = weights.sum(axis=0)
+        weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
+        return cls(training, camera, pixels, weights, tuple(others[i].name for i in nearest))
+
+    def __call__(self, light: Light) -> AnyFloats:
+        """The frame `(H, W, 3)` under `light`.
+
+        The other cameras' own frames under it where it is a training light, else what
+        `three_nearest` makes of them.
+        """
+        training = self.training.olat_lights()
+        total = np.zeros((self.camera.height, self.camera.width, 3))
+        for name, where, weight in zip(self.names, self.pixels, self.weights, strict=True):
+            if light.name in training and self.training.has_light(light.name, name):
+                frame = self.training.light(light.name, name)[0]
+            else:
+                frame = three_nearest(self.training, name, light, training)
+            x, y = np.moveaxis(where.astype(np.float32), -1, 0)
+            found = cv2.remap(
+                frame.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+            total += weight[..., None] * found
+        return total
+
+
+def _nearest(positions: Array, own: Array, most: int) -> tuple[Ints, Array]:
+    """The `most` directions of `positions (N, 3)` nearest to `own (3,)`, and weights `(most,)`."""
+    cosine = positions @ own / (np.linalg.norm(positions, axis=1) * np.linalg.norm(own))
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    nearest = np.argsort(angle)[:most]
+    weights = 1.0 / np.maximum(angle[nearest], 1e-6)
+    return nearest, weights / weights.sum()
+
+
+def _first_hits(scene: HairScene, camera: Camera, mask: Bools) -> tuple[Array, Bools]:
+    """Points `(H, W, 3)`, metres, that rays through the pixels' centres meet, and where `(H, W)`.
+
+    Pixels of `mask` whose ray misses the hair take the depth of the nearest pixel that meets it.
+    """
+    row, column = np.indices((camera.height, camera.width)).reshape(2, -1)
+    ray = camera_rays(camera, mi.Float(column + 0.5), mi.Float(row + 0.5))
+    surface = Surface(scene)
+    si = surface.interact(ray, mi.Bool(True))
+    valid = si.is_valid()
+    shape = mask.shape
+    met, hair = (
+        np.array(x, dtype=bool).reshape(shape) for x in (valid, valid & surface.is_hair(si))
+    )
+    depth = np.array(dr.select(valid, si.t, 0), dtype=float).reshape(shape) / SCALE
+    if hair.any():
+        nearest = distance_transform_edt(~hair, return_distances=False, return_indices=True)
+        depth = np.where(mask & ~hair, depth[tuple(nearest)], depth)
+        met |= mask
+    directions = camera.rays(np.stack([column, row], axis=-1)).reshape(*shape, 3)
+    return camera.center + depth[..., None] * directions, met
+
+
+def _seen(scene: HairScene, points: Array, camera: Camera) -> Bools:
+    """Whether nothing but `FUZZ` lies between `points (P, 3)` and the camera `(P,)`."""
+    way = camera.center - points
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    start, end = ((points + FUZZ * way) * SCALE).T, camera.center * SCALE
+    origin = mi.Point3f(*(mi.Float(x.astype(np.float32)) for x in start))
+    towards = mi.Vector3f(*(float(x) for x in end)) - mi.Vector3f(origin)
+    ray = mi.Ray3f(origin, dr.normalize(towards))
+    ray.maxt = dr.norm(towards)
+    return ~np.array(scene.mi_scene.ray_test(ray, mi.Bool(True)), dtype=bool)
