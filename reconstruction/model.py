@@ -6,7 +6,6 @@ and renamed: after a crash it is the old one or the new one, whole.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.strands import Strands
 from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.reading import read_json
 from reconstruction.report.report import Report
 
 MaskKind = Literal["hair", "skin"]
@@ -212,8 +212,13 @@ class Model:
         return np.clip(roots, 0, 1) if len(roots) == len(strands) else None
 
     def json(self, name: str) -> Any:
-        """A JSON file. Raises `ModelError` where it is not there."""
-        return json.loads(self._needed(name, "hairstage fit CAPTURE").read_text())
+        """A JSON file. Raises `ModelError` where it is not there or not JSON."""
+        try:
+            return read_json(self._needed(name, "hairstage fit CAPTURE"))
+        except ModelError:
+            raise
+        except ValueError as error:
+            raise ModelError(str(error)) from error
 
     def write_json(self, name: str, data: Any) -> None:
         """Write JSON; numbers that are not finite are an error, never NaN."""

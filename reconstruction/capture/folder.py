@@ -15,7 +15,6 @@ capture/
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -31,6 +30,7 @@ from reconstruction.files.exr import read_exr
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig
+from reconstruction.reading import parse_json, read_json
 
 T = TypeVar("T")
 StepKind = Literal["dark", "all_on", "olat", "scanline", "tracking"]
@@ -63,6 +63,8 @@ class Step:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Step:
         """Read one entry of `plan.json`; raises `CaptureError` naming the field that is wrong."""
+        if not isinstance(data, dict):
+            raise CaptureError(f"plan.json: a step is an object, got {data!r}")
         unknown = set(data) - {f.name for f in fields(cls)}
         if unknown:
             raise CaptureError(f"plan.json: step has unknown fields {sorted(unknown)}: {data}")
@@ -72,6 +74,15 @@ class Step:
             raise CaptureError(f"plan.json: step {data}: {error}") from error
         if step.kind not in get_args(StepKind):
             raise CaptureError(f"plan.json: step {step.index}: unknown kind {step.kind!r}")
+        numbers: tuple[tuple[str, type], ...] = (
+            *(("index", int), ("row", int)),
+            *(("exposure", float), ("level", float)),
+        )
+        for field, kind in numbers:
+            value = getattr(step, field)
+            fits = isinstance(value, kind | int) and not isinstance(value, bool)
+            if not (fits or (field == "row" and value is None)):
+                raise CaptureError(f"plan.json: step {data}: {field}: a number, got {value!r}")
         return step
 
     def to_dict(self) -> dict[str, Any]:
@@ -106,10 +117,15 @@ class Capture:
         self.path = Path(path)
         if not (self.path / "rig.json").is_file() or not (self.path / "plan.json").is_file():
             raise CaptureError(f"{self.path} is not a capture: expected rig.json and plan.json")
-        self.rig = Rig.load(self._own("rig.json"))
-        self.plan: dict[str, Any] = json.loads(self._own("plan.json").read_text())
-        self.steps = tuple(Step.from_dict(s) for s in self.plan["steps"])
-        self.records = dict(self._journal())
+        try:
+            self.rig = Rig.load(self._own("rig.json"))
+            self.plan: dict[str, Any] = _object(self._own("plan.json"))
+            self.steps = tuple(Step.from_dict(s) for s in _steps(self.plan))
+            self.records = dict(self._journal())
+        except (OSError, ValueError) as error:
+            if isinstance(error, CaptureError):
+                raise
+            raise CaptureError(str(error)) from error
         self._lenses: dict[str, Lens] = {}
 
     def view(
@@ -168,21 +184,23 @@ class Capture:
     def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:
         """Records by (step, camera); later lines win. A torn last line is what a crash leaves."""
         path = self._own("journal.jsonl")
-        lines = path.read_text().splitlines() if path.is_file() else []
+        lines = plain_file(path).read_bytes().splitlines() if path.exists() else []
         for number, line in enumerate(lines, 1):
             try:
-                record = FrameRecord(**json.loads(line))
-            except (json.JSONDecodeError, TypeError) as error:
+                record = FrameRecord(**parse_json(line))
+                if not isinstance(record.file, str | None):
+                    raise TypeError(f"file: a name, got {record.file!r}")
+                yield (int(record.step), str(record.camera)), record
+            except (ValueError, TypeError) as error:
                 if number == len(lines):
                     return
                 raise CaptureError(f"{path}, line {number}: {error}") from error
-            yield (record.step, record.camera), record
 
     @cached_property
     def manifest(self) -> dict[str, Any] | None:
-        """The manifest, or None while the capture is not finished."""
+        """The manifest, or None while the capture is not finished. Raises `CaptureError`."""
         path = self._own("manifest.json")
-        return json.loads(path.read_text()) if path.is_file() else None
+        return _object(path) if path.exists() else None
 
     def has(self, step: Step, camera: str) -> bool:
         """Whether the frame was written."""
@@ -340,6 +358,24 @@ class Capture:
     def _shape(self, camera: str) -> tuple[int, int]:
         c = self.rig.camera(camera)
         return c.height, c.width
+
+
+def _object(path: Path) -> dict[str, Any]:
+    """The object that a JSON file of a capture holds."""
+    try:
+        data = read_json(path)
+    except (OSError, ValueError) as error:
+        raise CaptureError(str(error)) from error
+    if not isinstance(data, dict):
+        raise CaptureError(f"{path}: expected an object, got {type(data).__name__}")
+    return data
+
+
+def _steps(plan: dict[str, Any]) -> list[Any]:
+    steps = plan.get("steps")
+    if not isinstance(steps, list):
+        raise CaptureError(f"plan.json: the field 'steps' must be a list, got {steps!r}")
+    return steps
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> Bools:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,8 +49,8 @@ def _journal(journal: Path) -> Iterator[str]:
 def _manifest(capture: Capture) -> Iterator[str]:
     try:
         manifest = capture.manifest
-    except json.JSONDecodeError as error:
-        yield f"manifest.json is not JSON: {error}."
+    except CaptureError as error:
+        yield f"manifest.json cannot be read: {error}."
         return
     if manifest is None:
         yield "manifest.json is missing: the capture was not finished."

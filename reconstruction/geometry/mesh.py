@@ -64,7 +64,8 @@ def read_obj(path: str | Path) -> Mesh:
     """Read the triangles of a Wavefront OBJ; polygons are fanned.
 
     Faces in a group, object or material whose name contains "scalp" are marked as scalp; without
-    such a name `scalp` is None. Raises `ValueError` naming the file where it holds no triangles.
+    such a name `scalp` is None. Raises `OSError`, and `ValueError` naming the file where it holds
+    no triangles, is no regular file or has more than 256 MiB.
     """
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
@@ -92,7 +93,7 @@ def read_obj(path: str | Path) -> Mesh:
         raise ValueError(f"{path}: no faces; expected a triangle mesh in Wavefront OBJ")
     try:
         return Mesh(np.array(vertices), np.array(faces), np.array(scalp) if any(scalp) else None)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"{path}: {error}") from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from reconstruction.geometry.ies import read_ies
 from reconstruction.geometry.light_profiles import LightProfile
 from reconstruction.geometry.lights import Light, dome_positions
 from reconstruction.geometry.projectors import Projector
+from reconstruction.reading import parse_json
 
 P = TypeVar("P", bound=Pinhole)
 
@@ -73,14 +73,17 @@ class Rig:
         """
         path = Path(path)
         try:
-            data = (json if path.suffix == ".json" else tomllib).loads(path.read_text())
+            text = plain_file(path).read_bytes()
+            data = parse_json(text) if path.suffix == ".json" else tomllib.loads(text.decode())
         except FileNotFoundError:
             raise RigError(f"{path}: no such rig file") from None
-        except (json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
+        except ValueError as error:
             raise RigError(f"{path}: {error}") from error
+        if not isinstance(data, dict):
+            raise RigError(f"{path}: expected an object, got {type(data).__name__}")
         try:
             return cls.from_dict(data, path.parent)
-        except (RigError, ValueError, TypeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
             raise RigError(f"{path}: {error}") from error
 
     @classmethod

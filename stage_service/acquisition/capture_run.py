@@ -60,6 +60,10 @@ class CaptureRun:
             }
         )
 
+    def give_up(self) -> None:
+        """Let go of the folder without having begun."""
+        self._writer.close()
+
     def _notify(self, kind: str, data: dict[str, Any]) -> None:
         self._events.publish(kind, {"id": self.id, **data})
 

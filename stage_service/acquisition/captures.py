@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import shutil
 import threading
-from collections.abc import Callable
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import RESERVE
+from reconstruction.reading import printable
 from stage_service.acquisition.capture_run import CaptureRun, plan_of
 from stage_service.acquisition.latch import Latch
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
 from stage_service.acquisition.states import CaptureStatus, WrongState, possible, read_status
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
-from stage_service.devices.lights.limited import LitTimes
+from stage_service.devices.last_seen import LastSeen
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.flash import SLOW_HZ, FlashRefusal
 from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
@@ -29,8 +31,13 @@ from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 from stage_service.records.lease import RootLock
 
+log = logging.getLogger("hairstage.captures")
 STOP_WITHIN_S = 30.0
 """A capture that is stopped at once is out of its last device call within this time."""
+TIDY_S = 1.0
+"""How long a blackout, once it is dark, waits for the capture's folder to be finished."""
+ANSWER_S = 5.0
+"""A blackout is answered within this time, or three times the slowest timeout_s of the devices."""
 
 
 class Busy(RuntimeError):
@@ -52,9 +59,10 @@ class CaptureManager:
     """Makes captures under `root/captures/<id>`, one at a time, each on a thread of its own.
 
     `on_complete(status)` is called on that thread when a capture is done with outcome "completed".
-    Folders without a manifest found at the start are listed as interrupted. Constructing connects
-    to nothing; `start`, `devices`, `blackout` and `darken` talk to the stage. Raises `RootInUse`
-    while another manager has this root.
+    Folders found at the first look are listed: without a manifest as interrupted, unreadable ones
+    as damaged. Constructing connects to nothing and reads no capture; `start`, `devices`,
+    `blackout` and `darken` talk to the stage, all through one `DeviceSet`. Raises `RootInUse` while
+    another manager has this root.
 
     A blackout that could not be verified is latched (`latch`): nothing is lit until that is over.
     `audit` is where the captures' ends and the latch are recorded.
@@ -75,17 +83,34 @@ class CaptureManager:
         self._dark: Blackout | None = None
         self.events = EventLog()
         self._on_complete = on_complete
-        self._lock = threading.RLock()
-        self._talking = threading.Lock()
+        self._lock = threading.RLock()  # for moments, never while device or disk is waited for
+        self._talking = threading.Lock()  # held by who has connected to the devices to ask them
         self._running: CaptureRun | None = None
-        self._closed = self._darkening = False
-        self._lit: LitTimes = {}
-        self._done: dict[str, CaptureStatus] = {}
-        for plan in sorted(self.folder.glob("*/plan.json")):
-            # a folder that is no capture, or a damaged one, must not keep the service from starting
-            with suppress(ValueError, LookupError, OSError):
-                self._done[plan.parent.name] = read_status(plan.parent)
+        self._preparing: str | None = None
+        self._closed = False
+        self._blackouts = 0  # begun since the start
+        self._darkening = 0  # under way
+        self._found: dict[str, CaptureStatus] | None = None
         self._stay_on_exit = off_on_exit(self.close)
+
+    @cached_property
+    def _devices(self) -> DeviceSet:
+        return DeviceSet.of(self.rig_file)
+
+    @cached_property
+    def _seen(self) -> LastSeen:
+        return LastSeen(self._look, self._devices.unseen())
+
+    @property
+    def _done(self) -> dict[str, CaptureStatus]:
+        """What nobody is shooting, by id; the folders are read when it is first asked for."""
+        with self._lock:
+            if self._found is None:
+                self._found = {p.name: read_status(p) for p in _folders(self.folder)}
+                for status in self._found.values():
+                    if status.outcome == "damaged":
+                        log.warning("%s is damaged: %s", status.path, status.error)
+            return self._found
 
     def start(
         self,
@@ -110,67 +135,99 @@ class CaptureManager:
         if cost.bytes + RESERVE > free:
             need, have = f"{cost.bytes / 1e9:.1f} GB", f"{free / 1e9:.1f} GB"
             raise PlanError([f"the plan writes {need}, {self.folder} has {have} free"])
-        with self._lock:
-            self._check_free()
-            now = datetime.now(UTC)
-            capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
-            description = {
-                "steps": list(resolved.steps),
-                "plan": plan.model_dump(mode="json"),
-                "cost": cost.model_dump(mode="json"),
-                "started": utc_now(),
-                "armed_by": armed_by,
-                "request": extra or {},
-            }
-            devices = self._devices()
-            writer = CaptureWriter.create(
-                self.folder / capture_id, self.rig_file.rig, description, masks=masks, head=head
-            )
-            self._begin(capture_id, resolved, devices, writer, armed_by)
+        now = datetime.now(UTC)
+        capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
+        description = {
+            "steps": list(resolved.steps),
+            "plan": plan.model_dump(mode="json"),
+            "cost": cost.model_dump(mode="json"),
+            "started": utc_now(),
+            "armed_by": armed_by,
+            "request": extra or {},
+        }
+
+        def make() -> CaptureRun:
+            folder, rig, devices = self.folder / capture_id, self.rig_file.rig, self._devices
+            writer = CaptureWriter.create(folder, rig, description, masks=masks, head=head)
+            return self._run_of(capture_id, resolved, devices, writer, armed_by)
+
+        self._launch(capture_id, make)
         return capture_id
 
     def _continue(self, capture_id: str, armed_by: str | None) -> None:
         """Shoot what a capture lacks that is done and did not complete."""
-        with self._lock:
-            done = self.get(capture_id)
-            if "continue" not in possible(done.state, done.outcome):
-                raise WrongState("resume", done.state, done.outcome)
-            self._check_free()
+        done = self.get(capture_id)
+        if "continue" not in possible(done.state, done.outcome):
+            raise WrongState("resume", done.state, done.outcome)
+
+        def make() -> CaptureRun:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
             _check_flashing(plan, armed_by)
-            devices = self._devices()
-            self._begin(capture_id, plan, devices, CaptureWriter.reopen(path), armed_by)
-            del self._done[capture_id]
+            devices = self._devices
+            return self._run_of(capture_id, plan, devices, CaptureWriter.reopen(path), armed_by)
 
-    def _check_free(self) -> None:
-        if self._closed:
-            raise Busy("none, but the service is closing")
-        if self._darkening:
-            raise Busy("none, but the stage is being put dark")
-        if self._running is not None:
-            raise Busy(self._running.id)
-        self.latch.check()
+        self._launch(capture_id, make)
 
-    def _begin(
+    def _run_of(
         self,
         capture_id: str,
         plan: ResolvedPlan,
         devices: DeviceSet,
         writer: CaptureWriter,
         armed_by: str | None,
-    ) -> None:
-        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=bool(armed_by))
+    ) -> CaptureRun:
+        consented = bool(armed_by)
+        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=consented)
         name = f"capture-{capture_id}"
         run.thread = threading.Thread(target=self._run, args=(run,), name=name, daemon=True)
-        self._running = run
-        run.thread.start()
+        return run
+
+    def _launch(self, capture_id: str, make: Callable[[], CaptureRun]) -> None:
+        """Begin what `make` prepares in the disk's own time, unless a blackout comes meanwhile."""
+        with self._lock:
+            self._check_free()
+            self._preparing, blackouts = capture_id, self._blackouts
+        run = None
+        try:
+            run = make()
+            with self._lock:
+                if self._closed or self._blackouts != blackouts:
+                    raise Busy("none, but the stage was put dark meanwhile")
+                self._done.pop(capture_id, None)
+                self._running = run
+                assert run.thread is not None
+                run.thread.start()
+        except BaseException:
+            if run is not None:
+                run.give_up()
+                self._done[capture_id] = read_status(self.folder / capture_id)
+            raise
+        finally:
+            with self._lock:
+                self._preparing = None
+
+    def _check_free(self) -> None:
+        if self._closed:
+            raise Busy("none, but the service is closing")
+        if self._darkening:
+            raise Busy("none, but the stage is being put dark")
+        going = self._preparing if self._running is None else self._running.id
+        if going is not None:
+            raise Busy(going)
+        self.latch.check()
+
+    @property
+    def running(self) -> str | None:
+        """The id of the capture that is being made; asks neither disk nor device."""
+        run = self._running
+        return None if run is None else run.id
 
     def get(self, capture_id: str) -> CaptureStatus:
         """What is known about a capture. Raises `UnknownCapture`."""
         with self._lock:
             if self._running is not None and self._running.id == capture_id:
-                return self._running.status()
+                return _not_yet_over(self._running.status())
             if capture_id not in self._done:
                 raise UnknownCapture(capture_id)
             return self._done[capture_id]
@@ -180,7 +237,7 @@ class CaptureManager:
         with self._lock:
             known = list(self._done.values())
             if self._running is not None:
-                known.append(self._running.status())
+                known.append(_not_yet_over(self._running.status()))
             return sorted(known, key=lambda c: c.id)
 
     def path(self, capture_id: str) -> Path:
@@ -215,18 +272,26 @@ class CaptureManager:
 
     def devices(self) -> dict[str, Any]:
         """Per device kind: {"state": "ok" | "unreachable" | "in use", "error"?: str, figures};
-        under "cameras" one such table per camera. Without a capture, connects for the answer.
-        "safety" has the state after the last blackout, and whether it is latched."""
-        with self._talking:
-            run = self._running
-            if run is not None:
-                lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
-                return {**run.sequencer.devices.status(connect=False), "safety": lit}
-            with closing(self._devices()) as devices:
-                return {**devices.status(connect=True), "safety": self.darkness()}
+        under "cameras" one such table per camera. They are asked anew, but not waited for: "age_s"
+        is how old the answer is. "safety" has the state after the last blackout, and whether it is
+        latched."""
+        seen = {"age_s": None} if self.rig_file.devices is None else self._seen.get()
+        run = self._running
+        if run is None:
+            return {**seen, "safety": self.darkness()}
+        lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
+        return {**seen, "safety": lit}
 
-    def _devices(self) -> DeviceSet:
-        return DeviceSet.of(self.rig_file, self._lit)
+    def _look(self) -> dict[str, Any] | None:
+        """Ask the devices; without a capture, connect for the answer, until one begins."""
+        devices = self._devices
+        with self._talking:
+            if self._running is not None:
+                return devices.status(connect=False)
+            try:
+                return devices.status(connect=True, given_up=lambda: self._running is not None)
+            finally:
+                devices.close()
 
     def darkness(self) -> dict[str, Any]:
         """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
@@ -239,56 +304,54 @@ class CaptureManager:
         """Put everything off that answers, as the service starts; what does not is latched."""
         if self.rig_file.devices is None:
             return
-        with self._talking, closing(self._devices()) as devices:
-            self._learn(blackout(devices, attempts=1), devices)
+        with self._talking:
+            try:
+                self._learn(blackout(self._devices, attempts=1))
+            finally:
+                self._devices.close()
 
     def blackout(self) -> dict[str, Any]:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
 
         Returns {"safe": bool, "state": "dark" | "unknown, unsafe", "detail": str}; what is unknown
-        is to be treated as lit.
+        is to be treated as lit. Waits for no disk, no camera and nobody who asks the devices.
         """
+        devices = self._devices
         with self._lock:
-            self._darkening = True  # nothing may begin between the run's end and the blackout
+            self._blackouts += 1
+            self._darkening += 1  # nothing may begin until it is over
+            run = self._running
         try:
-            run = self._stop()
-            with self._talking:
-                result = self._darken_after(run)
+            within_s = max(ANSWER_S, 3 * devices.slowest_s)
+            if run is not None:
+                result = run.sequencer.darken(within_s)
+            else:
+                result = blackout(devices, within_s=within_s)
+            self._learn(result)
+            if run is not None and run.thread is not None:
+                run.thread.join(TIDY_S)
         finally:
             with self._lock:
-                self._darkening = False
+                self._darkening -= 1
+                alone = self._darkening == 0 and self._running is None
+            if alone:
+                devices.close_lit()
         answer = result.to_dict()
         self.events.publish("stage.blackout", answer)
         return answer
-
-    def _darken_after(self, run: CaptureRun | None) -> Blackout:
-        """The blackout with which the run has ended, or one of our own."""
-        if run is not None and run.sequencer.blackout is not None:
-            return run.sequencer.blackout
-        with closing(self._devices() if run is None else run.sequencer.devices) as devices:
-            result = blackout(devices)
-            self._learn(result, devices)
-            return result
 
     def close(self) -> None:
         """Stop what runs, lights off, wait for the thread; the manager starts nothing any more."""
         with self._lock:
             self._closed = True
-        run = self._stop()
-        if run is not None and run.sequencer.blackout is None:  # its thread is stuck somewhere
-            self._learn(blackout(run.sequencer.devices), run.sequencer.devices)
+            run = self._running
+        if run is not None and run.thread is not None:
+            result = run.sequencer.darken(STOP_WITHIN_S)
+            run.thread.join(STOP_WITHIN_S)
+            if run.thread.is_alive():  # it is stuck somewhere
+                self._learn(result)
         self._stay_on_exit()
         self._root_lock.release()
-
-    def _stop(self) -> CaptureRun | None:
-        """Stop the running capture within its step, and wait until it has ended in order."""
-        with self._lock:  # until `start` has started its thread
-            run = self._running
-        if run is None or run.thread is None:
-            return None
-        run.sequencer.stop_now()
-        run.thread.join(STOP_WITHIN_S)
-        return run
 
     def _steer(self, capture_id: str, action: str) -> CaptureStatus:
         with self._lock:
@@ -307,11 +370,11 @@ class CaptureManager:
             run.sequencer.run()
         finally:
             # `devices` may have opened the links once more after the sequencer closed them.
-            with self._talking, self._lock:
-                try:
+            try:
+                with self._talking:
                     run.sequencer.devices.close()
-                finally:
-                    status = self._ended(run)
+            finally:
+                status = self._ended(run)
         if status.outcome == "completed" and self._on_complete is not None:
             try:
                 self._on_complete(status)
@@ -321,25 +384,55 @@ class CaptureManager:
 
     def _ended(self, run: CaptureRun) -> CaptureStatus:
         """Put the run away; its last blackout is what is known of the stage."""
-        self._running = None
-        status = run.status()
-        self._done[run.id] = status
         if run.sequencer.blackout is not None:
-            self._learn(run.sequencer.blackout, run.sequencer.devices)
+            self._learn(run.sequencer.blackout)
+        status = run.status()
         result = status.outcome or status.state
         self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
+        with self._lock:
+            self._done[run.id] = status
+            self._running = None
         return status
 
-    def _learn(self, result: Blackout, devices: DeviceSet) -> None:
+    def _learn(self, result: Blackout) -> None:
         """Keep what a blackout came to, and latch or unlatch."""
-        beams = devices.projectors
-        lamps = devices.lights.capabilities.reads_back
+        beams = self._devices.projectors
+        lamps = self._devices.lights.capabilities.reads_back
         reads_back = lamps and (beams is None or beams.capabilities.reads_back)
         self._dark = result
         change = self.latch.learn(result, reads_back)
         if change is not None:
             self.audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
             self.events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    """The captures in a folder, whole or damaged; what is none of it is left out."""
+    for path in sorted(folder.iterdir()):
+        if printable(path.name) != path.name:
+            log.warning("%s: the folder's name is not UTF-8: left out", printable(str(path)))
+        elif not path.name.startswith(".") and any(_there(path / name) for name in _OF_A_CAPTURE):
+            yield path
+
+
+_OF_A_CAPTURE = ("plan.json", "rig.json", "journal.jsonl", "manifest.json")
+
+
+def _there(path: Path) -> bool:
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:  # it cannot be looked at: that is for `read_status` to say
+        return True
+    return True
+
+
+def _not_yet_over(status: CaptureStatus) -> CaptureStatus:
+    """The status of a run whose thread still tidies up: nothing else can begin before."""
+    if status.state != "done":
+        return status
+    return status.model_copy(update={"state": "finishing", "outcome": None})
 
 
 def _check_flashing(plan: ResolvedPlan, armed_by: str | None) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from reconstruction import Step
@@ -44,6 +45,18 @@ class Exposing:
         self._devices, self._lamp, self._cancel, self._timings = devices, lamp, cancel, timings
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
+        self._lighting = threading.Lock()
+
+    @contextmanager
+    def no_light(self, within_s: float) -> Iterator[None]:
+        """A context in which, once `cancel` is set, nothing more goes on; a device that takes
+        longer than `within_s` to light something is not waited for."""
+        held = self._lighting.acquire(timeout=within_s)
+        try:
+            yield
+        finally:
+            if held:
+                self._lighting.release()
 
     def expose(self, step: Step) -> Pulse:
         """Make one pulse in the step's light."""
@@ -53,7 +66,8 @@ class Exposing:
         self._next = time.monotonic() + self._period
         if self._watch is not None:
             self._watch(step)
-        with timings.on("lights"):
+        with timings.on("lights"), self._lighting:
+            self._sleep(0)  # not even one more lamp once somebody asked for a blackout
             self._light(step)
         with timings.on("settle"):
             self._sleep(self._devices.config.lights.settle_s)

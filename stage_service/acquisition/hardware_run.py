@@ -79,6 +79,8 @@ class HardwareRun:
             beams.load_sequence(shown)
         trigger.load_table(self._rows, self._devices.config.watchdog_s)
         watch = _Watch(self._devices, stop_asked)
+        if cancel.is_set():
+            raise Cancelled("the capture is being stopped")
         try:
             trigger.go()
             watch.start()

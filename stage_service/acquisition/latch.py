@@ -8,8 +8,11 @@ import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import write_whole
+from reconstruction.reading import read_json
 from stage_service.acquisition.safety import Blackout
 
 log = logging.getLogger("hairstage.safety")
@@ -50,11 +53,12 @@ class Latch:
         self._path = path
         self._lock = threading.Lock()
         self.latched: Latched | None = None
-        if path.exists():
-            try:
-                self.latched = Latched(**json.loads(path.read_text()))
-            except (OSError, ValueError, TypeError) as error:
-                self.latched = Latched(utc_now(), f"{path} cannot be read: {error}", True)
+        try:
+            self.latched = TypeAdapter(Latched).validate_python(read_json(path))
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError) as error:
+            self.latched = Latched(utc_now(), f"{path} cannot be read: {error}", True)
 
     def check(self) -> None:
         """Raise `Unsafe` while it is set."""
@@ -91,5 +95,8 @@ class Latch:
             self._clear()
 
     def _clear(self) -> None:
-        self._path.unlink(missing_ok=True)
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError:  # it is latched again at the next start
+            log.exception("%s cannot be removed", self._path)
         self.latched = None

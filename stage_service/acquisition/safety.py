@@ -6,12 +6,14 @@ Software is not the safety function: the light bank's own watchdog and the wired
 from __future__ import annotations
 
 import atexit
+import queue
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from stage_service.devices.device_set import DeviceSet
@@ -21,6 +23,8 @@ from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.trigger.interface import TriggerStatus
 
 ATTEMPTS = 3
+WITHIN_S = 30.0
+"""A device that has not answered by then is not waited for any longer."""
 Darkness = Literal["dark", "unknown, unsafe"]
 
 
@@ -51,11 +55,11 @@ class Blackout:
         return {"safe": self.safe, "state": self.state, "detail": self.detail}
 
 
-def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
-    """Put lamps and projectors off and read it back; never raises for a device.
+def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WITHIN_S) -> Blackout:
+    """Put lamps and projectors off, side by side, and read it back; never raises for a device.
 
-    A device that fails is tried again on a new connection. What cannot be verified is reported
-    as "unknown, unsafe".
+    A device that fails is tried again on a new connection. What cannot be verified, or not
+    `within_s` seconds, is reported as "unknown, unsafe"; what is late is still tried.
     """
     lights, beams, config = devices.lights, devices.projectors, devices.config
     problems = unread = ""
@@ -63,9 +67,19 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
     lit = [(lights, lambda: lights.status().lit == 0)]
     if beams is not None:
         lit.append((beams, beams.is_dark))
-    for device, is_dark in lit:
+    found = [
+        _beside(
+            partial(_darken, device, is_dark if device.capabilities.reads_back else None, attempts)
+        )
+        for device, is_dark in lit
+    ]
+    deadline = time.monotonic() + within_s
+    for (device, _), answer in zip(lit, found, strict=True):
         can = device.capabilities
-        problem = _darken(device, is_dark if can.reads_back else None, attempts)
+        try:
+            problem = answer.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            problem = f" {device.name}: not dark within {within_s:g} s."
         if problem and can.dead_man:
             problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
         problems += problem
@@ -76,6 +90,20 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS) -> Blackout:
     only_lamps = beams is None or beams.capabilities.reads_back
     accepted = not problems and only_lamps and config.lights.accept_unverified_blackout
     return Blackout(False, f"unknown, unsafe: {(problems + unread).strip()}", accepted)
+
+
+def _beside(work: Callable[[], str]) -> queue.SimpleQueue[str]:
+    """Where the answer of `work`, on a thread of its own, will be."""
+    answer: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def run() -> None:
+        answer.put(work())
+
+    try:
+        threading.Thread(target=run, name="blackout", daemon=True).start()
+    except RuntimeError:  # the interpreter is ending, or no thread can be had
+        run()
+    return answer
 
 
 def _darken(

@@ -28,6 +28,8 @@ from stage_service.plan.stepping import SHORTEST_RUN
 Notify = Callable[[str, dict[str, Any]], None]
 QUEUED_STEPS = 2
 """Steps' worth of frames that may wait for the disk before the sequence waits, too."""
+ORDERLY_S = 0.5
+"""How long whoever darkens a run waits for it to do so itself."""
 MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
 
 
@@ -76,6 +78,7 @@ class Sequencer:
         self._pause_asked = False
         self._abort_asked = False
         self._cancel = threading.Event()
+        self._dark = threading.Event()
         self._lamp = {light.name: i for i, light in enumerate(writer.rig.lights)}
         self._armed: float | None = None
         self._doubtful = False
@@ -139,6 +142,18 @@ class Sequencer:
             self._abort_asked = True
             self._cancel.set()
             self._changed.notify_all()
+
+    def darken(self, within_s: float) -> Blackout:
+        """Stop at once and put everything off, whatever the run's thread is stuck in.
+
+        Returns the blackout with which the run ends in order, or else one of the caller's own,
+        after which the run lights nothing any more. Each takes `within_s` seconds at most.
+        """
+        self.stop_now()
+        if self._dark.wait(ORDERLY_S) and self.blackout is not None:
+            return self.blackout
+        with self._exposing.no_light(within_s):
+            return blackout(self.devices, within_s=within_s)
 
     def run(self) -> Outcome:
         """Shoot what is missing and finish the capture folder; returns the outcome.
@@ -363,6 +378,7 @@ class Sequencer:
 
     def _black_out(self) -> None:
         self.blackout = blackout(self.devices)
+        self._dark.set()
 
     def _require(self, action: str) -> None:
         if not self._machine.allows(action) or (self._abort_asked and action != "abort"):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from reconstruction import Capture
+from reconstruction import Capture, CaptureError
+from reconstruction.options import sentence
+from reconstruction.reading import printable
 
 State = Literal["idle", "running", "paused", "finishing", "done"]
-Outcome = Literal["completed", "aborted", "failed", "interrupted"]
+Outcome = Literal["completed", "aborted", "failed", "interrupted", "damaged"]
 
 TRANSITIONS: dict[State, dict[str, State]] = {
     "idle": {"start": "running", "abort": "finishing", "fail": "finishing"},
@@ -30,8 +32,11 @@ OUTCOMES: dict[str, Outcome] = {"complete": "completed", "abort": "aborted", "fa
 
 
 def possible(state: State, outcome: Outcome | None) -> dict[str, State]:
-    """The actions that a state allows, and where they lead; a completed capture is over."""
-    return {} if state == "done" and outcome == "completed" else TRANSITIONS[state]
+    """The actions that a state allows, and where they lead.
+
+    A completed capture is over, and a damaged one cannot be read.
+    """
+    return {} if state == "done" and outcome in ("completed", "damaged") else TRANSITIONS[state]
 
 
 class WrongState(RuntimeError):
@@ -92,9 +97,37 @@ class CaptureStatus(BaseModel):
 def read_status(path: Path) -> CaptureStatus:
     """The status of a capture folder that nobody is shooting: done, interrupted without manifest.
 
-    Raises `CaptureError` where the folder is no capture.
+    Whatever is wrong with it, it is "damaged", with the reason as `error`; never raises.
     """
+    try:
+        return _read_status(path)
+    except Exception as error:  # one folder must not keep the others, or the service, from working
+        reason = str(error) if isinstance(error, ValueError | OSError) else repr(error)
+        if isinstance(error, ValidationError):
+            reason = f"plan.json or manifest.json: {sentence(error)}"
+        return CaptureStatus(
+            id=path.name,
+            state="done",
+            outcome="damaged",
+            error=printable(f"{reason}; `hairstage verify {path}` lists what is wrong"),
+            path=str(path),
+            steps=0,
+            step=0,
+            frames_planned=0,
+            frames_written=0,
+            frames_missing=0,
+            seconds_predicted=None,
+            seconds=None,
+            left_out=[],
+            started=None,
+            request={},
+        )
+
+
+def _read_status(path: Path) -> CaptureStatus:
     capture = Capture(path)
+    if capture.manifest is not None and "outcome" not in capture.manifest:
+        raise CaptureError(f"{path / 'manifest.json'}: the field 'outcome' is missing")
     manifest, plan = capture.manifest, capture.plan
     written = {r.step for r in capture.records.values()}
     cost = plan.get("cost", {})

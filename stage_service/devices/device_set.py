@@ -103,28 +103,64 @@ class DeviceSet:
         for device in self._all():
             device.close()
 
-    def status(self, *, connect: bool) -> dict[str, Any]:
+    def status(
+        self, *, connect: bool, given_up: Callable[[], bool] = lambda: False
+    ) -> dict[str, Any] | None:
         """Ask each device how it is: {kind: {"state": "ok" | "unreachable", ...}}.
 
         With `connect` each device is connected first. Without it, as during a capture, the cameras
-        are left alone; a driver whose link is closed opens it to ask.
+        are left alone; a driver whose link is closed opens it to ask. None once `given_up`, which
+        is asked before each device.
         """
         lights, trigger, beams = self.lights, self.trigger, self.projectors
-        out = {
-            "lights": _ask(lights, connect, _lamps),
-            "trigger": _ask(
+        asked: dict[str, Callable[[], dict[str, Any]]] = {
+            "lights": lambda: _ask(lights, connect, _lamps),
+            "trigger": lambda: _ask(
                 trigger, connect, lambda t: {"pulses": t.count(), **asdict(t.status())}
             ),
         }
         if beams is not None:
-            shown = _ask(beams, connect, lambda b: {"dark": b.is_dark(), "names": list(b.names)})
-            out["projectors"] = shown
-        out["cameras"] = {
-            c.name: _ask(c, connect, lambda c: asdict(c.info)) if connect else {"state": "in use"}
-            for c in self.cameras
-        }
-        out["projector_power"] = {p.projector: _power(p) for p in self.powers if connect}
+            asked["projectors"] = lambda: _ask(
+                beams, connect, lambda b: {"dark": b.is_dark(), "names": list(b.names)}
+            )
+        asked["cameras"] = self._ask_cameras if connect else lambda: self._cameras("in use")
+        asked["projector_power"] = lambda: {p.projector: _power(p) for p in self.powers if connect}
+        out = {}
+        for kind, ask in asked.items():
+            if given_up():
+                return None
+            out[kind] = ask()
         return out
+
+    @property
+    def slowest_s(self) -> float:
+        """The longest deadline of a request to lamps or projectors."""
+        beams = self.config.projectors
+        return max(self.config.lights.timeout_s, 0.0 if beams is None else beams.timeout_s)
+
+    def unseen(self) -> dict[str, Any]:
+        """What `status` has while nobody knows: each device's state is "not asked yet"."""
+        state = "not asked yet"
+        single: dict[str, Device | None]
+        single = {"lights": self.lights, "trigger": self.trigger, "projectors": self.projectors}
+        known = {k: {"name": d.name, "state": state} for k, d in single.items() if d is not None}
+        return {**known, "cameras": self._cameras(state), "projector_power": {}}
+
+    def _cameras(self, state: str) -> dict[str, Any]:
+        return {camera.name: {"state": state} for camera in self.cameras}
+
+    def _ask_cameras(self) -> dict[str, Any]:
+        cameras = FanOut(self.cameras)
+        try:
+            return cameras(lambda camera: _ask(camera, True, lambda c: asdict(c.info)))
+        finally:
+            cameras.close()
+
+    def close_lit(self) -> None:
+        """Close the links to lamps and projectors, which stay as they are."""
+        for device in (self.lights, self.projectors):
+            if device is not None:
+                device.close()
 
     def _all(self) -> tuple[Device, ...]:
         beams = (self.projectors,) if self.projectors is not None else ()
@@ -148,7 +184,7 @@ def _power(projector: PjLinkProjector) -> dict[str, Any]:
     try:
         lamps = [asdict(lamp) for lamp in projector.lamps()]
         return {"state": "ok", "power": projector.power().name, "lamps": lamps}
-    except DeviceError as error:
+    except Exception as error:
         return {"state": "unreachable", "error": str(error)}
 
 
@@ -162,5 +198,5 @@ def _ask(device: D, connect: bool, question: Callable[[D], dict[str, Any]]) -> d
         if connect:
             device.connect()
         return {"name": device.name, "state": "ok", **question(device)}
-    except DeviceError as error:
+    except Exception as error:  # whatever it is, the other devices are still to be asked
         return {"name": device.name, "state": "unreachable", "error": str(error)}

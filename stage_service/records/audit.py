@@ -12,6 +12,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from reconstruction.capture.writer import utc_now
+from reconstruction.reading import printable
 
 log = logging.getLogger("hairstage.audit")
 SERVICE = "service"
@@ -43,6 +44,7 @@ class AuditLog:
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
     ) -> None:
         """Append an action. A disk that is full is logged: it must not keep a lamp lit."""
+        who, subject, detail = (printable(text) for text in (who, subject, detail))
         line = Action(
             time=utc_now(), who=who, action=action, subject=subject, result=result, detail=detail
         ).model_dump_json()
@@ -60,11 +62,12 @@ class AuditLog:
 
     def latest(self, limit: int) -> list[Action]:
         """The newest actions, oldest of them first; a torn line is left out."""
-        if not self._path.exists():
-            return []
         newest = []
-        with self._lock, self._path.open(errors="replace") as file:
-            for line in deque(file, maxlen=limit):
-                with suppress(ValueError):
-                    newest.append(Action.model_validate_json(line))
+        try:
+            with self._lock, self._path.open(errors="replace") as file:
+                for line in deque(file, maxlen=limit):
+                    with suppress(ValueError):
+                        newest.append(Action.model_validate_json(line))
+        except FileNotFoundError:
+            return []
         return newest

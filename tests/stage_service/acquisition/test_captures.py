@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import until as waited
 
 from reconstruction import CaptureError, verify
 from reconstruction.geometry.rig import RigError
@@ -83,7 +86,7 @@ def test_one_capture_at_a_time_and_steering(manager, world):
     until(manager, "capture.state", state="paused")
     assert not world.lit
     assert manager.get(first).state == "paused"
-    assert manager.devices()["lights"]["state"] == "ok"
+    assert seen(manager)["lights"]["state"] == "ok"
     manager.resume(first)
     manager.abort(first)
     status = manager.wait(first, 20)
@@ -106,7 +109,7 @@ def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, wo
         "state": "dark",
         "detail": "every lamp and projector was read back dark",
     }
-    assert manager.get(capture_id).outcome == "aborted"
+    assert manager.wait(capture_id, 20).outcome == "aborted"
 
 
 def test_blackout_without_a_capture(manager, world):
@@ -120,10 +123,15 @@ def test_blackout_without_a_capture(manager, world):
     assert "unknown, unsafe" in answer["detail"]
 
 
+def seen(manager: CaptureManager) -> dict[str, Any]:
+    """What the devices said, once they have answered or their deadlines are over."""
+    return waited(lambda: d if (d := manager.devices())["age_s"] is not None else None)
+
+
 def test_devices_are_asked_one_by_one(manager, world):
     world.estop = True
     world.late = ["ID?"]
-    devices = manager.devices()
+    devices = seen(manager)
     assert devices["lights"]["estop_pressed"] is True
     assert devices["lights"]["count"] == 200
     assert devices["trigger"]["state"] == "unreachable"
@@ -143,9 +151,13 @@ def test_an_interrupted_capture_is_listed_after_a_restart(manager, rig_file, wor
     (damaged / "rig.json").write_text("{")
     manager.close()
     again = CaptureManager(rig_file, manager.folder.parent)
-    (status,) = again.list()
+    status, broken = again.list()
     assert (status.state, status.outcome) == ("done", "interrupted")
     assert status.frames_written == 18
+    assert (broken.id, broken.outcome) == ("damaged", "damaged")
+    assert "rig.json" in broken.error
+    with pytest.raises(WrongState, match="possible now: nothing"):
+        again.resume("damaged")
     again.close()
 
 
@@ -172,6 +184,63 @@ def test_without_devices_nothing_can_be_shot(rig_file, tmp_path):
     with pytest.raises(RigError, match=r"\[devices\] is missing"):
         manager.start(SHORT)
     manager.close()
+
+
+WHOLE = {"kind": "dark", "exposure": 0.01}
+DAMAGES = {
+    "a plan that is a list": {"plan.json": "[]"},
+    "a plan without steps": {"plan.json": '{"steps": null}'},
+    "a step that is a number": {"plan.json": '{"steps": [1]}'},
+    "a step whose number is text": {"plan.json": json.dumps({"steps": [{**WHOLE, "index": "a"}]})},
+    "a plan too deep": {"plan.json": "[" * 100_000},
+    "a plan that is a folder": {"plan.json": None},
+    "a request that is a list": {"plan.json": '{"steps": [], "request": [1]}'},
+    "a request with half a character": {
+        "plan.json": r'{"steps": [], "request": {"environment": "\ud800"}}'
+    },
+    "no plan": {"rig.json": "{}", "plan.json": ""},
+    "a rig that is a list": {"rig.json": "[]"},
+    "a rig whose cameras are a number": {"rig.json": '{"cameras": 5}'},
+    "a rig whose camera is a number": {"rig.json": '{"cameras": [5]}'},
+    "a manifest that is a list": {"manifest.json": "[]"},
+    "an empty manifest": {"manifest.json": ""},
+    "a manifest without an outcome": {"manifest.json": "{}"},
+    "an outcome that is none": {"manifest.json": '{"outcome": "weird"}'},
+    "a journal that is no text": {"journal.jsonl": b"\xff\xfe\x00\n{}\n"},
+    "a journal line cut": {"journal.jsonl": '{"step": 0, "cam\n{}\n'},
+    "a journal of lists": {"journal.jsonl": "[]\n{}\n"},
+}
+
+
+def test_a_damaged_capture_is_listed_with_its_reason_and_harms_no_other(manager, rig_file):
+    whole = manager.start(SHORT)
+    manager.wait(whole, 20)
+    folder = manager.folder
+    for name, files in DAMAGES.items():
+        shutil.copytree(folder / whole, folder / name)
+        for file, content in files.items():
+            path = folder / name / file
+            path.unlink()
+            if content is None:
+                path.mkdir()
+            else:
+                path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    no_text = folder / os.fsdecode(b"caf\xe9")
+    no_text.mkdir()
+    (no_text / "plan.json").write_text("{}")
+    manager.close()
+    again = CaptureManager(rig_file, folder.parent)
+    listed = {status.id: status for status in again.list()}
+    again.close()
+    assert set(listed) == {whole, *DAMAGES}
+    for name, status in listed.items():
+        status.model_dump_json().encode()
+        if name == whole:
+            assert (status.outcome, status.frames_written) == ("completed", 18)
+            continue
+        assert (name, status.outcome) == (name, "damaged")
+        broken = next(iter(DAMAGES[name]))
+        assert broken in status.error or "outcome" in status.error or "request" in status.error
 
 
 PROCESS = """

@@ -1,0 +1,68 @@
+"""Files and texts that somebody else wrote: nothing hangs, and what JSON cannot mean is refused."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from reconstruction import read_obj
+from reconstruction.reading import DEEPEST, parse_json, printable, read_json
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('{"a": NaN}', "NaN"),
+        ("[-Infinity]", "Infinity"),
+        ("[1e999]", "beyond float64"),
+        (r'{"a": "\ud800"}', "not Unicode"),
+        (r'{"\udfff": 1}', "not Unicode"),
+        (r'[["a\u0000b"]]', "NUL"),
+        ('{"a": 1, "b": 2, "a": 3}', "'a'"),
+        ("[" * (DEEPEST + 1) + "]" * (DEEPEST + 1), "levels"),
+        ("[" * 200_000, "levels"),
+        ("[" + "9" * 5000 + "]", "digits"),
+        ('{"a": 1', "delimiter"),
+        ("", "Expecting value"),
+    ],
+)
+def test_json_that_means_nothing_or_too_much_is_refused(text, why, tmp_path):
+    with pytest.raises(ValueError, match=why):
+        parse_json(text)
+    (tmp_path / "some.json").write_text(text)
+    with pytest.raises(ValueError, match=r"some\.json: .*"):
+        read_json(tmp_path / "some.json")
+
+
+def test_sound_json_is_read_as_it_was_meant():
+    assert parse_json(rb'{"a": [1, 2.5, "\ud83d\ude00", null, true]}') == {
+        "a": [1, 2.5, "😀", None, True]
+    }
+    deep = parse_json("[" * DEEPEST + "]" * DEEPEST)
+    for _ in range(DEEPEST - 1):
+        (deep,) = deep
+    assert deep == []
+    with pytest.raises(ValueError, match="utf-8"):
+        parse_json(b'"\xff"')
+
+
+def test_only_plain_files_are_read(tmp_path):
+    """Nobody ever writes to this FIFO: whoever opens it to read waits for ever."""
+    os.mkfifo(tmp_path / "fifo.obj")
+    for path in (tmp_path / "fifo.obj", tmp_path, "/dev/zero"):
+        with pytest.raises((ValueError, OSError), match="no plain file"):
+            read_obj(path)
+    with pytest.raises(ValueError, match="no plain file"):
+        read_json(tmp_path / "fifo.obj")
+
+
+@pytest.mark.parametrize("face", ["1 2 99999999999999999999", "-99 1 2", "0 1 2", "1 2 x"])
+def test_an_obj_whose_faces_point_nowhere_is_refused(face, tmp_path):
+    (tmp_path / "head.obj").write_text(f"v 0 0 0\nv 0 1 0\nv 1 0 0\nf {face}\n")
+    with pytest.raises(ValueError, match=r"head\.obj"):
+        read_obj(tmp_path / "head.obj")
+
+
+def test_a_name_that_is_not_utf_8_can_be_told():
+    assert printable("caf\udce9 ü") == r"caf\udce9 ü"
