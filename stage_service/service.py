@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -11,14 +10,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
-from pydantic import ValidationError
 
-from reconstruction import Capture, Model, Rig, read_obj
+from reconstruction import Capture, CaptureError, Model, Rig, read_obj
 from reconstruction.containment import inside, is_file_name, plain_file
 from stage_service.acquisition.captures import CaptureManager, UnknownCapture
 from stage_service.acquisition.control import Caller, Control
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.config import RigFile
+from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest
@@ -43,7 +42,6 @@ from stage_service.service_models import (
 )
 
 T = TypeVar("T")
-log = logging.getLogger("hairstage.service")
 
 
 class BadInput(ValueError):
@@ -59,25 +57,31 @@ class UnknownFrame(LookupError):
 
 
 class NotFinished(RuntimeError):
-    """What was asked for needs a capture or job that is done."""
+    """What was asked for needs a capture that completed."""
+
+
+class ModelInUse(RuntimeError):
+    """Another job, queued or running, makes the same model."""
 
 
 class Service:
     """The captures, jobs and devices of one root folder, for routes and whoever else shows them.
 
-    `start()` puts the lights off and watches jobs for the event log; `close()` puts them off again
-    and may be called more than once, from any thread. What steers the stage is done in a caller's
+    `start()` puts the lights off, looks what is on the disk and then follows the jobs, whose
+    database nothing else waits for; `close()` puts the lights off again and may be called more than
+    once, from any thread. What steers the stage is done in a caller's
     name, recorded, and refused (`Leased`) while somebody else holds the lease.
     """
 
     def __init__(self, rig_file: RigFile, root: Path) -> None:
         self.rig_file, self.root = rig_file, root
-        self._captures = CaptureManager(rig_file, root, on_complete=self._enqueue_pipeline)
+        self._captures = CaptureManager(rig_file, root, on_complete=self._completed)
         self._control = Control(self._captures.audit)
         self._queue = JobQueue(root)
+        self._follower = JobFollower(root, self._queue, self._captures.events)
+        self._submitting = threading.Lock()
         self._closing = threading.Lock()
         self._closed = threading.Event()
-        self._watcher = threading.Thread(target=self._watch_jobs, name="job-events", daemon=True)
 
     @property
     def events(self) -> EventLog:
@@ -85,12 +89,13 @@ class Service:
         return self._captures.events
 
     def start(self) -> None:
-        """Lights off; enqueue what a crash kept from being enqueued, and follow the jobs."""
+        """Lights off; then what is on the disk; then, beside all else, the jobs: what a crash kept
+        from being enqueued, and what becomes of them."""
         self._captures.darken()
         for status in self._captures.list():
             if status.outcome == "completed":
-                self._enqueue_pipeline(status)
-        self._watcher.start()
+                self._follower.owe(status, fresh=False)
+        self._follower.start()
 
     def close(self) -> None:
         """Abort what runs, lights off; afterwards let go of the job database."""
@@ -101,8 +106,7 @@ class Service:
                 self._captures.close()
             finally:
                 self._closed.set()
-        if self._watcher.is_alive():
-            self._watcher.join(timeout=5)
+        self._follower.close()
         self._queue.close()
 
     def validate(self, plan: CapturePlan) -> PlanCost:
@@ -166,29 +170,33 @@ class Service:
         return self._view(self._control.do(by, "capture.abort", work, capture_id, steers=False))
 
     def _view(self, status: CaptureStatus) -> CaptureView:
-        """The status together with the job that follows it."""
-        job = None
-        if status.outcome == "completed" and status.request.get("pipeline") is not None:
-            try:
-                job = self._queue.get(job_of(status.id))
-            except NoSuchJob:  # the capture's own thread is just about to enqueue it
-                job = self._enqueue_pipeline(status)
-        return CaptureView(**status.model_dump(), job=None if job is None else job.id)
+        """The status together with the job that follows it; asks no database."""
+        return CaptureView(**status.model_dump(), job=self._follower.job_after(status.id))
+
+    def _completed(self, status: CaptureStatus) -> None:
+        self._follower.owe(status)
 
     def frame(self, capture_id: str, step: int, camera: str, read: Callable[[Path], T]) -> T:
         """What `read` makes of a frame's EXR file, wherever compression has just put it.
 
-        Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`.
+        Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`; `CaptureError` where the file is
+        gone or cannot be read.
         """
         capture = Capture(self.capture_path(capture_id))
         by_index = {s.index: s for s in capture.steps}
         cameras = [c.name for c in capture.rig.cameras]
         if step not in by_index or camera not in cameras:
             raise UnknownFrame(
-                f"{capture_id} has the steps {min(by_index)} to {max(by_index)} and the cameras "
+                f"{capture_id} has the steps {min(by_index, default=None)} to "
+                f"{max(by_index, default=None)} and the cameras "
                 f"{cameras}; got step {step}, camera {camera!r}"
             )
-        return capture.read_file(by_index[step], camera, read)
+        try:
+            return capture.read_file(by_index[step], camera, read)
+        except CaptureError:
+            raise
+        except (OSError, ValueError) as error:
+            raise CaptureError(str(error)) from error
 
     def capture_path(self, capture_id: str) -> Path:
         """The capture's folder; one that was put there by hand or by `import` counts too."""
@@ -203,11 +211,17 @@ class Service:
             return path.resolve()
 
     def submit(self, request: JobRequest) -> Job:
-        """Enqueue a pipeline on a capture. Raises `UnknownCapture`, `NotFinished`, `BadInput`."""
+        """Enqueue a pipeline on a capture. Raises `UnknownCapture`, `NotFinished`, `BadInput`,
+        `ModelInUse`, `JobsUnavailable`."""
         path = self.capture_path(request.capture)
-        if not (path / "manifest.json").is_file():
+        capture = Capture(path)
+        if capture.manifest is None:
             raise NotFinished(f"capture {request.capture} has no manifest yet: it is not finished")
-        _check_names(request.pipeline, Capture(path).rig)
+        if (outcome := capture.manifest.get("outcome")) != "completed":
+            raise NotFinished(
+                f"capture {request.capture} is {outcome}, not completed: resume it, or shoot anew"
+            )
+        _check_names(request.pipeline, capture.rig)
         job = new_job_id()
         model = Model(self.root / "models" / (request.model or job))
         rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
@@ -216,15 +230,27 @@ class Service:
                 f"model: {request.pipeline.name!r} needs a model with strands: name one that "
                 "'reconstruct' made"
             )
-        return self._queue.submit(request.pipeline, path, model, job=job)
+        with self._submitting:
+            other = self._queue.at_work_on(model)
+            if other is not None:
+                raise ModelInUse(
+                    f"model {model.path.name}: job {other} makes it; wait, or cancel it"
+                )
+            return self._queue.submit(request.pipeline, path, model, job=job)
 
-    def jobs(self, limit: int) -> list[Job]:
-        """The latest `limit` jobs, newest first."""
-        return self._queue.all(limit=limit)
+    def jobs(self, limit: int, offset: int = 0) -> list[Job]:
+        """The latest `limit` jobs after the `offset` newest, newest first."""
+        return self._queue.all(limit=limit, offset=offset)
 
     def job(self, job_id: str) -> Job:
-        """A job's present state. Raises `NoSuchJob`."""
-        return self._queue.get(job_id)
+        """A job's present state. Raises `NoSuchJob`, as all about jobs `JobsUnavailable`."""
+        try:
+            return self._queue.get(job_id)
+        except NoSuchJob:  # that of a capture which has just completed may not be there yet
+            job = self._follower.enqueue_now(job_id)
+            if job is None:
+                raise
+            return job
 
     def cancel_job(self, job_id: str) -> Job:
         """Cancel a job: a queued one at once, a running one at its next progress call."""
@@ -232,12 +258,12 @@ class Service:
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
-        files = Model(self._queue.get(job_id).model).artifacts()
+        files = Model(self.job(job_id).model).artifacts()
         return [Artifact(path=name, bytes=p.stat().st_size) for name, p in files.items()]
 
     def artifact(self, job_id: str, path: str) -> Path:
         """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
-        file = Model(self._queue.get(job_id).model).artifacts().get(path)
+        file = Model(self.job(job_id).model).artifacts().get(path)
         if file is None:
             raise UnknownArtifact(f"job {job_id} has no file {path!r}")
         return file
@@ -286,15 +312,20 @@ class Service:
         return self._control.audit.latest(limit)
 
     def health(self) -> Health:
-        """Whether service and worker run."""
-        running = [c.id for c in self._captures.list() if c.state != "done"]
+        """How service, lamps and jobs are; asks no device and no database."""
+        lamps = self._captures.safety()
+        problems = [p for p in (self._queue.set_aside, self._queue.problem) if p is not None]
+        if lamps["latched"] is not None:
+            problems.insert(0, lamps["detail"])
         return Health(
-            status="ok",
+            status="unsafe" if lamps["latched"] else "degraded" if problems else "ok",
             version=version("hairstage"),
             rig=self.rig_file.rig.name,
             root=str(self.root),
             worker=worker_is_alive(self.root),
-            capture=running[0] if running else None,
+            capture=self._captures.running,
+            lamps=lamps["state"],
+            problems=problems,
         )
 
     def _masks(self, folder: Path) -> dict[str, Any]:
@@ -314,40 +345,9 @@ class Service:
             raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
         return masks
 
-    def _enqueue_pipeline(self, status: CaptureStatus) -> Job | None:
-        asked = status.request.get("pipeline")
-        if asked is None:
-            return None
-        try:
-            pipeline = PipelineRequest.model_validate(asked)
-        except ValidationError as error:  # a capture of another version must not stop this one
-            log.warning("%s: its pipeline cannot be run: %s", status.path, error)
-            return None
-        # One id per capture: enqueuing again after a crash is not a second job.
-        model = Model(self.root / "models" / status.id)
-        return self._queue.submit(pipeline, Path(status.path), model, job=job_of(status.id))
-
-    def _watch_jobs(self) -> None:
-        seen: dict[str, Job] = {}
-        while not self._closed.wait(0.5):
-            for job in self._queue.all(limit=50):
-                before = seen.get(job.id)
-                seen[job.id] = job
-                if before is None or (before.state, before.outcome) != (job.state, job.outcome):
-                    data = {"job": job.id, "state": job.state, "outcome": job.outcome}
-                    self.events.publish("job.state", data)
-                if job.progress is not None and (before is None or before.progress != job.progress):
-                    data = {"job": job.id, **job.progress.model_dump(mode="json")}
-                    self.events.publish("job.progress", data)
-
 
 def _grant(lease: Lease) -> LeaseGrant:
     return LeaseGrant(token=lease.token, holder=lease.holder, expires=lease.expires)
-
-
-def job_of(capture_id: str) -> str:
-    """The id of the job that a capture's completion enqueues."""
-    return f"job-{capture_id}"
 
 
 def _check_names(pipeline: PipelineRequest, rig: Rig) -> None:

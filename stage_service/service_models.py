@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
@@ -119,11 +119,18 @@ class Artifact(BaseModel):
 
 
 class Health(BaseModel):
-    """Whether the service and its worker run; says nothing of the devices."""
+    """How the service is, as far as it knows without asking a device or the job database.
 
-    status: str
+    `status`: "unsafe" while nobody knows whether the lamps are off, "degraded" where something else
+    is wrong; `problems` has a sentence for each. `worker`: whether one runs; `lamps`: "dark", "in
+    use" or "unknown, unsafe".
+    """
+
+    status: Literal["ok", "degraded", "unsafe"]
     version: str
     rig: str
     root: str
     worker: bool
     capture: str | None
+    lamps: str
+    problems: list[str]

@@ -276,11 +276,14 @@ class CaptureManager:
         is how old the answer is. "safety" has the state after the last blackout, and whether it is
         latched."""
         seen = {"age_s": None} if self.rig_file.devices is None else self._seen.get()
+        return {**seen, "safety": self.safety()}
+
+    def safety(self) -> dict[str, Any]:
+        """What is known of the lamps now: {"state", "detail", "latched"}."""
         run = self._running
         if run is None:
-            return {**seen, "safety": self.darkness()}
-        lit = {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
-        return {**seen, "safety": lit}
+            return self.darkness()
+        return {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
 
     def _look(self) -> dict[str, Any] | None:
         """Ask the devices; without a capture, connect for the answer, until one begins."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from collections.abc import Iterator
@@ -12,21 +13,22 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
 from reconstruction import CaptureError, MissingFrame
 from reconstruction.capture.writer import JournalInUse
 from reconstruction.containment import NotContained
+from reconstruction.reading import printable
 from stage_service.acquisition.captures import Busy, UnknownCapture
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
-from stage_service.jobs.queue import NoSuchJob
+from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
-from stage_service.service import BadInput, NotFinished, UnknownArtifact, UnknownFrame
+from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
 
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"
@@ -71,8 +73,10 @@ wrong-state 409 The capture's state does not allow this
     `detail` lists what is possible now; `state` is where the capture is. Steps that the
     trigger box clocks cannot pause.
 not-finished 409 The capture is not finished
-    Wait until its state is `done`; an interrupted capture has no manifest and cannot be
-    processed.
+    Wait until its state is `done`; only a capture that completed can be processed, so resume
+    one that did not.
+model-in-use 409 Another job makes this model
+    Wait until it is done, cancel it, or name another model.
 unknown-capture 404 No such capture
     `GET /captures` lists the captures.
 unknown-frame 404 No such step or camera
@@ -84,7 +88,10 @@ unknown-job 404 No such job
 unknown-artifact 404 No such file in the model folder
     `GET /jobs/{id}/artifacts` lists the files. Paths that lead out of the folder are not
     followed.
-damaged-capture 500 The capture folder cannot be read
+jobs-unavailable 503 The job database does not answer
+    Captures, blackout and abort do not need it. `GET /health` says what is wrong; what
+    completed captures were asked to be followed by is enqueued once it answers.
+damaged-capture 409 The capture folder cannot be read
     `detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.
 http 400 The request cannot be served
     The status says why: no such route, method not allowed, or a host name that is not this
@@ -117,6 +124,8 @@ BY_ERROR: dict[type[Exception], str] = {
     NoLease: "no-lease",
     WrongState: "wrong-state",
     NotFinished: "not-finished",
+    ModelInUse: "model-in-use",
+    JobsUnavailable: "jobs-unavailable",
     UnknownCapture: "unknown-capture",
     UnknownFrame: "unknown-frame",
     MissingFrame: "missing-frame",
@@ -158,18 +167,20 @@ class Problem(BaseModel):
 
 def problem_response(
     path: str, slug: str, detail: str, *, status: int | None = None, **extra: Any
-) -> JSONResponse:
+) -> Response:
     """The problem document of the kind `slug` as a response."""
     kind = KINDS[slug]
     content = {
         "type": f"{PAGE}#{kind.slug}",
         "title": kind.title,
         "status": status or kind.status,
-        "detail": detail,
+        "detail": printable(detail),
         "instance": path,
         **extra,
     }
-    return JSONResponse(content, content["status"], media_type="application/problem+json")
+    # In ASCII, so that no text that an error quotes can keep it from being told.
+    text = json.dumps(content)
+    return Response(text, content["status"], media_type="application/problem+json")
 
 
 def errors_page() -> str:
@@ -191,12 +202,12 @@ def errors_page() -> str:
 def install_problems(app: FastAPI) -> None:
     """Make every error of `app` a problem document."""
 
-    async def known(request: Request, error: Exception) -> JSONResponse:
+    async def known(request: Request, error: Exception) -> Response:
         slug = next(s for e, s in BY_ERROR.items() if isinstance(error, e))
         extra = {k: getattr(error, k) for k in EXTRA if hasattr(error, k)}
         return problem_response(request.url.path, slug, str(error), **extra)
 
-    async def invalid(request: Request, error: Exception) -> JSONResponse:
+    async def invalid(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         errors = [
             {"loc": ".".join(str(p) for p in e["loc"] if p != "body"), "msg": e["msg"]}
@@ -205,7 +216,7 @@ def install_problems(app: FastAPI) -> None:
         detail = "; ".join(f"{e['loc']}: {e['msg']}" for e in errors)
         return problem_response(request.url.path, "invalid-request", detail, errors=errors)
 
-    async def http(request: Request, error: Exception) -> JSONResponse:
+    async def http(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         response = problem_response(
             request.url.path, "http", str(error.detail), status=error.status_code
@@ -213,12 +224,7 @@ def install_problems(app: FastAPI) -> None:
         response.headers.update(error.headers or {})
         return response
 
-    async def fault(request: Request, error: Exception) -> JSONResponse:
-        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return problem_response(request.url.path, "internal", f"{type(error).__name__}: {error}")
-
     for kind in BY_ERROR:
         app.add_exception_handler(kind, known)
     app.add_exception_handler(RequestValidationError, invalid)
     app.add_exception_handler(HTTPException, http)
-    app.add_exception_handler(Exception, fault)

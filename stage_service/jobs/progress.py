@@ -67,8 +67,9 @@ class StepProgress:
 
 
 def read_progress(model: Model, job: str) -> JobProgress | None:
-    """What `job` last said of this model, or None where it said nothing."""
-    if not model.has("progress.json"):
+    """What `job` last said of this model, or None where it said nothing that can be read."""
+    try:
+        data = model.json("progress.json")
+        return JobProgress(**data) if data.pop("job") == job else None
+    except (OSError, ValueError, TypeError, LookupError, AttributeError):
         return None
-    data = model.json("progress.json")
-    return JobProgress(**data) if data.pop("job") == job else None

@@ -21,7 +21,14 @@ from dbos import error as dbos_error
 from reconstruction import Model, parse_options
 from stage_service.jobs.pipelines import PIPELINES, STEPS_VERSION
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, WorkerStopping
-from stage_service.jobs.queue import APP, QUEUE, WORKFLOW, JobQueue, database_url
+from stage_service.jobs.queue import (
+    APP,
+    QUEUE,
+    WORKFLOW,
+    JobQueue,
+    JobsUnavailable,
+    database_url,
+)
 from stage_service.jobs.records import JobOptions
 from stage_service.jobs.slots import WorkerSlot
 from stage_service.jobs.steps import STEPS, StepContext
@@ -38,6 +45,7 @@ class Worker:
 
     def __init__(self, root: Path, concurrency: int) -> None:
         self.queue = JobQueue(root)
+        self.queue.connect()
         self._stopping = threading.Event()
         # A cancelled job leaves DBOS's count at once, but its thread only at its next progress
         # call: this keeps the next job from running beside it.
@@ -86,7 +94,10 @@ class Worker:
     def _interrupted(self, job: str) -> JobInterrupted | None:
         if self._stopping.is_set():
             return WorkerStopping("the worker was asked to stop")
-        return JobCancelled(job) if self.queue.cancelled(job) else None
+        try:
+            return JobCancelled(job) if self.queue.cancelled(job) else None
+        except JobsUnavailable:  # the database is away for a while: the step's work is not lost
+            return None
 
 
 def run_worker(

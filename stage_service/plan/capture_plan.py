@@ -57,7 +57,7 @@ class CapturePlan(Strict):
     sentinels: bool = True
     brackets: Annotated[tuple[Bracket, ...], Field(min_length=1, max_length=8)] = (1.0,)
     stepping: Literal["auto", "software", "hardware"] = "auto"
-    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
+    rate_hz: Annotated[float, Field(ge=0.01, le=1000.0)] | None = None
     consent: Annotated[str, Field(min_length=12, max_length=2000)] | None = None
     tracking_every: Annotated[int, Field(ge=0)] | None = None
     retries: Annotated[int, Field(ge=0, le=20)] | None = None

@@ -170,6 +170,7 @@ def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, 
     server.stop()
     server = Server(rig_file, tmp_path)
     try:
+        until(lambda: server.http.get("/jobs").json())
         assert [j["pipeline"] for j in server.http.get("/jobs").json()] == ["reconstruct"]
         assert server.http.get(f"/captures/{begun['id']}").json()["job"] is not None
     finally:

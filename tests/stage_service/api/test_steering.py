@@ -197,7 +197,9 @@ def test_the_service_starts_dark_and_starts_without_its_devices(rig_file, world,
     nowhere = rig_file.devices.lights.model_copy(update={"port": 1})
     away = replace(rig_file, devices=rig_file.devices.model_copy(update={"lights": nowhere}))
     with serving(away, tmp_path / "b") as http:
-        assert http.get("/health").json()["status"] == "ok"
+        health = http.get("/health").json()
+        assert (health["status"], health["lamps"]) == ("unsafe", "unknown, unsafe")
+        assert "light bank" in health["problems"][0]
         refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
     with serving(rig_file, tmp_path / "b") as http:  # they are there again: dark at the start
         assert http.get("/devices").json()["safety"] == {

@@ -1,0 +1,137 @@
+"""The thread that talks to the job database by itself, so that nothing else has to wait for it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from reconstruction import Model
+from stage_service.acquisition.states import CaptureStatus
+from stage_service.jobs.queue import JobQueue, JobsUnavailable
+from stage_service.jobs.records import Job, PipelineRequest
+from stage_service.records.events import EventLog
+
+log = logging.getLogger("hairstage.jobs")
+POLL_S = 0.5
+
+
+@dataclass(frozen=True)
+class _Wish:
+    """The pipeline that a capture was asked to be followed by; `fresh`: it has just completed."""
+
+    pipeline: PipelineRequest
+    capture: Path
+    fresh: bool
+
+
+class JobFollower:
+    """Enqueues what completed captures were asked to be followed by, and tells what becomes of
+    jobs. While the database is away it tries again."""
+
+    def __init__(self, root: Path, queue: JobQueue, events: EventLog) -> None:
+        self._root, self._queue, self._events = root, queue, events
+        self._lock = threading.Lock()
+        self._owed: dict[str, _Wish] = {}  # by capture; whether its job is there is not known yet
+        self._certain: set[str] = set()  # captures whose job is there
+        self._wake = threading.Event()
+        self._closed = False
+        self._told: str | None = None
+        self._seen: dict[str, Job] = {}
+        self._thread = threading.Thread(target=self._run, name="job-events", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; a database that hangs is not waited for."""
+        self._closed = True
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5)
+
+    def owe(self, status: CaptureStatus, *, fresh: bool = True) -> None:
+        """Take note of a capture that completed. One that is not `fresh` may have its job."""
+        asked = status.request.get("pipeline")
+        if asked is None:
+            return
+        try:
+            pipeline = PipelineRequest.model_validate(asked)
+        except ValidationError as error:  # a capture of another version must not stop this one
+            log.warning("%s: its pipeline cannot be run: %s", status.path, error)
+            return
+        self._owed[status.id] = _Wish(pipeline, Path(status.path), fresh)
+        self._wake.set()
+
+    def job_after(self, capture: str) -> str | None:
+        """The id of the job that follows the capture, there already or about to be."""
+        there = capture in self._certain or capture in self._owed
+        return job_of(capture) if there else None
+
+    def enqueue_now(self, job: str) -> Job | None:
+        """The job that is still owed under this id. Raises `JobsUnavailable`."""
+        capture = job.removeprefix(job_of(""))
+        with self._lock:
+            wish = self._owed.get(capture)
+            return None if wish is None else self._enqueue(capture, wish)
+
+    def _run(self) -> None:
+        while not self._closed:
+            self._wake.wait(POLL_S)
+            self._wake.clear()
+            if self._closed:
+                return
+            try:
+                self._enqueue_what_is_owed()
+                self._tell()
+                self._told = None
+            except Exception as error:  # the thread goes on, whatever is wrong with the database
+                if self._closed or str(error) == self._told:
+                    continue
+                self._told = str(error)
+                known = isinstance(error, JobsUnavailable)
+                log.error("%s", error, exc_info=None if known else error)
+
+    def _enqueue_what_is_owed(self) -> None:
+        if not self._owed:
+            return
+        there = self._queue.ids()
+        with self._lock:
+            for capture, wish in list(self._owed.items()):
+                begun = (self._root / "models" / capture).exists()
+                if job_of(capture) in there:
+                    self._certain.add(capture)
+                    del self._owed[capture]
+                elif begun and not wish.fresh:
+                    log.warning("%s: its job is lost; the model stays as it is", wish.capture)
+                    del self._owed[capture]
+                else:
+                    self._enqueue(capture, wish)
+
+    def _enqueue(self, capture: str, wish: _Wish) -> Job:
+        # One id per capture: enqueuing again after a crash is not a second job.
+        model = Model(self._root / "models" / capture)
+        job = self._queue.submit(wish.pipeline, wish.capture, model, job=job_of(capture))
+        self._certain.add(capture)
+        self._owed.pop(capture, None)
+        return job
+
+    def _tell(self) -> None:
+        for job in self._queue.all(limit=50):
+            before = self._seen.get(job.id)
+            self._seen[job.id] = job
+            if before is None or (before.state, before.outcome) != (job.state, job.outcome):
+                data = {"job": job.id, "state": job.state, "outcome": job.outcome}
+                self._events.publish("job.state", data)
+            if job.progress is not None and (before is None or before.progress != job.progress):
+                data = {"job": job.id, **job.progress.model_dump(mode="json")}
+                self._events.publish("job.progress", data)
+
+
+def job_of(capture_id: str) -> str:
+    """The id of the job that a capture's completion enqueues."""
+    return f"job-{capture_id}"

@@ -1,0 +1,156 @@
+"""The job database that is broken, gone, or hangs: the jobs suffer, nothing else does."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import sqlite3
+from pathlib import Path
+
+import pytest
+from waiting import until
+
+from reconstruction import Model
+from stage_service.acquisition.states import CaptureStatus
+from stage_service.jobs import queue as queues
+from stage_service.jobs.follower import JobFollower, job_of
+from stage_service.jobs.progress import read_progress
+from stage_service.jobs.queue import JobQueue, JobsUnavailable
+from stage_service.jobs.records import Job, PipelineRequest
+from stage_service.records.events import EventLog
+
+
+def submit(queue: JobQueue, root: Path, job: str, model: str = "m") -> Job:
+    request = PipelineRequest(name="reconstruct")
+    return queue.submit(request, root / "capture", Model(root / "models" / model), job=job)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database with three jobs."""
+    root = tmp_path_factory.mktemp("sound")
+    queue = JobQueue(root)
+    for number in range(3):
+        submit(queue, root, f"job-{number}", f"m{number}")
+    queue.close()
+    with sqlite3.connect(root / "jobs.sqlite") as database:
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    database.close()
+    return root / "jobs.sqlite"
+
+
+@pytest.mark.parametrize("damage", ["random", "half", "a page of zeros", "another program's"])
+def test_a_broken_database_is_set_aside_and_said(damage, sound, tmp_path):
+    file = tmp_path / "jobs.sqlite"
+    whole = sound.read_bytes()
+    if damage == "another program's":
+        with sqlite3.connect(file) as database:
+            database.execute("CREATE TABLE recipes (name TEXT)")
+        database.close()
+    else:
+        file.write_bytes(
+            {
+                "random": os.urandom(8192),
+                "half": whole[: len(whole) // 2],
+                "a page of zeros": whole[:4096] + bytes(4096) + whole[8192:],
+            }[damage]
+        )
+    broken = file.read_bytes()
+    queue = JobQueue(tmp_path)
+    assert queue.all() == []
+    assert submit(queue, tmp_path, "job-new").state == "queued"
+    (aside,) = tmp_path.glob("jobs.sqlite.broken-*")
+    assert aside.read_bytes() == broken
+    assert aside.name in queue.set_aside
+    queue.close()
+    again = JobQueue(tmp_path)
+    assert [j.id for j in again.all()] == ["job-new"]
+    assert again.set_aside is None
+    again.close()
+
+
+@pytest.mark.parametrize("sizes", ["whole", "empty"])
+def test_a_sound_or_empty_database_stays_where_it_is(sizes, sound, tmp_path):
+    shutil.copy(sound, tmp_path / "jobs.sqlite")
+    if sizes == "empty":
+        (tmp_path / "jobs.sqlite").write_bytes(b"")
+    queue = JobQueue(tmp_path)
+    assert len(queue.all()) == (3 if sizes == "whole" else 0)
+    assert queue.set_aside is None
+    queue.close()
+
+
+def test_jobs_are_listed_page_by_page(sound, tmp_path):
+    shutil.copy(sound, tmp_path / "jobs.sqlite")
+    queue = JobQueue(tmp_path)
+    pages = [[j.id for j in queue.all(limit=2, offset=o)] for o in (0, 2, 4)]
+    assert sorted(job for page in pages for job in page) == ["job-0", "job-1", "job-2"]
+    assert [len(p) for p in pages] == [2, 1, 0]
+    assert queue.ids() == {"job-0", "job-1", "job-2"}
+    model = Model(tmp_path / "models" / "mine")
+    assert queue.at_work_on(model) is None
+    submit(queue, tmp_path, "job-mine", "mine")
+    assert queue.at_work_on(model) == "job-mine"
+    queue.cancel("job-mine")
+    assert queue.at_work_on(model) is None
+    queue.close()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 10**5, '{"job": "job-1", "share": NaN}'])
+def test_progress_that_cannot_be_read_is_no_progress(text, tmp_path):
+    (tmp_path / "progress.json").write_text(text)
+    assert read_progress(Model(tmp_path), "job-1") is None
+
+
+def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatch, tmp_path):
+    monkeypatch.setattr(queues, "CONNECT_S", 2)  # the least that libpq takes
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        ports = {"down": 1, "deaf": deaf.getsockname()[1]}
+        for port in ports.values():
+            url = f"postgresql://nobody@127.0.0.1:{port}/nothing"
+            monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", url)
+            queue = JobQueue(tmp_path)
+            with pytest.raises(JobsUnavailable, match="the job database cannot be used"):
+                queue.all()
+            assert queue.problem is not None
+            queue.close()
+
+
+def completed(root: Path, name: str) -> CaptureStatus:
+    zeros = dict.fromkeys(("steps", "step", "frames_planned", "frames_written"), 0)
+    return CaptureStatus(
+        id=name,
+        state="done",
+        outcome="completed",
+        error=None,
+        path=str(root / "captures" / name),
+        **zeros,
+        frames_missing=0,
+        seconds_predicted=None,
+        seconds=None,
+        left_out=[],
+        started=None,
+        request={"pipeline": {"name": "reconstruct"}},
+    )
+
+
+def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_path):
+    monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", "postgresql://nobody@127.0.0.1:1/nothing")
+    queue = JobQueue(tmp_path)
+    follower = JobFollower(tmp_path, queue, EventLog())
+    follower.owe(completed(tmp_path, "fresh"))
+    follower.owe(completed(tmp_path, "lost"), fresh=False)
+    follower.owe(completed(tmp_path, "made"), fresh=False)
+    Model(tmp_path / "models" / "made").create()
+    follower.start()
+    try:
+        until(lambda: queue.problem is not None)
+        assert follower.job_after("fresh") == job_of("fresh")
+        monkeypatch.delenv("HAIRSTAGE_DATABASE_URL")
+        until(lambda: queue.problem is None and follower.job_after("made") is None)
+        # A model that is there is not made again because its job was lost with the database.
+        assert queue.ids() == {job_of("fresh"), job_of("lost")}
+    finally:
+        follower.close()
+        queue.close()
