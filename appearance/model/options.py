@@ -14,5 +14,5 @@ class AssessOptions:
     spp: Count = 49
     baseline_pixels: Count = 100
     baseline_lights: Count = 48
-    relit_size: Count = 320
-    relit_spp: Count = 36
+    relit_size: Count = 640
+    relit_spp: Count = 32

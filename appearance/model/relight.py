@@ -29,8 +29,8 @@ def relight(
     model: Model,
     environment: str = "studio",
     *,
-    size: int = 320,
-    spp: int = 36,
+    size: int = 640,
+    spp: int = 32,
     seed: int = 0,
 ) -> Floats:
     """Render `fitted` in three-quarter view under an `environment_map`: `(N, N, 3)`, N = `size`.

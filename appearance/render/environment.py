@@ -16,13 +16,15 @@ import numpy as np
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
-from appearance.render.paths import Surface, camera_rays
+from appearance.render.paths import Surface, Wave, camera_rays, each_sample, seed_state
 from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import AnyFloats, Floats
+from reconstruction.arrays import AnyFloats, Floats, Ints
+
+_GOLDEN = 0.6180339887498949
 
 
 def render_environment(
@@ -60,11 +62,66 @@ def render_environment(
     return image.reshape(camera.height, camera.width, 3)
 
 
+def direct_environment(
+    scene: HairScene, camera: Camera, envmap: AnyFloats, spp: int, seed: int = 0
+) -> Floats:
+    """`render_environment` to the first hit alone `(H, W, 3)`, its directions well spread.
+
+    A pixel's samples ask directions that follow each other by the golden ratio on a curve through
+    the map (`_along_curve`), from a random one: on smooth surfaces under half the noise of
+    independent ones.
+    """
+    sky = Sky.of(check_environment(envmap, "envmap"), 0.0)
+    image = np.zeros((camera.height * camera.width, 3), np.float32)
+    index = covered_pixels(scene, camera)
+    if len(index):
+        film, surface = dr.zeros(mi.Float, 3 * len(index)), Surface(scene)
+        gather, origin = _Gather(surface, film, sky), seed_state(seed, 1)
+        generator: Any = mi.PCG32  # the stubs call it a plain object
+
+        def trace(wave: Wave) -> None:
+            si = surface.interact(wave.rays, mi.Bool(True))
+            start = generator(1, origin, mi.UInt64(wave.slot)).next_float32()
+            place = start + mi.Float(wave.sample) * _GOLDEN
+            hit = Paths(mi.Color3f(1), mi.UInt32(0), wave.slot, wave.rng, si.is_valid())
+            gather.add(si, hit, place - dr.floor(place))
+
+        pixels = mi.UInt32(for_kernels(index, np.uint32))
+        each_sample(camera, pixels, len(index), spp, seed, trace)
+        image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def _along_curve(height: int, width: int) -> Ints:
+    """Flat indices of all texels of `(height, width)` along Hilbert's curve `(height · width,)`.
+
+    Neighbours on the curve are neighbours in the map. The curve is that of the least square of a
+    power of two that holds the map.
+    """
+    row, column = np.indices((height, width)).reshape(2, -1)
+    place = np.zeros(len(row), np.int64)
+    y, x, size = row.copy(), column.copy(), 1 << (max(height, width) - 1).bit_length()
+    step = size // 2
+    while step:
+        right, below = (x & step) > 0, (y & step) > 0
+        place += step * step * ((3 * right) ^ below)
+        turn, flip = ~below, ~below & right
+        x, y = np.where(flip, size - 1 - x, x), np.where(flip, size - 1 - y, y)
+        x, y = np.where(turn, y, x), np.where(turn, x, y)
+        step //= 2
+    return np.argsort(place)
+
+
 @dataclass(frozen=True)
 class Sky:
-    """A map on the device, constant over each texel."""
+    """A map on the device, constant over each texel.
+
+    `distribution` is that of the texels along a curve, on which texel number k of the map is the
+    `order[k]`-th.
+    """
 
     texels: Any
+    order: Any
     distribution: Any
     width: Any
     height: Any
@@ -80,9 +137,12 @@ class Sky:
         if weight.max(initial=0.0) == 0:
             weight = np.ones_like(weight)
         (turn,) = opaque(rotation_deg / 360)
+        order = _along_curve(height, width)
+        chance = (weight / weight.sum()).ravel()[order]
         return cls(
             mi.Float(for_kernels(np.ravel(envmap))),
-            mi.DiscreteDistribution(mi.Float(for_kernels((weight / weight.sum()).ravel()))),
+            mi.UInt32(for_kernels(order, np.uint32)),
+            mi.DiscreteDistribution(mi.Float(for_kernels(chance))),
             opaque_index(width),
             opaque_index(height),
             turn,
@@ -97,9 +157,14 @@ class Sky:
         row = dr.minimum(mi.UInt32(v * mi.Float(self.height)), self.height - 1)
         return dr.gather(mi.Color3f, self.texels, row * self.width + column)
 
-    def sample(self, rng: Any, active: Any) -> tuple[Any, Any]:
-        """A direction, and its radiance divided by the density of the draw."""
-        texel, chance = self.distribution.sample_pmf(rng.next_float32(), active)
+    def sample(self, rng: Any, active: Any, place: Any = None) -> tuple[Any, Any]:
+        """A direction, and its radiance divided by the density of the draw.
+
+        `place` in [0, 1) is that on the curve; random where None.
+        """
+        place = rng.next_float32() if place is None else place
+        number, chance = self.distribution.sample_pmf(place, active)
+        texel = dr.gather(mi.UInt32, self.order, number, active)
         row = texel // self.width
         u = (mi.Float(texel - row * self.width) + rng.next_float32()) / mi.Float(self.width)
         # Uniform in solid angle over the texel: its rows bound z, not the angle.
@@ -122,7 +187,11 @@ class _Gather:
     sky: Sky
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        towards, light = self.sky.sample(paths.rng, paths.active)
+        self.add(si, paths)
+
+    def add(self, si: Any, paths: Paths, place: Any = None) -> None:
+        """Add the light from the direction at `place` of the sky's curve; random where None."""
+        towards, light = self.sky.sample(paths.rng, paths.active, place)
         answer = self.surface.eval(si, si.to_local(towards), paths.active)
         value = paths.throughput * light * answer
         lit = paths.active & (dr.max(value) > 0)

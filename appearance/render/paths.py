@@ -189,11 +189,12 @@ def jittered(camera: Camera, pixel: Any, sample: Any, spp: int, rng: Any) -> Any
 
 @dataclass(frozen=True)
 class Wave:
-    """Camera paths in flight: `rays`, their random streams, and the slot in `pixels` of each."""
+    """Camera paths in flight: `rays`, random streams, each's slot in `pixels` and its sample."""
 
     rays: Any
     rng: Any
     slot: Any
+    sample: Any
 
 
 def wave(
@@ -206,7 +207,8 @@ def wave(
     slot = lane - sample * size
     rng = stream(count * slots, *seeds, first)
     pixel = dr.gather(mi.UInt32, pixels, slot)
-    return Wave(jittered(camera, pixel, sample + opaque_index(first), spp, rng), rng, slot)
+    sample = sample + opaque_index(first)
+    return Wave(jittered(camera, pixel, sample, spp, rng), rng, slot, sample)
 
 
 def each_sample(
@@ -235,7 +237,7 @@ def each_sample(
         lane = mi.UInt64(sample) * mi.UInt64(size) + mi.UInt64(slot)
         rng = generator(1, start + lane, lane)
         pixel = dr.gather(mi.UInt32, pixels, slot)
-        trace(Wave(jittered(camera, pixel, sample, spp, rng), rng, slot))
+        trace(Wave(jittered(camera, pixel, sample, spp, rng), rng, slot, sample))
         return (sample + 1,)
 
     dr.while_loop((dr.zeros(mi.UInt32, slots),), more, body, label="samples of a pixel")

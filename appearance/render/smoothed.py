@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from appearance.render.coverage import coverage
-from appearance.render.environment import render_environment
+from appearance.render.environment import direct_environment, render_environment
 from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
@@ -45,10 +45,10 @@ def olat_smoothed(
 def environment_smoothed(
     scene: HairScene, camera: Camera, envmap: AnyFloats, sampling: Sampling = SHOWN
 ) -> Floats:
-    """`render_environment` with its indirect light smoothed over `SIGMA` pixels: `(H, W, 3)`.
+    """`render_environment` with its indirect light smoothed: `(H, W, 3)`.
 
-    `envmap (h, w, 3)`. Direct light takes 8 `spp` paths a pixel: they are short, and the strands
-    show in it.
+    `envmap (h, w, 3)`. Smoothed over `SIGMA` pixels, of large pictures over 1/160 of their width.
+    Direct light takes 12 `spp` paths a pixel: they are short, and the strands show in it.
     """
     spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
@@ -56,8 +56,8 @@ def environment_smoothed(
         render_environment(scene, camera, envmap, replace(sampling, max_depth=depth))
         for depth in (1, sampling.max_depth)
     )
-    direct = render_environment(scene, camera, envmap, Sampling(8 * spp, 1, seed + 1))
-    return direct + smoothed((whole - first)[None], share, SIGMA)[0]
+    direct = direct_environment(scene, camera, envmap, 12 * spp, seed + 1)
+    return direct + smoothed((whole - first)[None], share, max(SIGMA, camera.width / 160))[0]
 
 
 def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from appearance import HairAppearance, Sampling, build_scene, render_environment
+from appearance.render.environment import _along_curve, direct_environment
 from appearance.render.environment_maps import load_environment, sky, studio
 from reconstruction import Camera, write_exr
 
@@ -25,6 +26,31 @@ def eye(direction, size=12, fov_deg=4.0):
 def test_a_convex_body_in_a_uniform_world_shows_its_albedo(ball):
     image = render_environment(ball, eye((0.3, -0.8, 0.2)), np.ones((8, 16, 3)), Sampling(256))
     np.testing.assert_allclose(image.mean((0, 1)), ALBEDO, rtol=0.02)
+
+
+def test_well_spread_directions_keep_the_mean_and_halve_the_noise(ball):
+    # a convex body under a map of two boxes: no shadow, one bounce; noise is between two seeds
+    view, spp = eye((0.3, -0.8, 0.2), fov_deg=9.0), 64
+    spread, drawn = (
+        np.array([render(seed) for seed in (1, 2)])
+        for render in (
+            lambda seed: direct_environment(ball, view, studio(), spp, seed),
+            lambda seed: render_environment(ball, view, studio(), Sampling(spp, 1, seed)),
+        )
+    )
+    assert spread.mean() == pytest.approx(drawn.mean(), rel=0.02)
+    assert np.std(spread[0] - spread[1]) < 0.5 * np.std(drawn[0] - drawn[1])
+    uniform = direct_environment(ball, eye((0.3, -0.8, 0.2)), np.ones((8, 16, 3)), 256)
+    np.testing.assert_allclose(uniform.mean((0, 1)), ALBEDO, rtol=0.02)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (5, 12), (1, 3)])
+def test_the_curve_through_a_map_meets_each_texel_once_and_goes_on_beside_it(shape):
+    order = _along_curve(*shape)
+    assert sorted(order) == list(range(shape[0] * shape[1]))
+    row, column = np.divmod(order, shape[1])
+    steps = np.abs(np.diff(row)) + np.abs(np.diff(column))
+    assert np.mean(steps == 1) == (1 if shape == (8, 8) else pytest.approx(1, abs=0.1))
 
 
 def test_clear_hair_in_a_uniform_world_vanishes(small):
