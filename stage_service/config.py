@@ -23,6 +23,7 @@ from pydantic import (
 )
 
 from reconstruction import Rig
+from reconstruction.containment import LONGEST_NAME
 from reconstruction.geometry.rig import RigError
 
 SHORTEST_S, LONGEST_S = 1e-6, 10.0
@@ -32,6 +33,9 @@ Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Seconds = Annotated[float, Field(gt=0.0)]
 Address = Annotated[int, Field(ge=0, le=65535)]
+Names = Annotated[
+    tuple[Annotated[str, Field(max_length=LONGEST_NAME)], ...], Field(max_length=4096)
+]
 
 
 class Strict(BaseModel):

@@ -114,8 +114,12 @@ class Service:
         return resolve(plan, self.rig_file).cost
 
     def start_capture(self, request: CaptureRequest, by: Caller) -> CaptureView:
-        """Begin a capture. Raises `BadInput`, `Leased`, and what `CaptureManager.start` raises."""
+        """Begin a capture. Raises `BadInput`, `Leased`, and what `CaptureManager.start` raises;
+        `Forbidden` for a pipeline without the scope "jobs", or arming without "arm"."""
+        if request.armed_by is not None:
+            by.require("arm")
         if request.pipeline is not None:
+            by.require("jobs")
             _check_names(request.pipeline, self.rig_file.rig)
             if "reconstruct" not in PIPELINES[request.pipeline.name]:
                 raise BadInput(
@@ -140,7 +144,8 @@ class Service:
             masks=self._masks(request.masks) if request.masks is not None else None,
             extra={"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {},
         )
-        capture = self._control.do(by, "capture.start", work, None)
+        then = "" if request.pipeline is None else f"{request.pipeline.name} is to follow"
+        capture = self._control.do(by, "capture.start", work, None, detail=then)
         self._control.record_arming(by, capture, request.armed_by, request.plan.consent)
         return self.capture(capture)
 
@@ -158,7 +163,10 @@ class Service:
         return self._view(self._control.do(by, "capture.pause", work, capture_id))
 
     def resume(self, capture_id: str, by: Caller, armed_by: str | None = None) -> CaptureView:
-        """Go on after a pause; of a capture that did not complete, shoot the frames it lacks."""
+        """Go on after a pause; of a capture that did not complete, shoot the frames it lacks.
+        Raises `Forbidden` for arming without the scope "arm"."""
+        if armed_by is not None:
+            by.require("arm")
         work = partial(self._captures.resume, capture_id, armed_by=armed_by)
         status = self._control.do(by, "capture.resume", work, capture_id)
         self._control.record_arming(by, capture_id, armed_by)
@@ -210,9 +218,15 @@ class Service:
                 raise
             return path.resolve()
 
-    def submit(self, request: JobRequest) -> Job:
+    def submit(self, request: JobRequest, by: Caller) -> Job:
         """Enqueue a pipeline on a capture. Raises `UnknownCapture`, `NotFinished`, `BadInput`,
         `ModelInUse`, `JobsUnavailable`."""
+        job = new_job_id()
+        work = partial(self._submit, job, request)
+        what = f"{request.pipeline.name} on {request.capture}"
+        return self._control.do(by, "job.submit", work, job, detail=what, steers=False)
+
+    def _submit(self, job: str, request: JobRequest) -> Job:
         path = self.capture_path(request.capture)
         capture = Capture(path)
         if capture.manifest is None:
@@ -222,7 +236,6 @@ class Service:
                 f"capture {request.capture} is {outcome}, not completed: resume it, or shoot anew"
             )
         _check_names(request.pipeline, capture.rig)
-        job = new_job_id()
         model = Model(self.root / "models" / (request.model or job))
         rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
         if not rebuilds and not model.has("strands.npz"):
@@ -252,9 +265,10 @@ class Service:
                 raise
             return job
 
-    def cancel_job(self, job_id: str) -> Job:
+    def cancel_job(self, job_id: str, by: Caller) -> Job:
         """Cancel a job: a queued one at once, a running one at its next progress call."""
-        return self._queue.cancel(job_id)
+        work = partial(self._queue.cancel, job_id)
+        return self._control.do(by, "job.cancel", work, job_id, steers=False)
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
@@ -302,9 +316,19 @@ class Service:
         return _grant(self._control.do(by, "lease.renew", work, detail=detail, steers=False))
 
     def release_lease(self, by: Caller) -> LeaseView:
-        """End the caller's lease. Raises `NoLease`."""
+        """End the caller's lease. Raises `Forbidden`, `NoLease`."""
+        by.require("steer")
         work = partial(self._control.leases.release, by.token or "")
         self._control.do(by, "lease.release", work, steers=False)
+        return self.lease()
+
+    def end_lease(self, by: Caller) -> LeaseView:
+        """End the lease whoever holds it. Raises `Forbidden`, `NoLease`."""
+        by.require("admin")
+        held = self._control.leases.current
+        detail = "" if held is None else f"held by {held.holder}"
+        work = self._control.leases.end
+        self._control.do(by, "lease.end", work, detail=detail, steers=False)
         return self.lease()
 
     def audit(self, limit: int) -> list[Action]:

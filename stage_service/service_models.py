@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
+from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.config import Strict
 from stage_service.jobs.records import PipelineRequest, with_example
@@ -48,7 +49,7 @@ class JobRequest(Strict):
 
     model_config = with_example(capture="20261121-093000", pipeline={"name": "light_planes"})
 
-    capture: str
+    capture: Annotated[str, Field(max_length=LONGEST_NAME)]
     pipeline: PipelineRequest
     model: FileName | None = None
 

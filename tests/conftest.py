@@ -39,6 +39,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place.get(item.path.relative_to(tests).parts[0], len(DEAR)))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_token(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Whoever runs the tests keeps the token that they have."""
+    file = tmp_path_factory.mktemp("user") / "token"
+    file.write_text("a token of the tests\n")
+    os.environ["HAIRSTAGE_TOKEN_FILE"] = str(file)
+
+
 @pytest.fixture
 def slack() -> int:
     """How many times longer devices may take than on an idle machine; of one test, one number.

@@ -8,17 +8,37 @@ from typing import Any, TypeVar
 
 from stage_service.records.audit import AuditLog
 from stage_service.records.lease import Leases
+from stage_service.records.tokens import SCOPES, Scope
 
 T = TypeVar("T")
 STAGE = "stage"
 
 
+class Forbidden(PermissionError):
+    """The caller may not do this; `scope` is what would allow it."""
+
+    def __init__(self, scope: Scope) -> None:
+        super().__init__(f"this needs a token with the scope {scope!r}")
+        self.scope = scope
+
+
 @dataclass(frozen=True)
 class Caller:
-    """Who asks: an address, and the token of a lease where they have one."""
+    """Who asks: an address, the token of a lease where they have one, and their own token's name
+    ("" where nobody is asked for one) and scopes."""
 
     address: str
     token: str | None = None
+    name: str = ""
+    scopes: tuple[Scope, ...] = SCOPES
+
+    def require(self, scope: Scope) -> None:
+        """Raise `Forbidden` without this scope."""
+        if scope not in self.scopes:
+            raise Forbidden(scope)
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.address})" if self.name else self.address
 
 
 class Control:
@@ -75,4 +95,4 @@ class Control:
 
     def _who(self, caller: Caller) -> str:
         holder = self.leases.holder(caller.token)
-        return f"{holder} ({caller.address})" if holder else caller.address
+        return f"{holder} ({caller})" if holder else str(caller)

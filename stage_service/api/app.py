@@ -1,4 +1,4 @@
-"""The FastAPI application and the server that runs it on this machine's loopback."""
+"""The FastAPI application and the server that runs it."""
 
 from __future__ import annotations
 
@@ -6,55 +6,28 @@ import contextlib
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
-from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stage_service.api import event_stream, routes, steering
-from stage_service.api.problems import (
-    PAGE,
-    Problem,
-    errors_page,
-    install_problems,
-    problem_response,
-)
+from stage_service.api.connections import LOOPBACK, limits, listening
+from stage_service.api.gate import OWN_NAMES, Access, Gate
+from stage_service.api.problems import PAGE, Problem, errors_page, install_problems
 from stage_service.service import Service
 
-LOOPBACK = "127.0.0.1"
-OWN_NAMES = {"127.0.0.1", "localhost", "[::1]"}
 
+def create_app(service: Service, access: Access | None = None) -> FastAPI:
+    """The application over `service`; starts it, and closes it (lights off) at shutdown.
 
-class OnlyThisMachine:
-    """Refuses requests to foreign host names.
-
-    The socket takes connections from this machine alone, but a web page from elsewhere, open in a
-    browser here, can point its own host name at 127.0.0.1.
+    Without `access` everybody on this machine may do everything.
     """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer 421."""
-        if scope["type"] == "http":
-            host = Headers(scope=scope).get("host", "")
-            name, _, port = host.rpartition(":")
-            if (name if port.isdigit() else host) not in OWN_NAMES:
-                detail = f"host {host!r} is not this machine's loopback: use http://{LOOPBACK}"
-                refusal = problem_response(scope["path"], "http", detail, status=421)
-                await refusal(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
-
-
-def create_app(service: Service) -> FastAPI:
-    """The application over `service`; starts it, and closes it (lights off) at shutdown."""
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -78,15 +51,16 @@ def create_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     install_problems(app)
-    app.include_router(routes.router)
-    app.include_router(steering.router)
-    app.include_router(event_stream.router)
+    for part in (routes, steering, event_stream):
+        app.include_router(part.reading)
+    for more in (routes, steering):
+        app.include_router(more.router)
 
     @app.get(PAGE, include_in_schema=False)
     def errors() -> PlainTextResponse:
         return PlainTextResponse(errors_page(), media_type="text/markdown")
 
-    app.add_middleware(OnlyThisMachine)
+    app.add_middleware(Gate, access=access or Access())
     return app
 
 
@@ -106,33 +80,53 @@ class _Server(uvicorn.Server):
         self._ready()
 
 
-def listening(port: int) -> socket.socket:
-    """A socket on 127.0.0.1:`port` (0: any free one). Raises `OSError` when the port is taken."""
-    # With the protocol named: asyncio sets TCP_NODELAY on what such a socket accepts and no other.
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((LOOPBACK, port))
-    except OSError as error:
-        listener.close()
-        raise OSError(
-            f"port {port} on {LOOPBACK} cannot be used ({error.strerror}): is another service "
-            "running? choose another with --port"
-        ) from error
-    return listener
+@dataclass(frozen=True)
+class Endpoint:
+    """Where a service listens: `socket`, a Unix socket's path, else `host` and `port` (0: any free
+    one), with TLS where there is a `certificate` (and its `key`, where that file lacks it)."""
+
+    host: str = LOOPBACK
+    port: int = 0
+    socket: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @property
+    def local(self) -> bool:
+        """Whether it is reached from this machine alone."""
+        return self.socket is not None or self.host in OWN_NAMES
+
+    def url(self, port: int) -> str:
+        """Where it is asked when it listens on `port`."""
+        if self.socket is not None:
+            return f"unix:{self.socket.resolve()}"
+        return f"http{'s' if self.certificate else ''}://{self.host}:{port}"
 
 
-def serve(service: Service, port: int, ready: Callable[[str], Any] = lambda _url: None) -> None:
-    """Serve `service` on 127.0.0.1:`port` (0: any free one) until SIGTERM or SIGINT.
+def serve(
+    service: Service,
+    endpoint: Endpoint,
+    access: Access,
+    ready: Callable[[str], Any] = lambda _url: None,
+) -> None:
+    """Serve `service` at `endpoint` until SIGTERM or SIGINT.
 
     `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
     """
-    with listening(port) as listener:
-        url = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
+    with listening(endpoint.host, endpoint.port, endpoint.socket) as listener:
+        url = endpoint.url(0 if endpoint.socket else listener.getsockname()[1])
         config = uvicorn.Config(
-            create_app(service), log_level="warning", access_log=False, timeout_graceful_shutdown=3
+            create_app(service, access),
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=3,
+            ssl_certfile=endpoint.certificate,
+            ssl_keyfile=endpoint.key,
+            **limits(),
         )
         try:
             _Server(config, service, lambda: ready(url)).run(sockets=[listener])
         finally:
             service.close()
+            if endpoint.socket is not None:
+                endpoint.socket.unlink(missing_ok=True)

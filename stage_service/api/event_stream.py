@@ -11,13 +11,14 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Request
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
+from stage_service.api.steering import READS
 from stage_service.records.events import EventLog
 
-router = APIRouter()
+reading = APIRouter(dependencies=READS)
 POLL_S = 0.5
 
 
-@router.get(
+@reading.get(
     "/events",
     response_class=EventSourceResponse,
     responses={200: {"content": {"text/event-stream": {}}}},

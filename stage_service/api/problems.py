@@ -22,6 +22,7 @@ from reconstruction.capture.writer import JournalInUse
 from reconstruction.containment import NotContained
 from reconstruction.reading import printable
 from stage_service.acquisition.captures import Busy, UnknownCapture
+from stage_service.acquisition.control import Forbidden
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
 from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
@@ -45,6 +46,15 @@ class Kind:
 
 
 TABLE = """
+unauthorized 401 Who asks is not known
+    Every request but those for /docs and /openapi.json carries `Authorization: Bearer TOKEN`.
+    `hairstage token` makes tokens; docs/safety.md says who may do what.
+forbidden 403 This token does not allow that
+    `scope` is what it lacks. Abort and blackout are open to every token.
+foreign-origin 403 A web page of another site asked
+    A browser sent this for a page that is not this service's own.
+too-large 413 The request is too large
+    `detail` says what is allowed.
 invalid-request 422 The request does not fit the schema
     `errors` lists each field that is wrong and why. The schema is in /openapi.json.
 invalid-plan 422 This rig cannot shoot this plan
@@ -94,8 +104,8 @@ jobs-unavailable 503 The job database does not answer
 damaged-capture 409 The capture folder cannot be read
     `detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.
 http 400 The request cannot be served
-    The status says why: no such route, method not allowed, or a host name that is not this
-    machine's.
+    The status says why: no such route, method not allowed, a host name that is not this
+    service's, or a request that took too long to come.
 internal 500 A fault in the service
     The service's log has the traceback. Lamps go off by themselves if the service dies.
 """
@@ -122,6 +132,7 @@ BY_ERROR: dict[type[Exception], str] = {
     CannotAcknowledge: "cannot-acknowledge",
     Leased: "leased",
     NoLease: "no-lease",
+    Forbidden: "forbidden",
     WrongState: "wrong-state",
     NotFinished: "not-finished",
     ModelInUse: "model-in-use",
@@ -135,7 +146,7 @@ BY_ERROR: dict[type[Exception], str] = {
 }
 """Which error class becomes which kind; a subclass stands before its base."""
 
-EXTRA = ("problems", "running", "state", "holder", "expires")
+EXTRA = ("problems", "running", "state", "holder", "expires", "scope")
 """Attributes of an error that its problem document repeats."""
 
 

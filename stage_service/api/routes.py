@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Response, status
 from fastapi.responses import FileResponse
 
 from stage_service.api.frames import png_preview
-from stage_service.api.steering import By, OnService
+from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
 from stage_service.jobs.records import Job
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
@@ -24,9 +24,10 @@ from stage_service.service_models import (
 )
 
 router = APIRouter()
+reading = APIRouter(dependencies=READS)
 
 
-@router.post("/plans:validate", tags=["captures"])
+@reading.post("/plans:validate", tags=["captures"])
 def validate_plan(plan: CapturePlan, service: OnService) -> PlanCost:
     """What a plan would take on this rig: frames, bytes, seconds, light dose. Lights nothing."""
     return service.validate(plan)
@@ -34,7 +35,7 @@ def validate_plan(plan: CapturePlan, service: OnService) -> PlanCost:
 
 @router.post("/captures", status_code=status.HTTP_202_ACCEPTED, tags=["captures"])
 def start_capture(
-    body: CaptureRequest, service: OnService, by: By, response: Response
+    body: CaptureRequest, service: OnService, by: Steers, response: Response
 ) -> CaptureView:
     """Begin a capture. With `pipeline`, its completion enqueues that job by itself."""
     view = service.start_capture(body, by)
@@ -42,39 +43,39 @@ def start_capture(
     return view
 
 
-@router.get("/captures", tags=["captures"])
+@reading.get("/captures", tags=["captures"])
 def list_captures(service: OnService) -> list[CaptureView]:
     """All captures, oldest first."""
     return service.captures()
 
 
-@router.get("/captures/{capture}", tags=["captures"])
+@reading.get("/captures/{capture}", tags=["captures"])
 def get_capture(capture: str, service: OnService) -> CaptureView:
     """Where a capture is, how it ended, and the job that follows it."""
     return service.capture(capture)
 
 
 @router.post("/captures/{capture}/pause", tags=["captures"])
-def pause_capture(capture: str, service: OnService, by: By) -> CaptureView:
+def pause_capture(capture: str, service: OnService, by: Steers) -> CaptureView:
     """Pause at the next step boundary, lights off."""
     return service.pause(capture, by)
 
 
 @router.post("/captures/{capture}/resume", tags=["captures"])
 def resume_capture(
-    capture: str, service: OnService, by: By, body: ResumeRequest | None = None
+    capture: str, service: OnService, by: Steers, body: ResumeRequest | None = None
 ) -> CaptureView:
     """Go on after a pause; of a capture that did not complete, shoot the frames that it lacks."""
     return service.resume(capture, by, None if body is None else body.armed_by)
 
 
 @router.post("/captures/{capture}/abort", tags=["captures"])
-def abort_capture(capture: str, service: OnService, by: By) -> CaptureView:
+def abort_capture(capture: str, service: OnService, by: Anybody) -> CaptureView:
     """Abort at the next step boundary, lights off; finished frames stay."""
     return service.abort(capture, by)
 
 
-@router.get(
+@reading.get(
     "/captures/{capture}/frames/{step}/{camera}.exr",
     response_class=FileResponse,
     responses={200: {"content": {"image/x-exr": {}}}},
@@ -86,7 +87,7 @@ def get_frame(capture: str, step: int, camera: str, service: OnService) -> Respo
     return Response(data, media_type="image/x-exr")
 
 
-@router.get(
+@reading.get(
     "/captures/{capture}/frames/{step}/{camera}.png",
     response_class=Response,
     responses={200: {"content": {"image/png": {}}}},
@@ -105,44 +106,44 @@ def get_preview(
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
-def submit_job(body: JobRequest, service: OnService, response: Response) -> Job:
+def submit_job(body: JobRequest, service: OnService, by: Processes, response: Response) -> Job:
     """Enqueue a pipeline on a finished capture."""
-    job = service.submit(body)
+    job = service.submit(body, by)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job
 
 
-@router.get("/jobs", tags=["jobs"])
+@reading.get("/jobs", tags=["jobs"])
 def list_jobs(service: OnService, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> list[Job]:
     """The latest jobs, newest first."""
     return service.jobs(limit)
 
 
-@router.get("/jobs/{job}", tags=["jobs"])
+@reading.get("/jobs/{job}", tags=["jobs"])
 def get_job(job: str, service: OnService) -> Job:
     """A job's state, progress, and outcome."""
     return service.job(job)
 
 
 @router.delete("/jobs/{job}", tags=["jobs"])
-def cancel_job(job: str, service: OnService) -> Job:
+def cancel_job(job: str, service: OnService, by: Processes) -> Job:
     """Cancel a job: a queued one at once, a running one at its next progress call."""
-    return service.cancel_job(job)
+    return service.cancel_job(job, by)
 
 
-@router.get("/jobs/{job}/report", response_class=FileResponse, tags=["jobs"])
+@reading.get("/jobs/{job}/report", response_class=FileResponse, tags=["jobs"])
 def get_report(job: str, service: OnService) -> Response:
     """The report that the job's stages filled: seconds, error against time, left out, warnings."""
     return FileResponse(service.artifact(job, "report.json"), media_type="application/json")
 
 
-@router.get("/jobs/{job}/artifacts", tags=["jobs"])
+@reading.get("/jobs/{job}/artifacts", tags=["jobs"])
 def list_artifacts(job: str, service: OnService) -> list[Artifact]:
     """The files in the job's model folder."""
     return service.artifacts(job)
 
 
-@router.get("/jobs/{job}/artifacts/{path:path}", response_class=FileResponse, tags=["jobs"])
+@reading.get("/jobs/{job}/artifacts/{path:path}", response_class=FileResponse, tags=["jobs"])
 def get_artifact(job: str, path: str, service: OnService) -> Response:
     """One file of the model folder."""
     file = service.artifact(job, path)
@@ -150,7 +151,7 @@ def get_artifact(job: str, path: str, service: OnService) -> Response:
     return FileResponse(file, media_type=kind)
 
 
-@router.get("/health", tags=["service"])
+@reading.get("/health", tags=["service"])
 def health(service: OnService) -> Health:
     """Whether the service and its worker run; asks no device."""
     return service.health()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Query, Request, status
+from fastapi import APIRouter, Depends, Header, Query, Request, Security, status
+from fastapi.security import HTTPBearer, SecurityScopes
 
 from stage_service.acquisition.control import Caller
 from stage_service.records.audit import Action
+from stage_service.records.tokens import SCOPES
 from stage_service.service import Service
 from stage_service.service_models import (
     AcknowledgeRequest,
@@ -17,8 +19,6 @@ from stage_service.service_models import (
     RenewRequest,
 )
 
-router = APIRouter()
-
 
 def on_service(request: Request) -> Service:
     """The service of this application."""
@@ -26,46 +26,65 @@ def on_service(request: Request) -> Service:
     return service
 
 
-def caller(
+async def caller(
     request: Request,
-    token: Annotated[
+    needed: SecurityScopes,
+    _: Annotated[object, Depends(HTTPBearer(auto_error=False, scheme_name="token"))],
+    lease: Annotated[
         str | None, Header(alias="Hairstage-Lease", description="token of the lease")
     ] = None,
 ) -> Caller:
-    """Who asks."""
-    peer = request.client
-    return Caller("unknown" if peer is None else f"{peer.host}:{peer.port}", token)
+    """Who asks; raises `Forbidden` where their token lacks a scope that the route needs."""
+    peer, identity = request.client, request.state.identity
+    address = f"{peer.host}:{peer.port}" if peer else "this machine"
+    by = Caller(address, lease, identity.name, identity.scopes)
+    for scope in SCOPES:
+        if scope in needed.scopes:
+            by.require(scope)
+    return by
 
 
 OnService = Annotated[Service, Depends(on_service)]
-By = Annotated[Caller, Depends(caller)]
+Anybody = Annotated[Caller, Security(caller)]
+"""Any token will do."""
+Steers = Annotated[Caller, Security(caller, scopes=["steer"])]
+Arms = Annotated[Caller, Security(caller, scopes=["arm"])]
+Processes = Annotated[Caller, Security(caller, scopes=["jobs"])]
+READS = [Security(caller, scopes=["read"])]
+
+router = APIRouter()
+reading = APIRouter(dependencies=READS)
 
 
 @router.post("/lease", status_code=status.HTTP_201_CREATED, tags=["steering"])
-def take_lease(body: LeaseRequest, service: OnService, by: By) -> LeaseGrant:
+def take_lease(body: LeaseRequest, service: OnService, by: Steers) -> LeaseGrant:
     """Steer alone for some time. Others are answered 409, but may abort and black out."""
     return service.take_lease(body, by)
 
 
-@router.get("/lease", tags=["steering"])
+@reading.get("/lease", tags=["steering"])
 def get_lease(service: OnService) -> LeaseView:
     """Who steers, if anybody in particular."""
     return service.lease()
 
 
 @router.patch("/lease", tags=["steering"])
-def renew_lease(body: RenewRequest, service: OnService, by: By) -> LeaseGrant:
+def renew_lease(body: RenewRequest, service: OnService, by: Steers) -> LeaseGrant:
     """Let the lease of the token end so many seconds from now."""
     return service.renew_lease(body, by)
 
 
 @router.delete("/lease", tags=["steering"])
-def release_lease(service: OnService, by: By) -> LeaseView:
+def release_lease(
+    service: OnService,
+    by: Anybody,
+    force: Annotated[bool, Query(description="whoever holds it; needs the scope admin")] = False,
+) -> LeaseView:
     """End the lease of the token."""
-    return service.release_lease(by)
+    return service.end_lease(by) if force else service.release_lease(by)
 
 
-@router.get("/audit", tags=["steering"])
+@reading.get("/audit", tags=["steering"])
 def get_audit(
     service: OnService, limit: Annotated[int, Query(ge=1, le=10_000)] = 100
 ) -> list[Action]:
@@ -73,19 +92,19 @@ def get_audit(
     return service.audit(limit)
 
 
-@router.get("/devices", tags=["devices"])
+@reading.get("/devices", tags=["devices"])
 def get_devices(service: OnService) -> dict[str, Any]:
     """Each device and whether it answers; under `safety`, whether the lamps are known to be off."""
     return service.devices()
 
 
 @router.post("/devices/blackout", tags=["devices"])
-def blackout(service: OnService, by: By) -> dict[str, Any]:
+def blackout(service: OnService, by: Anybody) -> dict[str, Any]:
     """All lamps and projectors off, verified. Aborts a running capture."""
     return service.blackout(by)
 
 
 @router.post("/devices/acknowledge", tags=["devices"])
-def acknowledge(body: AcknowledgeRequest, service: OnService, by: By) -> dict[str, Any]:
+def acknowledge(body: AcknowledgeRequest, service: OnService, by: Arms) -> dict[str, Any]:
     """Somebody has looked: the lamps are off. Only where the link cannot tell by itself."""
     return service.acknowledge(body, by)

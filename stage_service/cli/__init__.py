@@ -1,6 +1,7 @@
 """The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`,
-`serve`, `worker` and `simulate` in `processes.py`: in `stage/` those that run a stage, in `model/`
-those that work on a model, here all others. They import what they need when they run."""
+`token` in `tokens.py`, `serve`, `worker` and `simulate` in `processes.py`: in `stage/` those that
+run a stage, in `model/` those that work on a model, here all others. They import what they need
+when they run."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ from importlib.metadata import version
 
 from stage_service.cli import bench, calibrate, demo, head, rig, verify
 from stage_service.cli.model import edit, evaluate, export, fit, reconstruct, render
-from stage_service.cli.stage import capture, jobs, lease, processes
+from stage_service.cli.stage import capture, jobs, lease, processes, tokens
 from stage_service.cli.support.commands import EXIT_CODES, run_command
 
 COMMANDS = (
-    *(demo, processes, capture, lease, jobs),
+    *(demo, processes, capture, lease, jobs, tokens),
     *(verify, reconstruct, fit, render, edit, export, evaluate, bench, rig, calibrate, head),
 )
 

@@ -11,7 +11,7 @@ from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
 from reconstruction import ReconstructOptions
 from reconstruction.methods import Method
-from stage_service.config import Strict
+from stage_service.config import Names, Strict
 from stage_service.jobs.pipelines import PIPELINES
 
 JobState = Literal["queued", "running", "done"]
@@ -35,8 +35,8 @@ class JobOptions(Strict):
 
     method: Method = "light_planes"
     compress: bool = True
-    held_out_cameras: tuple[str, ...] = ()
-    held_out_lights: tuple[str, ...] = ()
+    held_out_cameras: Names = ()
+    held_out_lights: Names = ()
     environment: str = "studio"
     truth: str | None = None
     seed: int = Field(default=0, ge=0)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from stage_service.config import Exposure, Level, Strict
+from stage_service.config import Exposure, Level, Names, Strict
 
 Bracket = Annotated[float, Field(gt=0.0, le=1000.0)]
 
@@ -51,8 +51,8 @@ class CapturePlan(Strict):
     The rows that are left over follow the last full group. 0 means no tracking frames.
     """
 
-    lights: Literal["all"] | tuple[str, ...] = "all"
-    projectors: Literal["all"] | tuple[str, ...] = "all"
+    lights: Literal["all"] | Names = "all"
+    projectors: Literal["all"] | Names = "all"
     rows: Rows = Rows()
     sentinels: bool = True
     brackets: Annotated[tuple[Bracket, ...], Field(min_length=1, max_length=8)] = (1.0,)

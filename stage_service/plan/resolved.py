@@ -17,6 +17,9 @@ from stage_service.plan.stepping import LATENCY_S, Run, limited_by, runs, second
 from stage_service.plan.steps import expand, exposures_of, no_controller, rows_of, swept
 from stage_service.plan.timeline import timeline
 
+MOST_TOLD = 20
+"""So many wrong names are told one by one."""
+
 
 class PlanError(ValueError):
     """A plan that this rig cannot shoot; `problems` has one sentence for each reason."""
@@ -150,10 +153,13 @@ def _misfits(plan: CapturePlan, rig_file: RigFile) -> list[str]:
 def _unknown(kind: str, chosen: Literal["all"] | tuple[str, ...], known: list[str]) -> list[str]:
     if chosen == "all":
         return []
+    there = set(known)
     problems = [
         f"{kind}s: the rig has no {kind} {name!r} (it has {', '.join(known[:5])}, …)"
         for name in chosen
-        if name not in set(known)
+        if name not in there
     ]
-    twice = sorted({name for name in chosen if chosen.count(name) > 1})
-    return problems + [f"{kind}s: {name!r} is listed twice" for name in twice]
+    twice = sorted(name for name, count in Counter(chosen).items() if count > 1)
+    problems += [f"{kind}s: {name!r} is listed twice" for name in twice]
+    more = len(problems) - MOST_TOLD
+    return problems[:MOST_TOLD] + ([f"{kind}s: {more} more such names"] if more > 0 else [])

@@ -73,6 +73,14 @@ class Leases:
             self._lease = None
             return lease
 
+    def end(self) -> Lease:
+        """End the lease whoever holds it. Raises `NoLease` where nobody does."""
+        with self._lock:
+            lease, self._lease = self._now(), None
+            if lease is None:
+                raise NoLease("nobody holds a lease")
+            return lease
+
     def check(self, token: str | None) -> None:
         """Raise `Leased` unless nobody holds a lease, or this token is its own."""
         with self._lock:

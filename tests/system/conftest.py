@@ -6,6 +6,7 @@ These tests go only through HTTP, the command line and the wires.
 from __future__ import annotations
 
 import json
+import os
 import socket
 import struct
 import subprocess
@@ -121,6 +122,8 @@ class TinyStage:
         words = ("serve", "--rig", self.rig, "--devices", self.devices, "--root", self.root)
         child, ready = self.start(*words, "--port", "0")
         self.http.base_url = ready["url"]
+        token = Path(os.environ["HAIRSTAGE_TOKEN_FILE"]).read_text().strip()
+        self.http.headers["Authorization"] = f"Bearer {token}"
         return child
 
     def work(self) -> subprocess.Popen[str]:

@@ -20,7 +20,8 @@ def add(commands: Commands) -> None:
     add_remote(lease, "show", run_show_lease)
     renew = add_remote(lease, "renew", run_renew_lease)
     renew.add_argument("--seconds", type=float, default=600.0, help="from now")
-    add_remote(lease, "release", run_release_lease)
+    release = add_remote(lease, "release", run_release_lease)
+    release.add_argument("--force", action="store_true", help="whoever holds it; as admin")
 
 
 def run_take_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
@@ -44,6 +45,6 @@ def run_renew_lease(args: argparse.Namespace, output: Output, service: ServiceCl
     output.result(granted, f"until {granted['expires']}")
 
 
-def run_release_lease(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+def run_release_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """End the lease of --lease."""
-    output.result(service.ask("DELETE", "/lease"), "released")
+    output.result(service.ask("DELETE", f"/lease?force={args.force}"), "released")

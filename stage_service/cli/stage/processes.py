@@ -9,12 +9,22 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from stage_service.cli.support.commands import Commands, Output, add_command, rig_path
+from stage_service.cli.stage.tokens import TOKENS
+from stage_service.cli.support.commands import (
+    PRIVATE,
+    BadArgument,
+    Commands,
+    Output,
+    add_command,
+    rig_path,
+)
+
+if TYPE_CHECKING:
+    from stage_service.api.gate import Access
 
 DEFAULT_PORT = 8331
-PRIVATE = 0o027
-"""Frames are people's faces: what a stage writes is for its user, and to be read by its group."""
 RIG_HELP = "rig file, or one that comes with hairstage: demo, stage331"
 
 
@@ -25,6 +35,14 @@ def add(commands: Commands) -> None:
     serve.add_argument("--devices", type=Path, help="file whose [devices] wins over the rig file's")
     serve.add_argument("--root", type=Path, default=Path("runs/stage"), help="captures and models")
     serve.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 takes any free port")
+    serve.add_argument("--host", default="127.0.0.1", help="address; beyond this machine with TLS")
+    serve.add_argument("--socket", type=Path, help="a Unix socket instead, for user and group")
+    serve.add_argument("--tls-cert", type=Path, help="certificate and what leads to it, PEM")
+    serve.add_argument("--tls-key", type=Path, help="its key, where that file lacks it")
+    serve.add_argument("--name", action="append", default=[], help="a host name of this service")
+    serve.add_argument(
+        "--no-auth", action="store_true", help="everybody on this machine may do everything"
+    )
 
     worker = add_command(commands, "worker", run_worker)
     worker.add_argument("--root", type=Path, default=Path("runs/stage"), help="as the service's")
@@ -44,22 +62,48 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     """Run the service: devices, captures and the HTTP API.
 
     Run the service for one rig on 127.0.0.1. SIGTERM and Ctrl-C put the lights off first. With
-    --json, one object with the URL is printed when requests are answered.
+    --json, one object with the URL is printed when requests are answered. Who asks sends a token:
+    the commands send this user's own, which is made where there is none; 'hairstage token' makes
+    others.
     """
     log_to_stderr()
-    from stage_service.api.app import serve
+    from stage_service.api.app import Endpoint, serve
     from stage_service.config import load_rig_file
     from stage_service.service import Service
 
     exit_on_sigterm()
     os.umask(PRIVATE)
+    endpoint = Endpoint(args.host, args.port, args.socket, args.tls_cert, args.tls_key)
+    if not endpoint.local and (args.no_auth or args.tls_cert is None):
+        raise BadArgument(
+            f"--host {args.host}: beyond this machine a service has tokens, and TLS (--tls-cert), "
+            "or they could be overheard"
+        )
+    access = _access(args, output)
     service = Service(load_rig_file(args.rig, args.devices), args.root)
 
     def ready(url: str) -> None:
         text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"
         output.result({"url": url, "root": str(args.root), "rig": str(args.rig)}, text)
 
-    serve(service, args.port, ready)
+    serve(service, endpoint, access, ready)
+
+
+def _access(args: argparse.Namespace, output: Output) -> Access:
+    from stage_service.api.gate import OWN_NAMES, Access
+    from stage_service.records.tokens import Tokens, own_file, own_token
+
+    names = OWN_NAMES | {args.host, *args.name}
+    if args.no_auth:
+        output.note("no tokens are asked for: everybody on this machine may do everything")
+        return Access(None, names)
+    try:
+        own = own_token()
+        output.note(f"requests need a token; yours is in {own_file()} (hairstage token show)")
+    except OSError as error:
+        own = None
+        output.note(f"you have no token of your own here ({error}): make one by 'hairstage token'")
+    return Access(Tokens(args.root / TOKENS, own), names)
 
 
 def run_worker(args: argparse.Namespace, output: Output) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import os
 import socket
+import ssl
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +15,7 @@ import httpx
 
 from reconstruction import Progress
 from stage_service.cli.support.commands import BAD_INPUT, FAILED, UNREACHABLE, CommandError
+from stage_service.records.tokens import own_file, own_token
 
 DEFAULT_URL = "http://127.0.0.1:8331"
 LEASE = "Hairstage-Lease"
@@ -29,7 +31,18 @@ class ServiceClient:
 
     def __init__(self, url: str | None = None, lease: str | None = None) -> None:
         self.url = url or os.environ.get("HAIRSTAGE_URL") or DEFAULT_URL
-        self._http = httpx.Client(base_url=self.url, timeout=60.0, trust_env=False)
+        unix = self.url.removeprefix("unix:") if self.url.startswith("unix:") else None
+        authority = os.environ.get("HAIRSTAGE_CA")
+        known = ssl.create_default_context(cafile=authority) if authority else True
+        self._http = httpx.Client(
+            base_url=self.url if unix is None else "http://localhost",
+            transport=httpx.HTTPTransport(uds=unix, verify=known),
+            timeout=60.0,
+            trust_env=False,
+        )
+        local = unix is not None or self._http.base_url.host in ("127.0.0.1", "localhost", "::1")
+        if token := os.environ.get("HAIRSTAGE_TOKEN") or (_own() if local else None):
+            self._http.headers["Authorization"] = f"Bearer {token}"
         self._steer_with(lease)
 
     def __enter__(self) -> Self:
@@ -132,6 +145,14 @@ class ServiceClient:
                 return status
             check()
             time.sleep(0.3)
+
+
+def _own() -> str | None:
+    """This user's own token, which goes to services of this machine alone."""
+    try:
+        return own_token() if own_file().exists() else None
+    except OSError:
+        return None
 
 
 def me() -> str:

@@ -29,6 +29,8 @@ EXIT_CODES = {
     130: "interrupted",
 }
 FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
+PRIVATE = 0o027
+"""Frames are people's faces: what a stage writes is for its user, and to be read by its group."""
 LINE_EVERY_S = 10.0
 """Where progress goes to a log, a line so often."""
 

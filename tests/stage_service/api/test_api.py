@@ -16,7 +16,8 @@ import uvicorn
 from waiting import until
 
 from reconstruction import Model, Step, read_exr
-from stage_service.api.app import LOOPBACK, create_app
+from stage_service.api.app import create_app
+from stage_service.api.connections import LOOPBACK
 from stage_service.api.problems import KINDS, Problem, errors_page
 from stage_service.config import RigFile
 from stage_service.jobs.records import Job, PipelineRequest

@@ -3,9 +3,104 @@
 from __future__ import annotations
 
 import asyncio
+import resource
 import socket
+import threading
+from collections.abc import Callable, Iterator
 
-from stage_service.api.app import listening
+import pytest
+import uvicorn
+from waiting import until
+
+from stage_service.api import connections
+from stage_service.api.connections import Connection, limits, listening, protocol
+
+REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+HALF = b"GET / HTTP/1.1\r\nHost: x\r\nX: "
+
+
+@pytest.fixture
+def connect(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], socket.socket]]:
+    """`connect(data)`: a connection to a server with three places, over which `data` was sent."""
+    monkeypatch.setattr(Connection, "most", 3)
+
+    async def app(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        while scope["path"] == "/stay" and (await receive())["type"] != "http.disconnect":
+            pass
+        await send({"type": "http.response.body", "body": b"hello"})
+
+    options = {**limits(), "http": Connection}
+    server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="off", **options))
+    listener = listening()
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    until(lambda: server.started)
+    opened = []
+
+    def connect(data: bytes) -> socket.socket:
+        one = socket.create_connection(listener.getsockname(), timeout=60)
+        opened.append(one)
+        one.sendall(data)
+        return one
+
+    yield connect
+    for one in opened:
+        one.close()
+    server.should_exit = True
+    thread.join(30)
+    listener.close()
+
+
+def ended(connection: socket.socket) -> bool:
+    """Waits until the server has ended it; what it said before that is read."""
+    try:
+        while connection.recv(4096):
+            pass
+    except ConnectionResetError:
+        pass
+    return True
+
+
+def test_whoever_holds_connections_open_keeps_nobody_out(connect):
+    held = [connect(HALF) for _ in range(9)]
+    assert connect(REQUEST).recv(12) == b"HTTP/1.1 200"
+    assert all(ended(one) for one in held[:6])
+
+
+def test_a_request_under_way_keeps_its_place(connect):
+    streams = [connect(REQUEST.replace(b"/ ", b"/stay ")) for _ in range(3)]
+    assert [one.recv(12) for one in streams] == 3 * [b"HTTP/1.1 200"]
+    assert connect(REQUEST).recv(12) == b"HTTP/1.1 503"
+    streams[0].close()
+    until(lambda: connect(REQUEST).recv(12) == b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize("data", [b"", b"G", HALF, REQUEST + HALF])
+def test_headers_have_a_deadline(connect, data, monkeypatch):
+    monkeypatch.setattr(connections, "HEADER_S", 0.05)
+    assert ended(connect(data))
+
+
+def test_headers_have_a_size(connect):
+    assert connect(HALF + (17 << 10) * b"a").recv(12) == b"HTTP/1.1 400"
+
+
+def test_connections_leave_descriptors_for_a_capture(monkeypatch):
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (100, 4096))
+    assert protocol().most == 50
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 20, 1 << 20))
+    assert protocol().most == connections.MOST_CONNECTIONS < 1024  # what `select` knows
+
+
+def test_a_unix_socket_is_for_user_and_group(tmp_path):
+    path = tmp_path / "s"
+    with listening(unix=path) as listener:
+        assert path.stat().st_mode & 0o777 == 0o660
+        listener.listen()
+        with pytest.raises(OSError, match="another service"):
+            listening(unix=path)
+    listening(unix=path).close()  # the one before has died
 
 
 def test_answers_leave_at_once():
@@ -19,7 +114,7 @@ def test_answers_leave_at_once():
             found.set_result(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
             writer.close()
 
-        async with await asyncio.start_server(take, sock=listening(0)) as server:
+        async with await asyncio.start_server(take, sock=listening()) as server:
             _, client = await asyncio.open_connection(*server.sockets[0].getsockname())
             delay_off = await found
             client.close()

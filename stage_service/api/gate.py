@@ -1,0 +1,124 @@
+"""What a request passes before a route sees it: whom it is for, who sent it, how large it is.
+
+All of it on the event loop, so that a blackout waits for no thread here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from typing import Any
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from stage_service.api.problems import PAGE, problem_response
+from stage_service.records.tokens import SCOPES, Identity, Tokens
+
+OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
+OPEN = {PAGE, "/docs", "/openapi.json"}
+"""Says nothing of a stage: how to ask, for whoever may not yet."""
+ANYBODY = Identity(name="", scopes=SCOPES)
+MOST_BODY = 1 << 20
+BODY_S = 20.0
+"""A request's body is there within this time."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who gets in: by host names that are this service's, and by `tokens`; None: everybody."""
+
+    tokens: Tokens | None = None
+    names: frozenset[str] = OWN_NAMES
+
+    def refusal(self, headers: Headers) -> tuple[str, str, int | None] | None:
+        """Why a browser may have been made to send this, as a problem's kind, detail, status.
+
+        The listener takes connections from this machine alone, as a rule; but a web page from
+        elsewhere, open in a browser here, can post to it, or point its own host name at it.
+        """
+        host = headers.get("host", "")
+        if _name(host) not in self.names:
+            return "http", f"host {host!r} is not a name of this service", 421
+        origin = headers.get("origin")
+        if origin is not None and origin.partition("://")[2] != host:
+            return "foreign-origin", f"a page of {origin!r} may not ask this service", None
+        return None
+
+    def identity(self, headers: Headers) -> Identity | None:
+        """Who asks."""
+        if self.tokens is None:
+            return ANYBODY
+        kind, _, token = headers.get("authorization", "").partition(" ")
+        return self.tokens.find(token.strip()) if kind.lower() == "bearer" else None
+
+
+class Gate:
+    """Passes on what `access` lets in, with its body read; the caller is `identity` in the scope's
+    state. All else is answered with a problem document."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app, self._access = app, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        refusal = self._access.refusal(headers)
+        if refusal is None:
+            identity = self._access.identity(headers)
+            scope.setdefault("state", {})["identity"] = identity
+            if identity is None and scope["path"] not in OPEN:
+                detail = "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown"
+                refusal = "unauthorized", detail, None
+        if refusal is None:
+            try:
+                async with asyncio.timeout(BODY_S):
+                    body = await _body(headers, receive)
+            except TimeoutError:
+                refusal = "http", f"the request was not there within {BODY_S:g} s", 408
+            except OverflowError:
+                refusal = "too-large", f"a request has at most {MOST_BODY:,} bytes", None
+            else:
+                await self._app(scope, _again(body, receive), send)
+                return
+        slug, detail, status = refusal
+        response = problem_response(scope["path"], slug, detail, status=status)
+        response.headers["connection"] = "close"  # what it still sends is not read
+        if slug == "unauthorized":
+            response.headers["www-authenticate"] = "Bearer"
+        await response(scope, receive, send)
+
+
+async def _body(headers: Headers, receive: Receive) -> Message:
+    """The whole body as one message. Raises `OverflowError`; a client that has gone is one, too."""
+    length = headers.get("content-length", "")
+    if length.isdigit() and int(length) > MOST_BODY:
+        raise OverflowError
+    body = bytearray()
+    while True:
+        message = await receive()
+        if message["type"] != "http.request":
+            return message
+        body += message.get("body", b"")
+        if len(body) > MOST_BODY:
+            raise OverflowError
+        if not message.get("more_body", False):
+            return {"type": "http.request", "body": bytes(body), "more_body": False}
+
+
+def _again(message: Message, receive: Receive) -> Receive:
+    """Gives the message that was read already, then what comes."""
+    waiting: list[Any] = [message]
+
+    async def next_message() -> Message:
+        return waiting.pop() if waiting else await receive()
+
+    return next_message
+
+
+def _name(host: str) -> str:
+    name, _, port = host.rpartition(":")
+    return name if port.isdigit() else host

@@ -1,0 +1,139 @@
+"""Who may do what: tokens, of which a file holds the hashes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import threading
+from pathlib import Path
+from typing import Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from reconstruction.capture.writer import utc_now
+from reconstruction.containment import is_file_name, plain_file
+from reconstruction.files.durable import writing
+
+Scope = Literal["read", "steer", "arm", "jobs", "admin"]
+SCOPES: tuple[Scope, ...] = get_args(Scope)
+"""See what there is; shoot; answer for flashes and for dark lamps; process; end others' leases."""
+
+
+class TokenError(ValueError):
+    """A token that cannot be made or revoked, or a file of tokens that cannot be read."""
+
+
+class Identity(BaseModel):
+    """Whose token it is, and what it opens."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    scopes: tuple[Scope, ...]
+
+
+class Entry(Identity):
+    """A line of the file: `sha256` is the token's, in hexadecimal. It was made at `made` (UTC)."""
+
+    sha256: str
+    made: str
+
+
+class Tokens:
+    """The tokens in `path`; what another process changes there counts at once.
+
+    `own` is one more, with every scope, that stands in no file of the service: that of the user who
+    runs it. A file that is there and cannot be read opens nothing.
+    """
+
+    def __init__(self, path: Path, own: str | None = None) -> None:
+        self._path = path
+        self._own = None if own is None else _hash(own)
+        self._lock = threading.Lock()
+        self._read: tuple[tuple[int, int, int] | None, dict[str, Identity]] = (None, {})
+
+    def find(self, token: str) -> Identity | None:
+        """Whose token this is."""
+        hashed = _hash(token)
+        if hashed == self._own:
+            return Identity(name="owner", scopes=SCOPES)
+        return self._known().get(hashed)
+
+    def entries(self) -> list[Entry]:
+        """All of the file, the oldest first. Raises `TokenError`."""
+        try:
+            lines = json.loads(plain_file(self._path).read_text()) if self._path.exists() else []
+            return [Entry.model_validate(line) for line in lines]
+        except (OSError, ValueError, TypeError, ValidationError) as error:
+            raise TokenError(f"{self._path}: {error}") from error
+
+    def make(self, name: str, scopes: tuple[Scope, ...]) -> str:
+        """A new token, which is told only now. Raises `TokenError` where there is one of the name.
+
+        Of 256 random bits a plain hash tells nothing.
+        """
+        with self._lock:
+            entries = self.entries()
+            if not is_file_name(name) or name in [e.name for e in entries]:
+                raise TokenError(f"{name!r}: not a name, or there is a token of that name already")
+            token = secrets.token_urlsafe(32)
+            new = Entry(name=name, scopes=scopes, sha256=_hash(token), made=utc_now())
+            self._write([*entries, new])
+            return token
+
+    def revoke(self, name: str) -> None:
+        """End a token. Raises `TokenError` where there is none of that name."""
+        with self._lock:
+            entries = self.entries()
+            kept = [e for e in entries if e.name != name]
+            if len(kept) == len(entries):
+                raise TokenError(f"there is no token {name!r}; there are {[e.name for e in kept]}")
+            self._write(kept)
+
+    def _known(self) -> dict[str, Identity]:
+        try:
+            found = self._path.stat()
+        except OSError:
+            return {}
+        version = (found.st_ino, found.st_mtime_ns, found.st_size)
+        if self._read[0] != version:
+            try:
+                entries = {e.sha256: Identity(name=e.name, scopes=e.scopes) for e in self.entries()}
+            except TokenError:
+                entries = {}
+            self._read = (version, entries)
+        return self._read[1]
+
+    def _write(self, entries: list[Entry]) -> None:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        write_secret(self._path, json.dumps([e.model_dump() for e in entries], indent=1) + "\n")
+
+
+def own_file() -> Path:
+    """Where this user's own token lies, which the commands send to a service on this machine."""
+    if named := os.environ.get("HAIRSTAGE_TOKEN_FILE"):
+        return Path(named)
+    home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(home) / "hairstage" / "token"
+
+
+def own_token() -> str:
+    """This user's own token; made where there is none. Raises `OSError`."""
+    file = own_file()
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_secret(file, secrets.token_urlsafe(32) + "\n")
+    return plain_file(file, most=1000).read_text().strip()
+
+
+def write_secret(path: Path, text: str) -> None:
+    """Write a small file that its user alone may read."""
+    with writing(path) as temporary:
+        temporary.touch(0o600)
+        temporary.write_text(text)
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()

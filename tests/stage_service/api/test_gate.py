@@ -1,0 +1,206 @@
+"""Who gets in, from where, with what, and what the audit has of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from stage_service.api import gate
+from stage_service.api.app import create_app
+from stage_service.api.gate import Access
+from stage_service.cli import main
+from stage_service.config import RigFile
+from stage_service.records.tokens import SCOPES, TokenError, Tokens
+from stage_service.service import Service
+
+URL = "http://127.0.0.1"
+SEE = (
+    "GET /captures",
+    "GET /jobs",
+    "GET /lease",
+    "GET /audit",
+    "GET /events",
+    "POST /plans:validate",
+)
+NEEDS = {
+    "POST /captures": "steer",
+    "POST /captures/x/pause": "steer",
+    "POST /captures/x/resume": "steer",
+    "POST /lease": "steer",
+    "PATCH /lease": "steer",
+    "DELETE /lease": "steer",
+    "DELETE /lease?force=true": "admin",
+    "POST /devices/acknowledge": "arm",
+    "POST /jobs": "jobs",
+    "DELETE /jobs/x": "jobs",
+}
+
+
+def send(app: FastAPI, what: str, headers: dict[str, str], **more: Any) -> httpx.Response:
+    """The answer to a request like "GET /captures"; of a service that has not started."""
+    method, path = what.split(" ")
+
+    async def answer() -> httpx.Response:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=URL) as http:
+            return await http.request(method, path, headers=headers, **more)
+
+    return asyncio.run(answer())
+
+
+@pytest.fixture
+def service(rig_file: RigFile, tmp_path: Path) -> Iterator[Service]:
+    service = Service(rig_file, tmp_path / "root")
+    yield service
+    service.close()
+
+
+@pytest.fixture
+def tokens(tmp_path: Path) -> Tokens:
+    return Tokens(tmp_path / "root" / "tokens.json", own="mine")
+
+
+@pytest.fixture
+def ask(service: Service, tokens: Tokens) -> Callable[..., httpx.Response]:
+    """`ask("GET /captures", token, …)`"""
+    app = create_app(service, Access(tokens))
+
+    def ask(what: str, token: str | None = None, **more: Any) -> httpx.Response:
+        return send(
+            app, what, {} if token is None else {"Authorization": f"Bearer {token}"}, **more
+        )
+
+    return ask
+
+
+def refused(response: httpx.Response, slug: str, status: int) -> dict[str, Any]:
+    data: dict[str, Any] = response.json()
+    assert (data["type"], response.status_code) == (f"/docs/errors.md#{slug}", status), data
+    return data
+
+
+def test_every_route_asks_for_a_token(ask, service):
+    document = ask("GET /openapi.json").json()
+    assert ask("GET /docs").status_code == ask("GET /docs/errors.md").status_code == 200
+    routes = [(m, path, op) for path, ops in document["paths"].items() for m, op in ops.items()]
+    assert len(routes) > 20
+    for method, path, operation in routes:
+        assert operation["security"], path
+        for token in (None, "guessed", ""):
+            refused(ask(f"{method.upper()} {path}", token), "unauthorized", 401)
+    assert ask("GET /captures").headers["www-authenticate"] == "Bearer"
+    assert service.audit(10) == []
+
+
+@pytest.mark.parametrize("scope", SCOPES)
+def test_a_token_opens_what_its_scope_says(ask, tokens, scope):
+    token = tokens.make("x", (scope,))
+    for what in (w for w in SEE if w != "GET /events"):
+        if scope == "read":
+            assert ask(what, token, json={}).status_code == 200
+        else:
+            assert refused(ask(what, token, json={}), "forbidden", 403)["scope"] == "read"
+    for what, needed in NEEDS.items():
+        status = ask(what, token, json={}).status_code
+        assert (status == 403) == (scope != needed), (what, status)
+    refused(ask("POST /captures/x/abort", token), "unknown-capture", 404)
+    assert ask("POST /devices/blackout", token).json()["state"] == "dark"
+
+
+def test_arming_and_pipelines_need_scopes_of_their_own(ask, tokens):
+    token = tokens.make("x", ("read", "steer"))
+    armed = {"armed_by": "Ada", "plan": {"lights": ["nope"]}}
+    assert refused(ask("POST /captures", token, json=armed), "forbidden", 403)["scope"] == "arm"
+    then = {"pipeline": {"name": "light_planes"}}
+    assert refused(ask("POST /captures", token, json=then), "forbidden", 403)["scope"] == "jobs"
+    again = ask("POST /captures/x/resume", token, json={"armed_by": "Ada"})
+    assert refused(again, "forbidden", 403)["scope"] == "arm"
+
+
+def test_the_audit_has_whose_token_it_was(ask, tokens):
+    everything, other = tokens.make("ada", SCOPES), tokens.make("bob", ("steer",))
+    assert ask("POST /lease", other, json={"holder": "Bob", "seconds": 60}).status_code == 201
+    refused(ask("DELETE /lease", everything), "no-lease", 409)
+    assert ask("DELETE /lease?force=true", everything).json()["holder"] is None
+    refused(ask("DELETE /jobs/x", everything), "unknown-job", 404)
+    job = {"capture": "x", "pipeline": {"name": "fit"}}
+    refused(ask("POST /jobs", everything, json=job), "unknown-capture", 404)
+    ask("POST /devices/blackout", other)
+    found = [
+        (a["who"].split(" ")[0], a["action"], a["result"])
+        for a in ask("GET /audit", everything).json()
+    ]
+    assert found == [
+        ("bob", "lease.take", "ok"),
+        ("ada", "lease.release", "refused"),
+        ("ada", "lease.end", "ok"),
+        ("ada", "job.cancel", "refused"),
+        ("ada", "job.submit", "refused"),
+        ("bob", "blackout", "dark"),
+    ]
+
+
+def test_a_token_that_is_revoked_opens_nothing_any_more(ask, tmp_path, capsys):
+    root = ["--root", str(tmp_path / "root")]
+    assert main(["token", "make", "ada", "--scopes", "read", *root]) == 0
+    token = capsys.readouterr().out.strip()
+    assert ask("GET /lease", token).status_code == 200
+    file = tmp_path / "root" / "tokens.json"
+    assert token not in file.read_text()
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert main(["token", "list", "--json", *root]) == 0
+    listed = json.loads(capsys.readouterr().out)["tokens"]
+    assert [(e["name"], e["scopes"], "sha256" in e) for e in listed] == [("ada", ["read"], False)]
+    assert main(["token", "make", "ada", *root]) == 3
+    assert main(["token", "make", "bob", "--scopes", "read,everything", *root]) == 3
+    assert main(["token", "revoke", "ada", *root]) == 0
+    refused(ask("GET /lease", token), "unauthorized", 401)
+    assert main(["token", "revoke", "ada", *root]) == 3
+    actions = [(a["action"], a["subject"]) for a in ask("GET /audit", "mine").json()]
+    assert actions == [("token.make", "ada"), ("token.revoke", "ada")]
+
+
+def test_a_damaged_file_of_tokens_opens_nothing(ask, tokens, tmp_path):
+    token = tokens.make("ada", SCOPES)
+    for text in ("", "[", '[{"name": "ada"}]', '{"a": 1}', "[1]"):
+        (tmp_path / "root" / "tokens.json").write_text(text)
+        refused(ask("GET /lease", token), "unauthorized", 401)
+        with pytest.raises(TokenError, match=r"tokens\.json"):
+            tokens.make("bob", ())
+    assert ask("GET /lease", "mine").status_code == 200  # of whoever runs the service
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "x"])
+def test_a_page_of_another_site_asks_in_vain(service, origin):
+    """Also where no token is asked for: a browser sends the request, whoever made the page."""
+    app = create_app(service)
+    headers = {"Origin": origin, "Content-Type": "text/plain"}
+    for what in ("/captures/x/resume", "/devices/blackout", "/captures"):
+        refused(send(app, f"POST {what}", headers), "foreign-origin", 403)
+    assert send(app, "POST /devices/blackout", {"Origin": URL}).status_code == 200
+    for host in ("evil.example", "127.0.0.1.evil.example", ""):
+        refused(send(app, "GET /lease", {"Host": host}), "http", 421)
+    assert [a.action for a in service.audit(10)] == ["blackout"]
+
+
+def test_a_request_is_no_larger_than_it_need_be(ask, tokens):
+    token = tokens.make("ada", SCOPES)
+
+    async def long() -> AsyncIterator[bytes]:
+        for _ in range(gate.MOST_BODY // 1000 + 1):
+            yield b"a" * 1000
+
+    for content in (long(), b"a" * (gate.MOST_BODY + 1)):
+        refused(ask("POST /captures", token, content=content), "too-large", 413)
+    names = [f"x{i}" for i in range(4097)]
+    for plan in ({"lights": names}, {"projectors": names}, {"lights": ["x" * 101]}):
+        refused(ask("POST /plans:validate", token, json=plan), "invalid-request", 422)
+    plan = {"lights": [*names[1:4000], "x1"]}
+    told = refused(ask("POST /plans:validate", token, json=plan), "invalid-plan", 422)["problems"]
+    assert (len(told), told[-1]) == (21, "lights: 3981 more such names")
