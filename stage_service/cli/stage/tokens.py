@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stage_service.cli.support.commands import (
     PRIVATE,
@@ -14,7 +15,9 @@ from stage_service.cli.support.commands import (
     add_command,
     add_group,
 )
-from stage_service.records.tokens import SCOPES, Tokens, own_token
+
+if TYPE_CHECKING:
+    from stage_service.records.tokens import Tokens
 
 TOKENS = "tokens.json"
 
@@ -24,7 +27,9 @@ def add(commands: Commands) -> None:
     token = add_group(commands, "token", "make, list and revoke the tokens of a service")
     make = add_command(token, "make", run_make)
     make.add_argument("name", help="whose it is, as the audit will have it")
-    make.add_argument("--scopes", default="read", help=f"of {', '.join(SCOPES)}, by commas; or all")
+    make.add_argument(
+        "--scopes", default="read", help="of read, steer, arm, jobs, admin, by commas; or all"
+    )
     listed = add_command(token, "list", run_list)
     revoke = add_command(token, "revoke", run_revoke)
     revoke.add_argument("name")
@@ -40,27 +45,28 @@ def run_make(args: argparse.Namespace, output: Output) -> None:
     the lease. arm: answer for flashes and acknowledge dark lamps. jobs: submit and cancel. admin:
     end somebody else's lease. Abort and blackout need none of them.
     """
-    scopes = (
-        SCOPES if args.scopes == "all" else tuple(s for s in SCOPES if s in args.scopes.split(","))
-    )
-    if unknown := set(args.scopes.split(",")) - {*SCOPES, "all"}:
+    from stage_service.records.tokens import SCOPES
+
+    asked = set(SCOPES) if args.scopes == "all" else set(args.scopes.split(","))
+    scopes = tuple(s for s in SCOPES if s in asked)
+    if unknown := asked - set(SCOPES):
         raise BadArgument(f"--scopes: there is no {sorted(unknown)}; there are {', '.join(SCOPES)}")
     os.umask(PRIVATE)
-    token = Tokens(args.root / TOKENS).make(args.name, scopes)
+    token = _tokens(args).make(args.name, scopes)
     _record(args, "token.make", ", ".join(scopes))
     output.result({"name": args.name, "scopes": scopes, "token": token}, token)
 
 
 def run_list(args: argparse.Namespace, output: Output) -> None:
     """List the tokens: names, scopes, when they were made."""
-    entries = [e.model_dump(exclude={"sha256"}) for e in Tokens(args.root / TOKENS).entries()]
+    entries = [e.model_dump(exclude={"sha256"}) for e in _tokens(args).entries()]
     lines = [f"{e['name']}  {', '.join(e['scopes'])}  {e['made']}" for e in entries]
     output.result({"tokens": entries}, "\n".join(lines) or "no tokens")
 
 
 def run_revoke(args: argparse.Namespace, output: Output) -> None:
     """End a token; a running service knows at once."""
-    Tokens(args.root / TOKENS).revoke(args.name)
+    _tokens(args).revoke(args.name)
     _record(args, "token.revoke", "")
     output.result({"revoked": args.name}, f"{args.name} has no token any more")
 
@@ -72,8 +78,16 @@ def run_show(_args: argparse.Namespace, output: Output) -> None:
     by themselves; so it is for curl. It lies in $HAIRSTAGE_TOKEN_FILE, else in
     ~/.config/hairstage/token; remove that file and restart the service to have another.
     """
+    from stage_service.records.tokens import own_token
+
     token = own_token()
     output.result({"token": token}, token)
+
+
+def _tokens(args: argparse.Namespace) -> Tokens:
+    from stage_service.records.tokens import Tokens
+
+    return Tokens(args.root / TOKENS)
 
 
 def _record(args: argparse.Namespace, action: str, detail: str) -> None:
