@@ -19,7 +19,8 @@ from fastapi.responses import PlainTextResponse
 from stage_service.api import event_stream, routes, steering
 from stage_service.api.connections import LOOPBACK, limits, listening
 from stage_service.api.gate import OWN_NAMES, Access, Gate
-from stage_service.api.problems import PAGE, Problem, errors_page, install_problems
+from stage_service.api.lanes import Lanes
+from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
 from stage_service.service import Service
 
 
@@ -49,7 +50,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
             }
         },
     )
-    app.state.service = service
+    app.state.service, app.state.lanes = service, Lanes()
     install_problems(app)
     for part in (routes, steering, event_stream):
         app.include_router(part.reading)
@@ -60,6 +61,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     def errors() -> PlainTextResponse:
         return PlainTextResponse(errors_page(), media_type="text/markdown")
 
+    app.add_middleware(Faults)
     app.add_middleware(Gate, access=access or Access())
     return app
 

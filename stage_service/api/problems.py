@@ -16,6 +16,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from reconstruction import CaptureError, MissingFrame
 from reconstruction.capture.writer import JournalInUse
@@ -210,8 +211,37 @@ def errors_page() -> str:
     return "\n".join(parts) + "\n"
 
 
+class Faults:
+    """Answers a fault of the service with a problem document, and keeps the connection.
+
+    The framework's own handler answers and then raises again, upon which the server closes the
+    connection under the client's next request.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on; raises only where half an answer has gone out already."""
+        begun = False
+
+        async def sending(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self._app(scope, receive, sending)
+        except Exception as error:
+            if begun or scope["type"] != "http":
+                raise
+            log.error("%s %s failed", scope["method"], scope["path"], exc_info=error)
+            text = f"{type(error).__name__}: {error}"
+            await problem_response(scope["path"], "internal", text)(scope, receive, send)
+
+
 def install_problems(app: FastAPI) -> None:
-    """Make every error of `app` a problem document."""
+    """Make every error of `app` that is known a problem document; `Faults` does for the others."""
 
     async def known(request: Request, error: Exception) -> Response:
         slug = next(s for e, s in BY_ERROR.items() if isinstance(error, e))

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Response, status
 from fastapi.responses import FileResponse
 
 from stage_service.api.frames import png_preview
+from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
 from stage_service.jobs.records import Job
 from stage_service.plan.capture_plan import CapturePlan
@@ -70,9 +71,11 @@ def resume_capture(
 
 
 @router.post("/captures/{capture}/abort", tags=["captures"])
-def abort_capture(capture: str, service: OnService, by: Anybody) -> CaptureView:
+async def abort_capture(
+    capture: str, service: OnService, lanes: OnLanes, by: Anybody
+) -> CaptureView:
     """Abort at the next step boundary, lights off; finished frames stay."""
-    return service.abort(capture, by)
+    return await lanes.dark(service.abort, capture, by)
 
 
 @reading.get(
@@ -106,52 +109,60 @@ def get_preview(
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
-def submit_job(body: JobRequest, service: OnService, by: Processes, response: Response) -> Job:
+async def submit_job(
+    body: JobRequest, service: OnService, lanes: OnLanes, by: Processes, response: Response
+) -> Job:
     """Enqueue a pipeline on a finished capture."""
-    job = service.submit(body, by)
+    job = await lanes.jobs(service.submit, body, by)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job
 
 
 @reading.get("/jobs", tags=["jobs"])
-def list_jobs(service: OnService, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> list[Job]:
+async def list_jobs(
+    service: OnService,
+    lanes: OnLanes,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 200,
+    offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones left out")] = 0,
+) -> list[Job]:
     """The latest jobs, newest first."""
-    return service.jobs(limit)
+    return await lanes.jobs(service.jobs, limit, offset)
 
 
 @reading.get("/jobs/{job}", tags=["jobs"])
-def get_job(job: str, service: OnService) -> Job:
+async def get_job(job: str, service: OnService, lanes: OnLanes) -> Job:
     """A job's state, progress, and outcome."""
-    return service.job(job)
+    return await lanes.jobs(service.job, job)
 
 
 @router.delete("/jobs/{job}", tags=["jobs"])
-def cancel_job(job: str, service: OnService, by: Processes) -> Job:
+async def cancel_job(job: str, service: OnService, lanes: OnLanes, by: Processes) -> Job:
     """Cancel a job: a queued one at once, a running one at its next progress call."""
-    return service.cancel_job(job, by)
+    return await lanes.jobs(service.cancel_job, job, by)
 
 
 @reading.get("/jobs/{job}/report", response_class=FileResponse, tags=["jobs"])
-def get_report(job: str, service: OnService) -> Response:
+async def get_report(job: str, service: OnService, lanes: OnLanes) -> Response:
     """The report that the job's stages filled: seconds, error against time, left out, warnings."""
-    return FileResponse(service.artifact(job, "report.json"), media_type="application/json")
+    file = await lanes.jobs(service.artifact, job, "report.json")
+    return FileResponse(file, media_type="application/json")
 
 
 @reading.get("/jobs/{job}/artifacts", tags=["jobs"])
-def list_artifacts(job: str, service: OnService) -> list[Artifact]:
+async def list_artifacts(job: str, service: OnService, lanes: OnLanes) -> list[Artifact]:
     """The files in the job's model folder."""
-    return service.artifacts(job)
+    return await lanes.jobs(service.artifacts, job)
 
 
 @reading.get("/jobs/{job}/artifacts/{path:path}", response_class=FileResponse, tags=["jobs"])
-def get_artifact(job: str, path: str, service: OnService) -> Response:
+async def get_artifact(job: str, path: str, service: OnService, lanes: OnLanes) -> Response:
     """One file of the model folder."""
-    file = service.artifact(job, path)
+    file = await lanes.jobs(service.artifact, job, path)
     kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
     return FileResponse(file, media_type=kind)
 
 
 @reading.get("/health", tags=["service"])
-def health(service: OnService) -> Health:
-    """Whether the service and its worker run; asks no device."""
-    return service.health()
+async def health(service: OnService, lanes: OnLanes) -> Health:
+    """How service, lamps and jobs are, as far as is known; asks no device and no database."""
+    return await lanes.health(service.health)

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Security, status
 from fastapi.security import HTTPBearer, SecurityScopes
 
 from stage_service.acquisition.control import Caller
+from stage_service.api.lanes import OnLanes
 from stage_service.records.audit import Action
 from stage_service.records.tokens import SCOPES
 from stage_service.service import Service
@@ -20,7 +21,7 @@ from stage_service.service_models import (
 )
 
 
-def on_service(request: Request) -> Service:
+async def on_service(request: Request) -> Service:
     """The service of this application."""
     service: Service = request.app.state.service
     return service
@@ -93,15 +94,16 @@ def get_audit(
 
 
 @reading.get("/devices", tags=["devices"])
-def get_devices(service: OnService) -> dict[str, Any]:
-    """Each device and whether it answers; under `safety`, whether the lamps are known to be off."""
-    return service.devices()
+async def get_devices(service: OnService, lanes: OnLanes) -> dict[str, Any]:
+    """Each device and whether it answered when it was last seen, `age_s` seconds ago; under
+    `safety`, whether the lamps are known to be off."""
+    return await lanes.devices(service.devices)
 
 
 @router.post("/devices/blackout", tags=["devices"])
-def blackout(service: OnService, by: Anybody) -> dict[str, Any]:
+async def blackout(service: OnService, lanes: OnLanes, by: Anybody) -> dict[str, Any]:
     """All lamps and projectors off, verified. Aborts a running capture."""
-    return service.blackout(by)
+    return await lanes.dark(service.blackout, by)
 
 
 @router.post("/devices/acknowledge", tags=["devices"])
