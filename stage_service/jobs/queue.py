@@ -86,11 +86,12 @@ class JobQueue:
             pass
 
     def close(self) -> None:
-        """Let go of the database."""
-        with self._lock:
+        """Let go of the database; one that is still being connected to is left to the process."""
+        if self._lock.acquire(timeout=1.0):
             client, self._client = self._client, None
-        if client is not None:
-            client.destroy()
+            self._lock.release()
+            if client is not None:
+                client.destroy()
 
     def submit(self, request: PipelineRequest, capture: Path, model: Model, *, job: str) -> Job:
         """Put a job on the queue; where there is a job of this id already, return that one."""

@@ -46,6 +46,7 @@ class World:
         self.busy: dict[str, int] = {}  # camera: answers `busy` this often
         self.dead_lamps = False  # lamps cannot be lit
         self.stuck_lamps = False  # lamps cannot be put off
+        self.deaf_lights = False  # the light bank takes requests and answers none
         self.late: list[str] = []  # serial requests answered together with the next one
         self.garbage = b""  # sent before the next serial reply
 
@@ -81,6 +82,8 @@ class Lights(socketserver.BaseRequestHandler):
         while header := self.request.recv(7, 0x100):  # MSG_WAITALL
             tid, _, length, unit = struct.unpack(">HHHB", header)
             pdu = self.request.recv(length - 1, 0x100)
+            if world.deaf_lights:
+                continue
             with world.lock:
                 answer = self.answer(world, pdu)
             self.request.sendall(struct.pack(">HHHB", tid, 0, len(answer) + 1, unit) + answer)

@@ -1,0 +1,266 @@
+"""Whatever the service is busy with: lights can be put off, and it starts again."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from waiting import until
+
+from reconstruction import CaptureWriter
+from stage_service.acquisition import captures as manager_module
+from stage_service.api.app import create_app
+from stage_service.config import RigFile
+from stage_service.service import Service
+
+THREADS = 45
+"""More than the 40 that the framework has for all routes that do not say otherwise."""
+LONG = {"plan": {"projectors": []}}
+
+
+class Client(httpx.Client):
+    """Asks the application, which runs on a socket of its own; `service` is behind it."""
+
+    service: Service
+
+    def flood(self, *request: Any, count: int = THREADS, **more: Any) -> None:
+        """Send a request so many times at once, and wait for no answer."""
+
+        def ask() -> None:
+            own = httpx.Client(base_url=self.base_url, timeout=120, trust_env=False)
+            with own, suppress(httpx.HTTPError):
+                own.request(*request, **more)
+
+        for _ in range(count):
+            threading.Thread(target=ask, daemon=True).start()
+
+
+@contextmanager
+def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
+    service = Service(rig_file, root)
+    config = uvicorn.Config(
+        create_app(service), log_level="critical", ws="none", timeout_graceful_shutdown=1
+    )
+    server = uvicorn.Server(config)
+    listener = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    try:
+        with Client(base_url=url, timeout=60, trust_env=False) as client:
+            client.service = service
+            client.get("/health")
+            yield client
+    finally:
+        server.should_exit = True
+        thread.join(60)
+        listener.close()
+
+
+@contextmanager
+def stuck(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Iterator[Callable[[], int]]:
+    """Whoever calls this waits until the end of the block; how many do."""
+    free, waiting = threading.Event(), []
+    real = getattr(owner, name)
+
+    def instead(*args: Any, **more: Any) -> Any:
+        if not free.is_set():
+            waiting.append(1)
+            free.wait()
+        return real(*args, **more)
+
+    monkeypatch.setattr(owner, name, instead)
+    try:
+        yield lambda: len(waiting)
+    finally:
+        free.set()
+
+
+def begun(http: Client, world: Any) -> str:
+    """The id of a capture that has lit its first lamps."""
+    capture: str = http.post("/captures", json=LONG).json()["id"]
+    until(lambda: world.pulses > 3)
+    return capture
+
+
+def assert_it_can_be_darkened(http: Client, world: Any, capture: str | None) -> None:
+    """Health, abort and blackout are answered, and the blackout says the truth."""
+    assert http.get("/health").status_code == 200
+    if capture is not None:
+        assert http.post(f"/captures/{capture}/abort").status_code in (200, 409)
+    answer = http.post("/devices/blackout").json()
+    assert (answer["state"], world.lit, world.show) == ("dark", set(), "OFF")
+
+
+def test_while_every_thread_of_the_framework_waits(rig_file, world, tmp_path, monkeypatch):
+    with (
+        serving(rig_file, tmp_path) as http,
+        stuck(monkeypatch, http.service, "validate") as waiting,
+    ):
+        capture = begun(http, world)
+        http.flood("POST", "/plans:validate", json={})
+        until(lambda: waiting() == 40)
+        assert_it_can_be_darkened(http, world, capture)
+
+
+def test_while_the_job_database_never_answers(rig_file, world, tmp_path, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        url = f"postgresql://nobody@127.0.0.1:{deaf.getsockname()[1]}/x?connect_timeout=600"
+        monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", url)
+        monkeypatch.setattr("stage_service.api.lanes.DATABASE_S", 1.0)
+        with serving(rig_file, tmp_path) as http:
+            capture = begun(http, world)
+            http.flood("GET", "/jobs")
+            problem = http.get("/jobs").json()
+            assert problem["type"] == "/docs/errors.md#jobs-unavailable"
+            assert_it_can_be_darkened(http, world, capture)
+            until(lambda: http.get(f"/captures/{capture}").json()["state"] == "done")
+            assert [c["id"] for c in http.get("/captures").json()] == [capture]
+        deaf.close()
+
+
+def test_while_cameras_hang_and_everybody_asks_how_the_devices_are(rig_file, world, tmp_path):
+    assert rig_file.devices is not None
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        port = deaf.getsockname()[1]
+        cameras = rig_file.devices.cameras.model_copy(update={"port": port, "timeout_s": 600.0})
+        devices = rig_file.devices.model_copy(update={"cameras": cameras})
+        with serving(replace(rig_file, devices=devices), tmp_path) as http:
+            http.flood("GET", "/devices")
+            seen = http.get("/devices").json()
+            assert seen["age_s"] is None
+            assert seen["cameras"]["cam_0"]["state"] == "not asked yet"
+            world.lit = {3}
+            assert_it_can_be_darkened(http, world, None)
+
+
+def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(rig_file, world, tmp_path):
+    with serving(rig_file, tmp_path) as http:
+        assert http.get("/devices").json()["safety"]["state"] == "dark"
+        world.show = "ON 65535"
+        with stuck_lights(world):
+            http.flood("GET", "/devices", count=5)
+            answer = http.post("/devices/blackout").json()
+            assert answer["state"] == "unknown, unsafe"
+            assert "light bank" in answer["detail"]
+            assert world.show == "OFF"
+            health = http.get("/health").json()
+            assert (health["status"], health["lamps"]) == ("unsafe", "unknown, unsafe")
+        assert_it_can_be_darkened(http, world, None)
+        assert http.get("/health").json()["status"] == "ok"
+
+
+@contextmanager
+def stuck_lights(world: Any) -> Iterator[None]:
+    """The light bank takes requests and answers none."""
+    world.deaf_lights = True
+    try:
+        yield
+    finally:
+        world.deaf_lights = False
+
+
+def test_while_the_disk_hangs(rig_file, world, tmp_path, monkeypatch):
+    """A run that cannot hand over its frames does not end, and is darkened all the same."""
+    with (
+        serving(rig_file, tmp_path) as http,
+        stuck(monkeypatch, CaptureWriter, "commit") as waiting,
+    ):
+        capture = http.post("/captures", json=LONG).json()["id"]
+        until(lambda: waiting() > 0)
+        world.lit = {5}
+        start = time.monotonic()
+        assert_it_can_be_darkened(http, world, capture)
+        assert http.get(f"/captures/{capture}").json()["state"] != "done"
+        assert http.post("/captures", json=LONG).status_code == 409
+        assert time.monotonic() - start < manager_module.STOP_WITHIN_S
+
+
+def test_a_capture_that_is_being_prepared_does_not_begin_after_a_blackout(
+    rig_file, world, tmp_path, monkeypatch
+):
+    with serving(rig_file, tmp_path) as http:
+        with stuck(monkeypatch, CaptureWriter, "create") as waiting:
+            answers = []
+            ask = threading.Thread(target=lambda: answers.append(http.post("/captures", json=LONG)))
+            ask.start()
+            until(waiting)
+            assert_it_can_be_darkened(http, world, None)
+        ask.join()
+        (answer,) = answers
+        assert answer.json()["type"] == "/docs/errors.md#busy"
+        assert world.pulses == 0
+        (listed,) = http.get("/captures").json()
+        assert (listed["outcome"], listed["frames_written"]) == ("interrupted", 0)
+
+
+def test_a_fault_is_answered_and_the_connection_kept(rig_file, world, tmp_path, monkeypatch):
+    with serving(rig_file, tmp_path) as http:
+
+        def broken() -> None:
+            raise RuntimeError("caf\udce9")
+
+        monkeypatch.setattr(http.service, "captures", broken)
+        port = http.base_url.port
+        with socket.create_connection(("127.0.0.1", port)) as line:
+            answers = line.makefile("rb")
+            for path, status in (("/captures", b"500"), ("/health", b"200")):
+                line.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+                head, length = answers.readline(), 0
+                assert status in head, (path, head)
+                while (field := answers.readline()) != b"\r\n":
+                    if field.lower().startswith(b"content-length:"):
+                        length = int(field.split(b":")[1])
+                body = json.loads(answers.read(length))
+                if status == b"500":
+                    assert body["detail"] == r"RuntimeError: caf\udce9"
+
+
+def test_it_darkens_first_and_starts_whatever_lies_in_its_folder(
+    rig_file, world, tmp_path, monkeypatch
+):
+    for name, text in {
+        "captures/poisoned/plan.json": r'{"steps": [], "request": {"environment": "\ud800"}}',
+        "captures/poisoned/rig.json": "{}",
+        "captures/deep/plan.json": "[" * 10**5,
+        "jobs.sqlite": "no database " * 1000,
+        "unsafe.json": "[1]",
+        "audit.jsonl": '{"time": "\ud800',
+        "models/m/progress.json": "",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(text.encode("utf-8", "surrogatepass"))
+    lit_at_the_first_look = []
+    real = manager_module.read_status
+
+    def look(path: Path) -> Any:
+        lit_at_the_first_look.append((set(world.lit), world.show))
+        return real(path)
+
+    monkeypatch.setattr(manager_module, "read_status", look)
+    world.lit, world.show = {1, 2}, "ON 65535"
+    with serving(rig_file, tmp_path) as http:
+        assert lit_at_the_first_look == [(set(), "OFF")] * 2
+        listed = http.get("/captures").json()
+        assert [(c["id"], c["outcome"]) for c in listed] == [
+            ("deep", "damaged"),
+            ("poisoned", "damaged"),
+        ]
+        frame = http.get("/captures/poisoned/frames/0/cam_0.exr").json()
+        assert (frame["status"], frame["type"]) == (409, "/docs/errors.md#damaged-capture")
+        until(lambda: http.get("/health").json()["problems"])
+        health = http.get("/health").json()
+        assert health["status"] == "degraded"  # the latch was cleared by the blackout at the start
+        assert "set aside" in health["problems"][0]
+        assert http.get("/jobs").json() == []
+        assert http.get("/audit").status_code == 200
