@@ -12,6 +12,7 @@ from typing import Any
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from reconstruction.reading import parse_json
 from stage_service.api.problems import PAGE, problem_response
 from stage_service.records.tokens import SCOPES, Identity, Tokens
 
@@ -82,7 +83,13 @@ class Gate:
             except OverflowError:
                 refusal = "too-large", f"a request has at most {MOST_BODY:,} bytes", None
             else:
-                await self._app(scope, _again(body, receive), send)
+                wrong = _not_json(headers, body)
+                if wrong is None:
+                    await self._app(scope, _again(body, receive), send)
+                else:
+                    told = [{"loc": "", "msg": wrong}]
+                    answer = problem_response(scope["path"], "invalid-request", wrong, errors=told)
+                    await answer(scope, receive, send)
                 return
         slug, detail, status = refusal
         response = problem_response(scope["path"], slug, detail, status=status)
@@ -107,6 +114,18 @@ async def _body(headers: Headers, receive: Receive) -> Message:
             raise OverflowError
         if not message.get("more_body", False):
             return {"type": "http.request", "body": bytes(body), "more_body": False}
+
+
+def _not_json(headers: Headers, message: Message) -> str | None:
+    """Why a body that calls itself JSON, or nothing at all, cannot be read as such."""
+    kind = headers.get("content-type", "json").partition(";")[0].strip().lower()
+    if not message.get("body") or not kind.endswith("json"):
+        return None
+    try:
+        parse_json(message["body"])
+    except ValueError as error:
+        return f"the body is not JSON: {error}"
+    return None
 
 
 def _again(message: Message, receive: Receive) -> Receive:

@@ -394,3 +394,80 @@ def test_every_route_of_the_api_is_there_and_documented(http):
 
 def test_the_page_of_errors_is_the_table():
     assert (DOCS / "errors.md").read_text() == errors_page()
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        (r'{"plan": {"consent": "\ud800 agreed, 3 May"}}', "not Unicode"),
+        (r'{"head": "/data/he\u0000ad.obj"}', "NUL"),
+        ('{"plan": {"rate_hz": NaN}}', "NaN"),
+        ('{"plan": {"rate_hz": 1e999}}', "1e999"),
+        ('{"plan": {}, "plan": {}}', "twice"),
+        ('{"plan": ' + "[" * 50 + "]" * 50 + "}", "levels"),
+        ("[" * 100_000, "levels"),
+        ('{"plan": ', "Expecting value"),
+        (b'{"plan": "\xff"}', "utf-8"),
+        ('{"plan": {"rate_hz": 5e-324}}', "greater than or equal to 0.01"),
+        ('{"plan": {"retries": -1}}', "greater than or equal to 0"),
+        ('{"plan": {"rows": {"step": 1' + "0" * 400 + "}}}", "rows"),
+    ],
+)
+def test_what_json_cannot_mean_is_refused_before_anything_is_lit(http, world, body, why):
+    refused = http.post("/captures", content=body, headers={"content-type": "application/json"})
+    (error,) = problem(refused, "invalid-request")["errors"]
+    assert why in error["msg"] or why in error["loc"]
+    assert http.get("/captures").json() == []
+    assert world.pulses == 0
+
+
+def test_paths_that_no_file_can_have_are_refused(http, world, tmp_path):
+    for path in ("/" + "n" * 300, "/".join("n" * 3000), str(tmp_path), "/dev/zero", "/dev/stdin"):
+        for field in ("head", "masks"):
+            refused = http.post("/captures", json={"plan": SHORT, field: path})
+            problem(refused, "bad-input")
+    for name in ("%00", "n" * 300, "..%2f..", "%ff", "caf%ed%a0%80"):
+        for path in (f"/captures/{name}", f"/captures/{name}/frames/0/cam_0.png"):
+            problem(http.get(path), "unknown-capture" if "%2f" not in name else "http")
+        problem(http.get(f"/jobs/{name}"), "unknown-job" if "%2f" not in name else "http")
+    assert world.pulses == 0
+
+
+def test_a_frame_that_is_gone_or_cut_is_damage_not_a_fault(http, server):
+    done = capture_done(http, {"plan": SHORT})
+    folder, frames = Path(done["path"]), f"/captures/{done['id']}/frames"
+    cut, gone = (next(folder.glob(f"frames/*{i}/cam_0.exr")) for i in (1, 2))
+    cut.write_bytes(cut.read_bytes()[:500])
+    gone.unlink()
+    problem(http.get(f"{frames}/1/cam_0.png"), "damaged-capture")
+    for suffix in ("png", "exr"):
+        assert (
+            "cam_0.exr"
+            in problem(http.get(f"{frames}/2/cam_0.{suffix}"), "damaged-capture")["detail"]
+        )
+    assert http.get(f"{frames}/3/cam_0.png").status_code == 200
+    journal = folder / "journal.jsonl"
+    lines = journal.read_text().splitlines()
+    journal.write_text("\n".join([lines[0], lines[1][:40], *lines[2:]]) + "\n")
+    assert "line 2" in problem(http.get(f"{frames}/3/cam_0.png"), "damaged-capture")["detail"]
+    asked = {"capture": done["id"], "pipeline": {"name": "reconstruct"}}
+    problem(http.post("/jobs", json=asked), "damaged-capture")
+
+
+def test_jobs_need_a_capture_that_completed_and_a_model_of_their_own(http, server, head):
+    aborted = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+    http.post(f"/captures/{aborted}/abort")
+    until(lambda: http.get(f"/captures/{aborted}").json()["state"] == "done")
+    asked = {"capture": aborted, "pipeline": {"name": "reconstruct"}}
+    assert "aborted" in problem(http.post("/jobs", json=asked), "not-finished")["detail"]
+    whole = capture_done(http, {"plan": SHORT})["id"]
+    asked = {"capture": whole, "pipeline": {"name": "reconstruct"}, "model": "shared"}
+    first = http.post("/jobs", json=asked)
+    assert first.status_code == 202
+    again = problem(http.post("/jobs", json=asked), "model-in-use")
+    assert first.json()["id"] in again["detail"]
+    assert http.post("/jobs", json={**asked, "model": "own"}).status_code == 202
+    http.delete(f"/jobs/{first.json()['id']}")
+    assert http.post("/jobs", json=asked).status_code == 202
+    pages = [http.get("/jobs", params={"limit": 2, "offset": o}).json() for o in (0, 2)]
+    assert [len(p) for p in pages] == [2, 1]
