@@ -356,9 +356,12 @@ class Service:
         masks = {}
         for camera in self.rig_file.rig.cameras:
             path = folder / f"{camera.name}.png"
-            if not path.is_file():
+            try:
+                image = cv2.imread(str(plain_file(path)), cv2.IMREAD_GRAYSCALE)
+            except FileNotFoundError:
                 continue
-            image = cv2.imread(str(plain_file(path)), cv2.IMREAD_GRAYSCALE)
+            except (OSError, ValueError) as error:
+                raise BadInput(f"masks: {error}") from error
             if image is None or image.shape != (camera.height, camera.width):
                 found = "not an image" if image is None else f"{image.shape[1]}x{image.shape[0]}"
                 raise BadInput(

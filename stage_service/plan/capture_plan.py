@@ -8,6 +8,7 @@ from pydantic import Field
 
 from stage_service.config import Exposure, Level, Names, Strict
 
+MOST_ROWS = 100_000
 Bracket = Annotated[float, Field(gt=0.0, le=1000.0)]
 
 
@@ -33,9 +34,9 @@ class KindLevels(Strict):
 class Rows(Strict):
     """Scanlines `first`, `first + step`, … up to and including `last` (None: the last row)."""
 
-    first: int = Field(default=0, ge=0)
-    last: int | None = Field(default=None, ge=0)
-    step: int = Field(default=1, ge=1)
+    first: Annotated[int, Field(ge=0, le=MOST_ROWS)] = 0
+    last: Annotated[int, Field(ge=0, le=MOST_ROWS)] | None = None
+    step: Annotated[int, Field(ge=1, le=MOST_ROWS)] = 1
 
 
 class CapturePlan(Strict):
@@ -59,7 +60,7 @@ class CapturePlan(Strict):
     stepping: Literal["auto", "software", "hardware"] = "auto"
     rate_hz: Annotated[float, Field(ge=0.01, le=1000.0)] | None = None
     consent: Annotated[str, Field(min_length=12, max_length=2000)] | None = None
-    tracking_every: Annotated[int, Field(ge=0)] | None = None
+    tracking_every: Annotated[int, Field(ge=0, le=MOST_ROWS)] | None = None
     retries: Annotated[int, Field(ge=0, le=20)] | None = None
     exposure: KindExposures = KindExposures()
     level: KindLevels = KindLevels()
