@@ -58,17 +58,15 @@ class MotionOptions:
 class MeasureOptions:
     """How tangents are measured.
 
-    The `bank` answers to pictures under `light_groups` groups of neighbouring lights, which show
-    different fibres: 1 is the sum of all OLAT frames, the number of lights is each light alone.
-    Scores of a point's directions are averaged over up to `neighbours` within `radius`. Points
-    closer than `thin` are merged first. `tolerance` is how far behind a camera's own depth a point
-    may lie and still count as seen. The scores of the reflection under single lights count
-    `reflection_weight` times those of the texture.
+    The `bank` answers to pictures under groups of neighbouring lights. Scores of a point's
+    directions are averaged over up to `neighbours` within `radius`. Points closer than `thin` are
+    merged first. `tolerance` is how far behind a camera's own depth a point may lie and still count
+    as seen. The scores of the reflection under single lights count `reflection_weight` times those
+    of the texture.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)
     texture_scale: Length = 5.0
-    light_groups: Count = 24
     radius: Length = 10e-3
     neighbours: Count = 48
     thin: Length = 2e-3
@@ -96,12 +94,10 @@ class SearchOptions:
 class LightCodeOptions:
     """Options of line stereo (the methods `photometric`, `lmvs` and, in part, `fused`).
 
-    Depths are searched at most `deepest` metres behind where a ray enters the hair's volume.
     Segments count that at least `least_views` views found alike, their own and two others.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=5.0, count=48, spread=1.0)
-    deepest: Length = 0.06
     least_views: Count = 3
     search: SearchOptions = SearchOptions()
 

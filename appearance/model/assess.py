@@ -42,6 +42,7 @@ INTERPOLATED = {
 SHOWN = {"held_out_lights": 4, "held_out_camera": 2}
 """Rows of the comparison by group."""
 MAX_DEPTH = 16
+BASELINE_PIXELS, BASELINE_LIGHTS = 100, 48  # of each camera: what mean colour and albedo come from
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +162,8 @@ class _Comparison:
 
     def _observed(self) -> list[Observed]:
         """Hair pixels of the training cameras under some of the training lights."""
-        rng, most = np.random.default_rng(self.seed), self.options.baseline_pixels
-        names = _spread(self.training.olat_lights(), self.options.baseline_lights)
+        rng, most = np.random.default_rng(self.seed), BASELINE_PIXELS
+        names = _spread(self.training.olat_lights(), BASELINE_LIGHTS)
         lights = tuple(self.fitted.lights(names))
         seen = observe_hair(self.training, self.model, names, most, rng)
         return [replace(o, lights=lights) for o in seen]

@@ -12,7 +12,5 @@ class AssessOptions:
     cameras: Count = 2
     lights: Count = 5
     spp: Count = 49
-    baseline_pixels: Count = 100
-    baseline_lights: Count = 48
     relit_size: Count = 640
     relit_spp: Count = 32

@@ -14,6 +14,8 @@ from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.visual_hull import visual_hull
 
+DEEPEST = 0.06  # metres behind where a ray enters the volume
+
 
 def hair_volume(
     cameras: Sequence[Camera], subject: Mapping[str, Bools], head: Mesh | None, spacing: float
@@ -29,10 +31,10 @@ def hair_volume(
     return VoxelGrid(hull.origin, hull.spacing, inside)
 
 
-def depth_range(camera: Camera, volume: VoxelGrid, most: float) -> tuple[Floats, Floats]:
+def depth_range(camera: Camera, volume: VoxelGrid) -> tuple[Floats, Floats]:
     """Nearest and furthest depth `(H, W)` of the volume behind each pixel, both 0 where none is.
 
-    At most `most` metres apart: hair deeper under the volume's surface is not seen.
+    At most `DEEPEST` metres apart: hair deeper under the volume's surface is not seen.
     """
     near = np.zeros((camera.height, camera.width), np.float32)
     centers = volume.centers()
@@ -52,7 +54,7 @@ def depth_range(camera: Camera, volume: VoxelGrid, most: float) -> tuple[Floats,
     np.maximum.at(last, (row[on], column[on]), depth[on])
     first = ndimage.minimum_filter(first, 3)[1:-1, 1:-1] - volume.spacing
     last = ndimage.maximum_filter(last, 3)[1:-1, 1:-1] + volume.spacing
-    last = np.minimum(last, first + most)
+    last = np.minimum(last, first + DEEPEST)
     y, x = np.arange(camera.height) // tile, np.arange(camera.width) // tile
     found = np.isfinite(first)[np.ix_(y, x)]
     return (

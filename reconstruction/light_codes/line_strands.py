@@ -83,7 +83,7 @@ def _depth_maps(
         maps = []
         for k, view in enumerate(views):
             progress("searching depths", k / len(views))
-            maps.append(search.run(k, *depth_range(view.camera, volume, options.deepest)))
+            maps.append(search.run(k, *depth_range(view.camera, volume)))
         seen = np.concatenate([m.seen_by for m in maps])
         stage.figures.update(
             segments={v.camera.name: len(m.x) for v, m in zip(views, maps, strict=True)},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -25,19 +25,6 @@ NEIGHBOURS, ISOLATION = 8, 1.6  # see `supported`
 
 RADIUS, ROUGHNESS = 2.5e-3, 3e-4
 """Metres: a neighbourhood's size, and how far fibres lie off its plane (`flatten`)."""
-
-
-@dataclass(frozen=True)
-class TriangulateOptions:
-    """What a study leaves out of making points.
-
-    `hull`: points outside a silhouette go. `fuse`: points of one pixel that agree become one.
-    `flatten`: points move to their neighbourhood's plane.
-    """
-
-    hull: bool = True
-    fuse: bool = True
-    flatten: bool = True
 
 
 def sweep_peaks(capture: Capture, progress: Progress = silent) -> list[Peaks]:
@@ -66,18 +53,17 @@ def triangulate(
     *,
     motion: Motion | None = None,
     peaks: list[Peaks] | None = None,
-    options: TriangulateOptions | None = None,
+    hull: bool = True,
     progress: Progress = silent,
     stage: Stage | None = None,
 ) -> PointCloud:
     """Points of all cameras and projectors in the reference pose.
 
     `motion` undoes the subject's motion step by step (None: it did not move), and stripes of steps
-    whose pose is not known are left out; `peaks` are those of
-    `sweep_peaks` where they are already known. Figures and warnings go into `stage`. Raises
+    whose pose is not known are left out; `peaks` are those of `sweep_peaks` where they are already
+    known; points outside the silhouettes' `hull` go. Figures and warnings go into `stage`. Raises
     `CaptureError` for a capture without a sweep; a sweep that lit nothing gives an empty cloud.
     """
-    options = options or TriangulateOptions()
     stage = stage or Stage("triangulation")
     if peaks is None:
         peaks = sweep_peaks(capture, progress)
@@ -101,17 +87,15 @@ def triangulate(
             )
         elif not len(p.row):
             stage.warn(f"{p.camera} saw no stripe of {p.projector}")
-    if options.hull:
+    if hull:
         cloud = cloud.subset(inside_hull(capture, cloud.points, stage))
     counts["inside_hull"] = len(cloud)
-    if options.fuse:
-        cloud = fuse(cloud)
+    cloud = fuse(cloud)
     counts["after_fusion"] = len(cloud)
     cloud = cloud.subset(supported(cloud.points, NEIGHBOURS, ISOLATION))
     backing = support(cloud.points, RADIUS)
     cloud = replace(cloud, weight=(cloud.weight * backing).astype(np.float32))
-    if options.flatten:
-        cloud = flatten(cloud, RADIUS, ROUGHNESS)
+    cloud = flatten(cloud, RADIUS, ROUGHNESS)
     counts["points"] = len(cloud)
     stage.figures.update(counts)
     if len(cloud):

@@ -27,6 +27,7 @@ from reconstruction.tangents.line_evidence import (
 from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
 
 CANDIDATES = 500  # directions that are scored at each point
+LIGHT_GROUPS = 24  # of neighbouring lights; the texture of each shows different fibres
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ def measure_tangents(
     if not names:
         raise CaptureError(f"{capture.path}: no OLAT frames, which the orientations come from")
     lights = [capture.rig.light(n) for n in names]
-    group = light_groups(lights, options.light_groups)
+    group = light_groups(lights, LIGHT_GROUPS)
     cameras = [c for c in masked.cameras if masked.masks[c.name].hair.any()]
     evidences, pictures = [], []
     for done, camera in enumerate(cameras):

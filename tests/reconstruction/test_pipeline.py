@@ -28,17 +28,11 @@ from reconstruction import (
 )
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_planes import PointCloud
-from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.tangents.estimate import light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(12, 1.2, 0.0))]
-QUICK = ReconstructOptions(
-    grid=4e-3,
-    roots=300,
-    max_length=0.2,
-    measure=MeasureOptions(light_groups=4),
-)
+QUICK = ReconstructOptions(grid=4e-3, roots=300, max_length=0.2)
 
 
 def ball(radius: float) -> Mesh:

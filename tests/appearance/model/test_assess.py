@@ -32,9 +32,7 @@ from reconstruction.geometry.lights import dome_positions
 
 TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.2, 0.2)
 HELD_OUT = HeldOut(("cam_2",), ("l4", "l7"))
-OPTIONS = AssessOptions(
-    cameras=2, lights=3, spp=64, baseline_pixels=60, baseline_lights=8, relit_size=32, relit_spp=4
-)
+OPTIONS = AssessOptions(cameras=2, lights=3, spp=64, relit_size=32, relit_spp=4)
 
 
 @pytest.fixture(scope="module")

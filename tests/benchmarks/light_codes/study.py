@@ -51,7 +51,7 @@ def study_depths(
     tree = cKDTree(dense.points)
     tangents = dense.tangents()
     center = volume.centers().mean(axis=0)
-    ranges = {k: depth_range(views[k].camera, volume, options.deepest) for k in which}
+    ranges = {k: depth_range(views[k].camera, volume) for k in which}
 
     def found(search: SearchOptions) -> tuple[list[DepthMap], float]:
         depths = DepthSearch(views, center, search)

@@ -14,7 +14,7 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import Scalp, sample_roots
-from reconstruction.light_planes import TriangulateOptions, sweep_peaks, triangulate
+from reconstruction.light_planes import sweep_peaks, triangulate
 from reconstruction.report.report import peak_memory
 from reconstruction.tangents.estimate import Measured
 
@@ -68,8 +68,7 @@ def of_triangulation(capture: Capture) -> list[Growth]:
     def shrunk(cameras: int, projectors: int) -> None:
         part = capture.view(cameras=[c.name for c in rig.cameras[:cameras]])
         part.rig = replace(part.rig, projectors=rig.projectors[:projectors])
-        options = TriangulateOptions(hull=False)
-        triangulate(part, peaks=sweep_peaks(part), options=options)
+        triangulate(part, peaks=sweep_peaks(part), hull=False)
 
     counts = [n for n in (1, 2, 4, 8, 16) if n <= len(rig.cameras)]
     return [

@@ -29,7 +29,6 @@ QUICK = ReconstructOptions(
     light_codes=LightCodeOptions(
         bank=LogGaborBank(count=16, spread=1.0, wavelength=5.0),
         search=SearchOptions(candidates=8, step=5e-4),
-        deepest=0.03,
     )
 )
 

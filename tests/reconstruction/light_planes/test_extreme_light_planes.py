@@ -36,16 +36,10 @@ from reconstruction.growth.field import solve_field
 from reconstruction.growth.from_roots import Tracing, grow_from_roots
 from reconstruction.head.scalp import NoScalp
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, triangulate
-from reconstruction.reconstruct_options import MeasureOptions
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(6, 1.2, 0.0))]
-QUICK = ReconstructOptions(
-    grid=5e-3,
-    roots=60,
-    max_length=0.1,
-    measure=MeasureOptions(light_groups=2),
-)
+QUICK = ReconstructOptions(grid=5e-3, roots=60, max_length=0.1)
 Shoot = Callable[..., Capture]
 MakeCamera = Callable[..., Camera]
 

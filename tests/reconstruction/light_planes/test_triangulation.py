@@ -13,13 +13,12 @@ from reconstruction import Camera, Capture, CaptureError, Projector, Rig, Stage
 from reconstruction.light_planes import (
     Motion,
     PointCloud,
-    TriangulateOptions,
     sweep_peaks,
     triangulate,
 )
 from reconstruction.light_planes.peaks import REACH, fit_stripes
 from reconstruction.light_planes.plane_conditioning import condition, ray_plane_angles, row_pitch
-from reconstruction.light_planes.triangulation import flatten, fuse, supported
+from reconstruction.light_planes.triangulation import flatten, fuse, intersect, supported
 
 Shoot = Callable[..., Capture]
 RADIUS = 0.1
@@ -46,8 +45,13 @@ def test_points_lie_on_the_sphere_within_their_stated_deviation(sphere_capture: 
     assert np.allclose(np.linalg.norm(cloud.view, axis=1), 1)
 
 
+def of_rays(capture: Capture) -> PointCloud:
+    """The points where rays meet their planes, as measured: not yet fused, flattened or cleaned."""
+    return PointCloud.merged([intersect(capture, p, None) for p in sweep_peaks(capture)])
+
+
 def test_points_project_to_the_pixels_that_saw_them(sphere_capture: Capture) -> None:
-    cloud = triangulate(sphere_capture, options=TriangulateOptions(flatten=False))
+    cloud = of_rays(sphere_capture)
     for name in cloud.cameras:
         mine = cloud.of_camera(name)
         pixels, _ = sphere_capture.rig.camera(name).project(mine.points)
@@ -128,14 +132,14 @@ def test_saturated_stripes_are_kept_with_a_larger_deviation(shoot: Shoot) -> Non
 
 def test_a_missing_row_costs_only_its_neighbourhood(shoot: Shoot) -> None:
     stage = Stage("triangulation")
-    options = TriangulateOptions(flatten=False, fuse=False)
-    cloud = triangulate(shoot(missing=[(17, "left")]), options=options, stage=stage)
+    capture = shoot(missing=[(17, "left")])
+    assert np.median(off(triangulate(capture, stage=stage))) < 2e-4
+    cloud = of_rays(capture)
     assert any("1 scanlines" in w and "17" in w for w in stage.warnings)
     left = cloud.of_camera("left")
     assert not ((left.row > 16.2) & (left.row < 17.8)).any()
     assert (left.row > 18.6).any()
     assert (left.row < 15.4).any()
-    assert np.median(off(cloud)) < 2e-4
 
 
 def test_known_motion_is_undone(shoot: Shoot) -> None:
@@ -160,7 +164,7 @@ def test_isolated_points_are_outliers() -> None:
 
 
 def test_flattening_moves_noise_onto_the_plane_and_never_widens(sphere_capture: Capture) -> None:
-    cloud = triangulate(sphere_capture, options=TriangulateOptions(flatten=False))
+    cloud = triangulate(sphere_capture)
     rng = np.random.default_rng(1)
     noisy = replace(cloud, points=cloud.points + rng.normal(0, 5e-4, cloud.points.shape))
     noisy = replace(noisy, covariance=np.tile(25e-8 * np.eye(3), (len(noisy), 1, 1)))
@@ -171,9 +175,7 @@ def test_flattening_moves_noise_onto_the_plane_and_never_widens(sphere_capture: 
 
 
 def test_points_of_one_pixel_that_agree_become_one(sphere_capture: Capture) -> None:
-    cloud = triangulate(sphere_capture, options=TriangulateOptions(flatten=False)).subset(
-        np.arange(50)
-    )
+    cloud = triangulate(sphere_capture).subset(np.arange(50))
     shifted = replace(cloud, points=cloud.points - 2e-4 * cloud.view)
     both = fuse(PointCloud.merged([cloud, shifted]))
     assert len(both) == len(fuse(cloud))
