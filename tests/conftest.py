@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from waiting import machine_slack, slowed
 
+from appearance.scene.backend import ensure_backend
 from reconstruction import Rig
 from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.responses import Response
@@ -24,19 +25,22 @@ from stage_service.config import RigFile, load_rig_file
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 
+# The same order of sums every time, and a core for the other worker.
+ensure_backend(threads=1)
+
 # What runs in the background starts with Ctrl-C ignored, and so would the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-DEAR = ("system", "appearance", "benchmarks")
-"""Folders whose files take longest, one by one: they begin first, or a worker waits for them."""
+FIRST = ("system", "faults", "contracts", "appearance", "benchmarks")
+"""Folders that begin first: what mostly waits, beside it what mostly computes and takes longest."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The dear folders in front; with `--no-loadscope-reorder` xdist keeps that order."""
-    place = {name: i for i, name in enumerate(DEAR)}
+    """`FIRST` in front; with `--no-loadscope-reorder` xdist keeps that order."""
+    place = {name: i for i, name in enumerate(FIRST)}
     tests = CHECKOUT / "tests"
-    items.sort(key=lambda item: place.get(item.path.relative_to(tests).parts[0], len(DEAR)))
+    items.sort(key=lambda item: place.get(item.path.relative_to(tests).parts[0], len(FIRST)))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -33,14 +33,15 @@ def slowed(faults: tuple[Fault, ...], slack: int) -> Faults:
     return Faults(tuple(replace(f, seconds=min(f.seconds * slack, 60.0)) for f in faults))
 
 
-def until(what: Callable[[], T], seconds: float | None = None) -> T:
+def until(what: Callable[[], T], seconds: float | None = None, *, pause: float = 0.002) -> T:
     """Poll for what another thread or process brings about; what `what` returns once it is true.
 
-    `seconds` only where the deadline is what is tested, and then times `slack`.
+    `seconds` only where the deadline is what is tested, and then times `slack`. `pause` seconds
+    between looks: more where a look costs the process that is waited for.
     """
     seconds = 60.0 * machine_slack() if seconds is None else seconds
     deadline = time.monotonic() + seconds
     while not (found := what()):
         assert time.monotonic() < deadline, f"it did not happen within {seconds:g} s"
-        time.sleep(0.002)
+        time.sleep(pause)
     return found

@@ -206,8 +206,13 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     assert np.abs(np.linalg.norm(strands.roots, axis=1) - HEAD).max() < 2e-3
     with np.load(tmp_path / "model" / "scalp_map.npz") as data:
         assert data["roots"].shape == (len(strands), 2)
-    # once it has a head of its own, none is laid
+    # once it has a head of its own, none is laid; what fails leaves the model its head
     write_obj(capture.path / "head.obj", ball(HEAD))
+    unlit = Capture(capture.path)
+    unlit.steps = tuple(s for s in unlit.steps if s.kind != "olat")
+    with pytest.raises(CaptureError, match="no OLAT frames"):
+        reconstruct(unlit, Model(tmp_path / "model"), options=QUICK)
+    assert (tmp_path / "model" / "head.obj").is_file()
     report = reconstruct(Capture(capture.path), Model(tmp_path / "model"), options=QUICK)
     assert "head" not in [s.name for s in report.stages]
     assert not (tmp_path / "model" / "head.obj").exists()

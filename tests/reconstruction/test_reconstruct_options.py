@@ -7,8 +7,10 @@ import subprocess
 import sys
 
 import pytest
+from pydantic import ValidationError
 
 from reconstruction import BadOptions, ReconstructOptions, parse_options
+from reconstruction.reconstruct_options import LogGaborBank
 
 
 def test_nested_json_fills_in_the_defaults() -> None:
@@ -21,6 +23,15 @@ def test_nested_json_fills_in_the_defaults() -> None:
     assert made.measure.thin == ReconstructOptions().measure.thin
     assert made.network is not None
     assert made.network.size is None
+
+
+def test_what_is_given_by_position_is_named_by_its_field() -> None:
+    assert LogGaborBank(4.0, 12) == LogGaborBank(wavelength=4.0, count=12)
+    with pytest.raises(ValidationError) as caught:
+        LogGaborBank(4.0, 1)
+    assert caught.value.errors()[0]["loc"] == ("count",)
+    with pytest.raises(TypeError, match="multiple values"):
+        LogGaborBank(4.0, wavelength=5.0)  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(

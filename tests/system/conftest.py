@@ -86,11 +86,12 @@ class TinyStage:
         self.rig.write_text(RIG.replace("WATCHDOG_S", str(self.watchdog_s)))
         _write_subject(folder)
         self._running: list[subprocess.Popen[str]] = []
+        self.workers: list[subprocess.Popen[str]] = []
         self.http = httpx.Client(timeout=120, trust_env=False)
 
     def until(self, what: Callable[[], T], seconds: float = 60.0) -> T:
         """What `what` returns once that is true; fails after `seconds` of an idle machine."""
-        return until(what, seconds * self.slack)
+        return until(what, seconds * self.slack, pause=0.05)
 
     def start(self, *words: str | Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
         """Start `hairstage …` and read the object that it prints when it is ready."""
@@ -128,7 +129,8 @@ class TinyStage:
 
     def work(self) -> subprocess.Popen[str]:
         """Start a worker."""
-        return self.start("worker", "--root", self.root)[0]
+        self.workers.append(self.start("worker", "--root", self.root)[0])
+        return self.workers[-1]
 
     def get(self, path: str) -> Any:
         """The JSON at `path`."""

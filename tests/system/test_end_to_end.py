@@ -1,11 +1,13 @@
-"""From a REST call to relit hair: three processes, HTTP and the wires."""
+"""From a REST call to relit hair: three processes, HTTP and the wires; and kills in between."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 
 def modes(root: Path) -> dict[str, set[int]]:
@@ -16,36 +18,57 @@ def modes(root: Path) -> dict[str, set[int]]:
     return found
 
 
-OPTIONS = {"held_out_cameras": ["cam_2"], "held_out_lights": ["light_004"]}
+HELD_OUT = {"held_out_cameras": ["cam_2"], "held_out_lights": ["light_004"]}
 
 
-def test_a_capture_becomes_relit_hair(running):
-    cost = running.post("/plans:validate", {})
-    assert cost["frames"] == running.FRAMES
-    capture = running.capture(
-        {
-            **running.subject(),
-            "pipeline": running.pipeline(**OPTIONS),
-        }
-    )
-    assert (capture["outcome"], capture["error"]) == ("completed", None)
-    assert (capture["frames_written"], capture["frames_missing"]) == (running.FRAMES, 0)
+@pytest.fixture(scope="module")
+def captured(running):
+    """A capture that asked for the whole pipeline; no worker has begun it yet."""
+    assert running.post("/plans:validate", {})["frames"] == running.FRAMES
+    return running.capture({**running.subject(), "pipeline": running.pipeline(**HELD_OUT)})
+
+
+@pytest.fixture(scope="module")
+def finished(running, captured):
+    """Its job, whose first worker was killed while it fitted, and when the strands were written."""
+    path = f"/jobs/{captured['job']}"
+    assert running.get(path)["state"] == "queued"
+    worker = running.work()
+    running.until(lambda: (running.get(path)["progress"] or {}).get("step") == "fit", 100)
+    worker.kill()
+    worker.wait()
+    assert running.get(path)["state"] == "running"
+    assert running.get("/health")["worker"] is False
+    written = (Path(running.get(path)["model"]) / "strands.npz").stat().st_mtime_ns
+    running.work()
+    running.until(lambda: running.get(path)["state"] == "done", 200)
+    return running.get(path), written
+
+
+def test_a_capture_has_every_frame_each_of_its_own_lamp(running, captured):
+    assert (captured["outcome"], captured["error"]) == ("completed", None)
+    assert (captured["frames_written"], captured["frames_missing"]) == (running.FRAMES, 0)
     assert running.lamps_lit() == 0
     assert modes(running.root) == {"folder": {0o750}, "file": {0o640}}  # people's faces
-    assert running.verify(Path(capture["path"])) == []
+    assert running.verify(Path(captured["path"])) == []
 
     # Each lamp lights something else: the commanded state makes the picture, nothing else does.
     pictures = []
     for step in range(2, 6):
-        png = running.http.get(f"/captures/{capture['id']}/frames/{step}/cam_1.png").content
+        png = running.http.get(f"/captures/{captured['id']}/frames/{step}/cam_1.png").content
         pictures.append(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
     assert len({p.tobytes() for p in pictures}) == 4
 
-    assert running.get(f"/jobs/{capture['job']}")["state"] == "queued"
-    running.work()
-    running.until(lambda: running.get(f"/jobs/{capture['job']}")["state"] == "done", 200)
-    job = running.get(f"/jobs/{capture['job']}")
-    assert job["outcome"] == "succeeded", job["error"]
+
+def test_a_job_outlives_its_worker(finished):
+    job, written = finished
+    assert (job["outcome"], job["error"]) == ("succeeded", None)
+    strands = Path(job["model"]) / "strands.npz"
+    assert strands.stat().st_mtime_ns == written, "reconstruction was done, and was done again"
+
+
+def test_a_capture_becomes_relit_hair(running, captured, finished):
+    job, _ = finished
     files = {a["path"]: a["bytes"] for a in running.get(f"/jobs/{job['id']}/artifacts")}
     for name in ("strands.npz", "strands.hair", "strands.usdc", "appearance.json"):
         assert files[name] > 100
@@ -58,6 +81,48 @@ def test_a_capture_becomes_relit_hair(running):
     for group in ("held_out_lights", "held_out_camera"):
         assert {"ours", "mean_colour", "diffuse"} <= set(results["images"][group])
     # Compressed in the background, and still sound.
-    assert running.verify(Path(capture["path"])) == []
-    assert len(list(Path(capture["path"]).glob("frames/*/*.zip.exr"))) == running.FRAMES
+    assert running.verify(Path(captured["path"])) == []
+    assert len(list(Path(captured["path"]).glob("frames/*/*.zip.exr"))) == running.FRAMES
     assert len(running.get("/devices")["cameras"]) == running.CAMERAS
+
+
+def test_inverse_rendering_goes_on_where_its_worker_was_killed(running, captured, finished):
+    effort = {"pixels": 60, "spp": 4, "gradient_spp": 2}
+    fit = {"variant": "correctives", "shape": [2, 2, 2], "steps": 40, "check_every": 5}
+    asked = {
+        "capture": captured["id"],
+        "model": Path(finished[0]["model"]).name,
+        "pipeline": {
+            "name": "appearance",
+            "options": {
+                **HELD_OUT,
+                "fit": {"iterations": 2},
+                "inverse_rendering": {
+                    "judged_spp": 4,
+                    "max_depth": 4,
+                    "fit": fit | {"halvings": 99, "effort": effort},
+                },
+                "assess": {"relit_size": 32, "relit_spp": 4},
+            },
+        },
+    }
+    path = f"/jobs/{running.post('/jobs', asked)['id']}"
+
+    def step() -> int:
+        """The step of the fit that the job tells, with its current error; 0 before the volume's."""
+        progress = running.get(path)["progress"] or {"what": "", "step_share": 0.0}
+        told = re.match(r"step (\d+): error \d", progress["what"])
+        return int(told[1]) if told and progress["step_share"] > 0.3 else 0
+
+    reached = running.until(lambda: (n := step()) >= 10 and n, 200)
+    running.workers[-1].kill()
+    running.workers[-1].wait()
+    running.work()
+    running.until(lambda: step() == 0, 100)  # until then, what the killed worker had told
+    assert running.until(step, 100) >= reached
+    running.until(lambda: running.get(path)["state"] == "done", 300)
+    job = running.get(path)
+    assert (job["outcome"], job["error"]) == ("succeeded", None)
+    # by name: what validation speaks against lies in a folder of its own
+    found = {Path(a["path"]).name for a in running.get(f"{path}/artifacts")}
+    assert {"hair_maps.npz", "lights.json", "report.json"} <= found

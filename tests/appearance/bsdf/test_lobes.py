@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appearance.bsdf import lobes, reference
+from reconstruction.array_backend import for_kernels
 
 
 def scattered(case: Case, count: int = 300, seed: int = 0) -> np.ndarray:
@@ -55,8 +56,9 @@ def test_weights_are_bounded_finite_and_not_negative(
     beta_m, beta_n, theta_deg, h, eta, tilt_deg, sigma
 ):
     case = Case(beta_m, beta_n, theta_deg, h, eta, tilt_deg, sigma)
-    vector = array_types(False)[1]
-    coloured = replace(fibre(case, False), sigma_a=vector(0, sigma, 1e4))
+    number, vector = array_types(False)
+    sigma_a = vector(*(dr.opaque(number, s) for s in (0, sigma, 1e4)))
+    coloured = replace(fibre(case, False), sigma_a=sigma_a)
     wi = known_direction(case, False)
     wo, pdf, weight = lobes.sample(coloured, wi, *uniforms(4000, 5, False))
     assert np.abs(np.linalg.norm(np.array(wo, float), axis=0) - 1).max() < 1e-6
@@ -65,7 +67,7 @@ def test_weights_are_bounded_finite_and_not_negative(
     assert (pdf > 0).all()
     assert (weight >= 0).all()
     assert weight.max() <= 3.001
-    elsewhere = vector(scattered(case, 500).T.astype(np.float32))
+    elsewhere = vector(for_kernels(scattered(case, 512).T))
     value, pdf = lobes.evaluate(coloured, wi, elsewhere)
     value, pdf = np.array(value), np.array(pdf)
     assert np.isfinite(value).all()
@@ -79,13 +81,13 @@ def test_every_uniform_number_gives_a_direction(double):
     """0 and the largest number below 1 too, for every lobe, at both ends of roughness."""
     last = 1 - 2.0**-24
     corners = np.stack(np.meshgrid(*[[0.0, 2.0**-24, 0.5, last]] * 3), -1).reshape(-1, 3)
-    number, _ = array_types(double)
+    number, dtype = array_types(double)[0], np.float64 if double else np.float32
     for beta in (0.001, 1.0):
         for h in (0.0, 0.9, -1.0):
             for sigma in (0.0, 1e4):
                 case = Case(beta, beta, theta_deg=-89.99, h=h, sigma_a=sigma)
                 wi = known_direction(case, double)
-                u = [number(c) for c in corners.T]
+                u = [number(for_kernels(c, dtype)) for c in corners.T]
                 wo, pdf, weight = lobes.sample(fibre(case, double), wi, *u)
                 assert np.linalg.norm(np.array(wo, float), axis=0) == pytest.approx(1, abs=1e-6)
                 assert (np.array(pdf) > 0).all()

@@ -16,6 +16,7 @@ import numpy as np
 
 from appearance.bsdf import reference as ref
 from appearance.bsdf.lobes import Fibre
+from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
@@ -126,10 +127,8 @@ def uniforms(count: int, seed: int, double: bool) -> list[Any]:
     number, _ = array_types(double)
     rng = np.random.default_rng(seed)
     if double:
-        return [number(rng.random(count)) for _ in range(3)]
-    return [
-        number((rng.integers(0, 1 << 24, count) / (1 << 24)).astype(np.float32)) for _ in range(3)
-    ]
+        return [number(for_kernels(rng.random(count), np.float64)) for _ in range(3)]
+    return [number(for_kernels(rng.integers(0, 1 << 24, count) / (1 << 24))) for _ in range(3)]
 
 
 def cases(count: int, seed: int = 0) -> list[Case]:

@@ -60,6 +60,7 @@ def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
     assert "| HairInverse |" in report({"subjects": {"a": rows}})
 
 
+@pytest.mark.slow
 def test_recovery_compares_frames_as_they_are_with_worse_ones(captured):
     rows = Table(captured, QUICK).run(("original", "lights"))
     found = recovery(captured, rows, QUICK)

@@ -30,7 +30,7 @@ def test_brute_force_agrees_with_itself_and_worse_searches_find_less(
     monkeypatch.setattr(study, "VARIANTS", variants)
     inside = np.ones((16, 16, 16), bool)
     volume = VoxelGrid(np.full(3, -0.032), 4e-3, inside)
-    found = study.study_depths(fibres.views, volume, fibres.strands, LightCodeOptions(), [0, 1])
+    found = study.study_depths(fibres.views, volume, fibres.strands, LightCodeOptions(), [0])
     candidates = found["candidates"]
     assert candidates["all"]["as_brute_force"] == 1
     assert candidates["1"]["as_brute_force"] <= candidates["8"]["as_brute_force"]

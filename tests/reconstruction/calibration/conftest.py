@@ -86,7 +86,7 @@ def noisy_sightings(true_rig: Rig, board: Board) -> dict[str, dict[str, Sighting
     """Where the cameras find the corners, in pictures with the sensor's noise."""
     seen: dict[str, dict[str, Sighting]] = {c.name: {} for c in true_rig.cameras}
     for pose in POSES:
-        responder = PropResponder(true_rig, board_pose(pose, board), samples=3)
+        responder = PropResponder(true_rig, board_pose(pose, board), samples=2)
         for k, camera in enumerate(true_rig.cameras):
             response = responder.lights_together(camera.name, 0, np.full(4, 0.5))
             image = np.zeros((HEIGHT * WIDTH, 3))
@@ -107,7 +107,7 @@ def shoot_prop(tmp_path_factory: pytest.TempPathFactory, true_rig: Rig, nominal_
     def make(prop: Prop, steps: Sequence[dict[str, Any]], rig: Rig = true_rig, **more: Any) -> Any:
         path: Path = tmp_path_factory.mktemp("prop") / "capture"
         plan = [Step(index=i, **s) for i, s in enumerate(steps)]
-        responder = PropResponder(rig, prop, samples=3)
+        responder = PropResponder(rig, prop, samples=2)
         return shoot(path, rig, responder, plan, written=nominal_rig, **more)
 
     return make

@@ -14,7 +14,6 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruction import Camera, Capture, Light, Rig, Strands, write_exr
-from reconstruction.array_backend import array_types
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_codes.code_views import View, light_beside, line_vectors
 from reconstruction.light_codes.codes import code_map
@@ -87,7 +86,7 @@ def lit(points: Array, lights: Sequence[Light]) -> Bools:
     return np.stack(bits, axis=-1)
 
 
-def cameras(count: int = 8, size: int = 96, distance: float = 0.6) -> list[Camera]:
+def cameras(count: int = 8, size: int = 72, distance: float = 0.6) -> list[Camera]:
     """Cameras on the upper hemisphere that see the whole ball."""
     places = dome_positions(count, distance, 15.0)
     fov = np.degrees(2 * np.arctan(1.25 * RADIUS / distance))
@@ -106,7 +105,7 @@ def lamps(count: int, beside: Sequence[Camera] = ()) -> list[Light]:
 class FibreStage:
     """Fibres, cameras and lamps; what the cameras see of them, exactly or as a capture."""
 
-    strands: Strands = field(default_factory=lambda: wisps(150))
+    strands: Strands = field(default_factory=lambda: wisps(60))
     cameras: Sequence[Camera] = field(default_factory=cameras)
     lights: Sequence[Light] = ()
 
@@ -178,18 +177,9 @@ class FibreStage:
         return Capture(path)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _one_thread() -> None:
-    """The same order of sums every time, and a core for others."""
-    array_types()
-    import drjit
-
-    drjit.set_thread_count(1)
-
-
 @pytest.fixture(scope="session")
 def fibres() -> FibreStage:
-    """150 fibres before 8 cameras with a lamp each, and 28 lamps more."""
+    """60 fibres before 8 cameras with a lamp each, and 28 lamps more."""
     return FibreStage()
 
 

@@ -292,9 +292,12 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     code, data = run(capsys, "evaluate", "table", file, again)
     (spread,) = data["figures"]["curly, seeds 3, 4"]["β_M: ours"]
     assert spread == pytest.approx({"mean": 0.587, "std": 0.3 * 2**0.5, "n": 2})
+    damaged = {**results, "geometry": {}}
     del results["subject"]
     for text, said in (
         (json.dumps(results), "has no subject"),
+        (json.dumps(damaged), "has no 'visible'"),
+        (json.dumps({**damaged, "geometry": 3}), "a figure of another kind"),
         ("[]", "not a JSON object"),
         ("{", "not JSON"),
     ):

@@ -28,6 +28,7 @@ from reconstruction import (
 )
 from reconstruction.geometry.lights import dome_positions
 from stage_service.cli import main
+from stage_service.jobs import steps
 
 HAIR = HairAppearance((0.1, 0.1, 0.1), 0.25, 0.2)
 DEPTH = 5
@@ -125,6 +126,20 @@ def run(capsys, *words) -> tuple[int, dict]:
 
 
 @pytest.mark.usefixtures("fitted")
+def test_inverse_rendering_runs_suns_fit_again_where_other_images_are_held_out(
+    made, capsys, monkeypatch
+):
+    called = []
+    for name in ("fit", "inverse_rendering", "assess"):
+        monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
+    words = (capsys, "fit", made.capture, made.model, "--method", "inverse_rendering")
+    assert run(*words)[0] == 0
+    assert called == ["inverse_rendering"]
+    assert run(*words, "--hold-out-light", "l4")[0] == 0
+    assert called[1:] == ["fit", "inverse_rendering", "assess"]
+
+
+@pytest.mark.usefixtures("fitted")
 def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
     before = FittedModel.load(made.model)
     write_strands(tmp_path / "other.npz", tuft(50, seed=3))
@@ -159,6 +174,11 @@ def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
     assert dyed.tolist() == [False, False, True, True, False, False, False, False]
     code, _ = run(capsys, "render", tmp_path / "wisp", "--spp", 1, "--out", tmp_path / "x.png")
     assert code == 0
+    lights = [Model(m).json("lights.json") for m in (made.model.path, tmp_path / "band")]
+    assert lights[0] == lights[1]
+    words = ["edit", str(made.model), "--out", str(tmp_path / "bare"), "--roughen", "1.1"]
+    assert main(words) == 0
+    assert "holds no head" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("fitted")

@@ -81,7 +81,7 @@ def test_a_killed_workers_job_goes_on_at_the_step_that_was_under_way(
     worker = start_worker(tmp_path)
     try:
         until(lambda: log.is_file() and "slow begins" in log.read_text())
-        until(lambda: queue.get(job.id).progress is not None)
+        until(lambda: queue.get(job.id).progress is not None, pause=0.02)
         running = queue.get(job.id)
         assert (running.state, running.outcome) == ("running", None)
         assert worker_is_alive(tmp_path)
@@ -92,7 +92,7 @@ def test_a_killed_workers_job_goes_on_at_the_step_that_was_under_way(
     try:
         until(lambda: log.read_text().count("slow begins") == 2)
         (Path(job.model) / "go").touch()
-        until(lambda: queue.get(job.id).state == "done")
+        until(lambda: queue.get(job.id).state == "done", pause=0.02)
     finally:
         end(worker)
     done = queue.get(job.id)
@@ -117,7 +117,7 @@ def test_cancelling_stops_the_step_and_failures_carry_their_reason(
     try:
         until(lambda: log.is_file() and "slow begins" in log.read_text())
         assert queue.cancel(job.id).outcome == "cancelled"
-        until(lambda: queue.get(after.id).state == "done")
+        until(lambda: queue.get(after.id).state == "done", pause=0.02)
         worker.terminate()
         assert worker.wait(60) == 0
     finally:
