@@ -220,10 +220,10 @@ class Model:
         except ValueError as error:
             raise ModelError(str(error)) from error
 
-    def write_json(self, name: str, data: Any) -> None:
+    def write_json(self, name: str, data: Any, *, durable: bool = True) -> None:
         """Write JSON; numbers that are not finite are an error, never NaN."""
         self.path.mkdir(parents=True, exist_ok=True)
-        write_json(self.file(name), data)
+        write_json(self.file(name), data, durable=durable)
 
     def report(self) -> Report:
         """The report of what was done so far; an empty one where nothing was."""

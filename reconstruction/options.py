@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import wraps
+from inspect import signature
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -22,10 +24,18 @@ def options(cls: type[T]) -> type[T]:
 
     Unknown fields, NaN, infinity and values out of the range that a field is annotated with (as
     `Annotated[float, Field(gt=0)]`) raise pydantic's `ValidationError`, which names the field's
-    place at any depth.
+    place at any depth, also of what is given by position.
     """
     config = ConfigDict(extra="forbid", allow_inf_nan=False)
     made: type[T] = dataclass(frozen=True, config=config)(cls)  # type: ignore[assignment]
+    names, checked = list(signature(made).parameters), made.__init__
+
+    @wraps(checked)
+    def named(self: T, *values: Any, **fields: Any) -> None:
+        known = dict(zip(names, values, strict=False))
+        checked(self, *values[len(known) :], **known, **fields)
+
+    made.__init__ = named  # type: ignore[method-assign, assignment]
     return made
 
 

@@ -87,6 +87,8 @@ def reconstruct(
         scalp = find_scalp(head.mesh, envelope)
         field = stages.field(envelope, measured, scalp)
         stages.strands(field, scalp, seen, head.scalp_map)
+    if not any(stage.name == "head" for stage in stages.report.stages):
+        model.remove("head.obj")  # an earlier reconstruction's: this one has the capture's, or none
     model.write_report(stages.report)
     return stages.report
 
@@ -128,7 +130,6 @@ class _Stages:
 
     def known_head(self, capture: Capture) -> FittedHead | None:
         """The head under the user's scalp points, which win where asked for, or the capture's."""
-        self.model.remove("head.obj")
         self.report.drop("head")
         asked = self.options.scalp_points
         if capture.head is not None and asked is None:

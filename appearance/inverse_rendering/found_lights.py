@@ -9,7 +9,7 @@ import numpy as np
 from appearance.inverse_rendering.unknowns import LightDeviations
 from reconstruction import Light, Model
 
-FILE = "lights.json"
+LIGHTS_FILE = "lights.json"
 
 
 def save_lights(model: Model, found: LightDeviations, lights: Sequence[Light]) -> None:
@@ -24,12 +24,12 @@ def save_lights(model: Model, found: LightDeviations, lights: Sequence[Light]) -
         }
         for i, light in enumerate(found.applied(lights))
     ]
-    model.write_json(FILE, rows)
+    model.write_json(LIGHTS_FILE, rows)
 
 
 def lights_as_found(model: Model, lights: Sequence[Light]) -> list[Light]:
     """The calibrated `lights` as they were found to be; those that were not fitted as they are."""
-    rows = {row["name"]: row for row in model.json(FILE)} if model.has(FILE) else {}
+    rows = {row["name"]: row for row in model.json(LIGHTS_FILE)} if model.has(LIGHTS_FILE) else {}
     out = []
     for light in lights:
         row = rows.get(light.name)

@@ -7,7 +7,6 @@ the differences within a group.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_scene import SCALE, mitsuba_hair
 from reconstruction import Camera, Mesh, Strands, write_exr, write_obj
 from reconstruction.arrays import Array
+from reconstruction.files.durable import write_json, write_whole, writing
 from reconstruction.files.strands.usd import open_curves, write_usd
 
 SCALARS = ("beta_m", "beta_n", "eta", "tilt_deg")
@@ -40,7 +40,7 @@ def export_maps(maps: HairMaps, folder: Path) -> list[Path]:
             write_exr(written[-1], image)
     about = {"layers": len(maps.sigma_a), "units": "absorption per fibre radius; radians"}
     about |= {k: getattr(maps, k) for k in SCALARS}
-    (folder / "maps.json").write_text(json.dumps(about, indent=1) + "\n")
+    write_json(folder / "maps.json", about)
     return [*written, folder / "maps.json"]
 
 
@@ -114,16 +114,18 @@ def export_mitsuba(
             shapes.append(_hair(name, centres[i] ** 2, model.maps))
     if model.head is not None:
         scaled = Mesh(model.head.vertices * SCALE, model.head.faces)
-        write_obj(folder / "head.obj", scaled)
+        with writing(folder / "head.obj") as part:
+            write_obj(part, scaled)
         shapes.append(_head(model.appearance.skin))
     path = folder / "scene.xml"
-    path.write_text(
+    text = (
         '<scene version="3.0.0">\n <integrator type="path"><integer name="max_depth" value="16"/>'
         "</integrator>\n"
         + _sensor(camera, spp)
         + "".join(shapes)
         + ' <emitter type="constant"><rgb name="radiance" value="1 1 1"/></emitter>\n</scene>\n'
     )
+    write_whole(path, text.encode())
     return path
 
 
@@ -133,7 +135,8 @@ def _write_curves(path: Path, strands: Strands) -> None:
     ends = np.cumsum(np.diff(strands.offsets) + 2)
     lines = [" ".join(f"{x:.6g}" for x in row) for row in rows]
     parts = np.split(np.array(lines), ends[:-1])
-    path.write_text("\n\n".join("\n".join(part) for part in parts) + "\n")
+    text = "\n\n".join("\n".join(part) for part in parts) + "\n"
+    write_whole(path, text.encode())
 
 
 def _hair(file: str, sigma_a: Array, maps: HairMaps) -> str:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.found_lights import lights_as_found
+from appearance.inverse_rendering.found_lights import LIGHTS_FILE, lights_as_found
 from appearance.render.mixed import Environment, render_mixed
 from appearance.render.tracing import SAMPLING, Sampling
 from appearance.scene.hair_scene import HairScene, build_scene
@@ -26,7 +27,8 @@ class FittedModel:
 
     `maps` are of one cell where the hair is one material. `placed (S, 2)` are the roots' places on
     the scalp's map where they are known; they stay with the strands when they move. `rig` is the
-    capture's, its lights as inverse rendering found them.
+    capture's, its lights as inverse rendering found them; `found_lights` says how, row by row of
+    `lights.json`, empty where they were not fitted.
     """
 
     strands: Strands
@@ -35,6 +37,7 @@ class FittedModel:
     maps: HairMaps
     placed: Array | None = None
     rig: Rig | None = None
+    found_lights: Sequence[Mapping[str, Any]] = ()
 
     @classmethod
     def load(cls, model: Model, capture: Capture | None = None) -> FittedModel:
@@ -54,7 +57,8 @@ class FittedModel:
         rig = None
         if capture is not None:
             rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
-        return cls(strands, model.head(capture), appearance, maps, placed, rig)
+        found = model.json(LIGHTS_FILE) if model.has(LIGHTS_FILE) else ()
+        return cls(strands, model.head(capture), appearance, maps, placed, rig, found)
 
     @classmethod
     def alternatives(cls, model: Model, capture: Capture) -> dict[str, FittedModel]:
@@ -86,6 +90,8 @@ class FittedModel:
         appearance.save(model)
         if self.placed is not None or not self.maps.uniform:
             self.maps.save(model, self.root_uv)
+        if self.found_lights:
+            model.write_json(LIGHTS_FILE, list(self.found_lights))
 
     @cached_property
     def root_uv(self) -> Array:

@@ -76,29 +76,32 @@ def _write(path: Path, data: memoryview, flags: int) -> None:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[Path]:
-    """A temporary path to write to; afterwards `path` is whole on the disk.
+def writing(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """A temporary path to write to; afterwards `path` is whole, and where `durable` on the disk.
 
     Where the block raises, nothing is left of what it wrote.
     """
     temporary = part(path)
     try:
         yield temporary
-        replace_durably(temporary, path)
+        if durable:
+            flush(temporary)
+        temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes, *, durable: bool = True) -> None:
     """Write a small file: temporary name, flush, rename. A failed one leaves nothing."""
-    with naming_full_disk(path, len(data)), writing(path) as temporary:
+    with naming_full_disk(path, len(data)), writing(path, durable=durable) as temporary:
         temporary.write_bytes(data)
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: Any, *, durable: bool = True) -> None:
     """Write JSON; numbers that are not finite are an error, never NaN."""
-    write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+    text = json.dumps(data, indent=1, allow_nan=False) + "\n"
+    write_whole(path, text.encode(), durable=durable)
 
 
 def append_whole(file: FileIO, data: bytes) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +67,7 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
     from reconstruction import Capture, Rig
     from reconstruction.calibration.rig_comparison import compare_rigs
     from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
+    from reconstruction.files.durable import write_json
     from stage_service.config import load_rig_file
 
     if args.out.suffix != ".json":
@@ -103,7 +103,7 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
             keep_lens=args.keep_lens,
             progress=progress,
         )
-    args.out.write_text(json.dumps({**rig.to_dict(), **tables}, indent=1) + "\n")
+    write_json(args.out, {**rig.to_dict(), **tables})
     load_rig_file(args.out)
     report.save(args.out.with_suffix(".report.json"))
     data: dict[str, Any] = {

@@ -40,6 +40,7 @@ def run_fit(args: argparse.Namespace, output: Output) -> None:
     import numpy as np
 
     from reconstruction import read_obj, write_obj
+    from reconstruction.files.durable import writing
     from reconstruction.files.points import read_points
     from reconstruction.head.fit import HeadHints, fit_head
     from reconstruction.head.generic import generic_head
@@ -50,7 +51,8 @@ def run_fit(args: argparse.Namespace, output: Output) -> None:
     points, normals = read_points(args.points)
     turn = None if args.turn_deg is None else float(np.radians(args.turn_deg))
     fit = fit_head(points, normals, shape, hints=HeadHints(part=args.part, turn=turn))
-    write_obj(args.out, fit.mesh)
+    with writing(args.out) as part:
+        write_obj(part, fit.mesh)
     rms, used = 1e3 * fit.deformed.to_mesh_rms, 1 - float(fit.outliers.mean())
     lines = [f"{args.out}: {rms:.2f} mm rms from {used:.0%} of {len(points)} points"]
     lines += [f"warning: {w}" for w in fit.warnings]
@@ -74,11 +76,13 @@ def run_mark(args: argparse.Namespace, output: Output) -> None:
     the generic head's frame, for 'head fit --mesh' or the option head_mesh.
     """
     from reconstruction import read_obj, write_obj
+    from reconstruction.files.durable import writing
     from reconstruction.head.template import template
 
     _require_obj(args.out)
     mesh, fit = template(read_obj(args.mesh), up=args.up, above=args.above)
-    write_obj(args.out, mesh)
+    with writing(args.out) as part:
+        write_obj(part, mesh)
     assert mesh.scalp is not None
     scalp = float(mesh.face_areas()[mesh.scalp].sum() * 1e4)
     data = {"head": str(args.out), "faces": len(mesh.faces), "scalp_cm2": scalp}

@@ -63,7 +63,7 @@ class StepProgress:
             step_share=step_share,
         )
         told = {"job": self._job, **progress.model_dump(mode="json")}
-        self._model.write_json("progress.json", told)
+        self._model.write_json("progress.json", told, durable=False)  # five times a second
 
 
 def read_progress(model: Model, job: str) -> JobProgress | None:

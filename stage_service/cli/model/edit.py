@@ -80,8 +80,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         )
     if args.out.exists() and any(args.out.iterdir()):
         raise BadArgument(f"--out {args.out} is not empty: choose a new folder")
-    source = Model(args.model)
-    fitted = FittedModel.load(source, Capture(args.capture) if args.capture else None)
+    fitted = FittedModel.load(Model(args.model), Capture(args.capture) if args.capture else None)
     if args.strands is not None:
         fitted = restyled(fitted, read_strands(args.strands))
     if args.cut is not None:
@@ -92,8 +91,11 @@ def run(args: argparse.Namespace, output: Output) -> None:
         fitted = fitted.with_maps(roughened(fitted.maps, args.roughen))
     model = Model(args.out)
     fitted.save(model)
-    if source.has("lights.json"):
-        model.write_json("lights.json", source.json("lights.json"))
+    if fitted.head is None:
+        output.note(
+            f"warning: {args.model} holds no head, so {model} has none and is rendered without: "
+            "give --capture where the capture has one"
+        )
     data: dict[str, Any] = {"model": str(model), "strands": len(fitted.strands)}
     data["edits"] = {k: str(v) if isinstance(v, Path) else v for k, v in edits.items()}
     output.result(data, f"{model}: {', '.join(edits)}; see it with 'hairstage render {model}'")

@@ -133,6 +133,8 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
 
 
 def _demo_results(path: Path) -> dict[str, Any]:
+    from stage_service.cli.support.tables import figures_of
+
     try:
         results = json.loads(path.read_text())
     except ValueError as e:
@@ -141,4 +143,9 @@ def _demo_results(path: Path) -> dict[str, Any]:
         raise BadArgument(f"{path} is not a JSON object: not a demo's results.json")
     if absent := [field for field in _DEMO_FIELDS if field not in results]:
         raise BadArgument(f"{path} has no {', '.join(absent)}: not a demo's results.json")
+    try:
+        figures_of([results])
+    except (KeyError, TypeError, AttributeError, ValueError) as e:
+        what = f"no {e}" if isinstance(e, KeyError) else f"a figure of another kind ({e})"
+        raise BadArgument(f"{path} has {what} where a demo's results.json has one") from e
     return results
