@@ -44,10 +44,15 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+OWNER_WORDS = 17
+"""Registers that say who has a bank: a number, then 32 characters of ASCII."""
+
+
 class LightRegisters(Strict):
     """`[devices.lights.registers]`: Modbus addresses; the defaults are those of docs/wire.md.
 
-    Holding registers, then input registers; `levels`, `coils` and `table` are the first of many.
+    Holding registers, then input registers; `levels`, `coils`, `table` and `owner` are the first of
+    many. Without `owner` services of several machines do not see each other.
     None, "none" in TOML: the bank has no such register. Without `selector` lamps are put on by
     coils; without `heartbeat` and `watchdog` there is no dead-man, without `lit` no read-back,
     without `sequence`, `table` and `position` no hardware stepping. `signature` is (address,
@@ -61,6 +66,7 @@ class LightRegisters(Strict):
     heartbeat: Address | None = 1001
     watchdog: Address | None = 1002
     sequence: Address | None = 1003
+    owner: Address | None = 1004
     table: Address | None = 2000
     status: Address | None = 0
     lit: Address | None = 1

@@ -73,9 +73,12 @@ class Service:
     name, recorded, and refused (`Leased`) while somebody else holds the lease.
     """
 
-    def __init__(self, rig_file: RigFile, root: Path) -> None:
+    def __init__(self, rig_file: RigFile, root: Path, *, take_over: bool = False) -> None:
         self.rig_file, self.root = rig_file, root
-        self._captures = CaptureManager(rig_file, root, on_complete=self._completed)
+        self._captures = CaptureManager(
+            rig_file, root, on_complete=self._completed, take_over=take_over
+        )
+        self._has_stage = False
         self._control = Control(self._captures.audit)
         self._queue = JobQueue(root)
         self._follower = JobFollower(root, self._queue, self._captures.events)
@@ -90,12 +93,22 @@ class Service:
 
     def start(self) -> None:
         """Lights off; then what is on the disk; then, beside all else, the jobs: what a crash kept
-        from being enqueued, and what becomes of them."""
+        from being enqueued, and what becomes of them.
+
+        Raises `StageInUse`, and touches nothing, where another service has the stage.
+        """
+        if not self._has_stage:
+            self.take_stage()
         self._captures.darken()
         for status in self._captures.list():
             if status.outcome == "completed":
                 self._follower.owe(status, fresh=False)
         self._follower.start()
+
+    def take_stage(self) -> None:
+        """Have the stage for this service alone. Raises `StageInUse`."""
+        self._captures.take_stage()
+        self._has_stage = True
 
     def close(self) -> None:
         """Abort what runs, lights off; afterwards let go of the job database."""

@@ -15,6 +15,7 @@ ALL_ON = 65535
 COILS_WERE_WRITTEN = 65534
 WATCHDOG_MS = (100, 60_000)
 ENTRIES = 4096
+OWNER_WORDS = 17
 
 
 class NotNow(Exception):
@@ -47,6 +48,7 @@ class Lamps:
         self._table = np.zeros((ENTRIES, 2), np.uint16)
         self._armed = self._position = 0
         self._gate = False
+        self._owner = [0] * OWNER_WORDS
         self._stuck = np.zeros(count, bool)
         self._cut: Callable[[], tuple[bool, bool]] = lambda: (False, False)
 
@@ -187,6 +189,21 @@ class Lamps:
             self._heartbeat = value
             self._fed = self._clock()
             self._tripped = False
+
+    def owner(self) -> list[int]:
+        """Number and name of who has the bank."""
+        with self._lock:
+            return list(self._owner)
+
+    def own(self, first: int, words: Sequence[int]) -> None:
+        """Write the owner's number and name from word `first`; raises `NotNow` for a number while
+        there is another. A new number has no name yet. It decides nothing else."""
+        with self._lock:
+            if first == 0 and words[0] != self._owner[0]:
+                if words[0] and self._owner[0]:
+                    raise NotNow
+                self._owner = [0] * OWNER_WORDS
+            self._owner[first : first + len(words)] = words
 
     def watch(self, milliseconds: int) -> bool:
         """Set the watchdog time; False, and nothing happens, when it is out of range."""

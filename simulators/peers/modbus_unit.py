@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from simulators.peers.faults import Fault
-from simulators.peers.lamps import ENTRIES, FULL, Lamps, NotNow
+from simulators.peers.lamps import ENTRIES, FULL, OWNER_WORDS, Lamps, NotNow
 from stage_service.config import LightRegisters
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, FAILURE = 1, 2, 3, 4
@@ -69,6 +69,7 @@ class ModbusUnit:
             (r.heartbeat, 1, lambda: lamps.control()[1:2], lambda _, v: lamps.beat(v[0])),
             (r.watchdog, 1, lambda: lamps.control()[2:], _accepted(lamps.watch)),
             (r.sequence, 1, lambda: lamps.sequence()[:1], _accepted(lamps.arm)),
+            (r.owner, OWNER_WORDS, lamps.owner, lamps.own),
             (r.table, 2 * ENTRIES, self._table, self._load),
         )
         signature = r.signature or (None, 0)

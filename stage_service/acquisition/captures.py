@@ -24,6 +24,7 @@ from stage_service.acquisition.states import CaptureStatus, WrongState, possible
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.last_seen import LastSeen
+from stage_service.devices.ownership import Ownership
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.flash import SLOW_HZ, FlashRefusal
 from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
@@ -62,7 +63,8 @@ class CaptureManager:
     Folders found at the first look are listed: without a manifest as interrupted, unreadable ones
     as damaged. Constructing connects to nothing and reads no capture; `start`, `devices`,
     `blackout` and `darken` talk to the stage, all through one `DeviceSet`. Raises `RootInUse` while
-    another manager has this root.
+    another manager has this root, `StageInUse` while one on this machine has the stage; `take_over`
+    says that one on another machine has it no more.
 
     A blackout that could not be verified is latched (`latch`): nothing is lit until that is over.
     `audit` is where the captures' ends and the latch are recorded.
@@ -73,11 +75,20 @@ class CaptureManager:
         rig_file: RigFile,
         root: Path,
         on_complete: Callable[[CaptureStatus], object] | None = None,
+        *,
+        take_over: bool = False,
     ) -> None:
         self.rig_file = rig_file
         self.folder = root / "captures"
         self.folder.mkdir(parents=True, exist_ok=True)
         self._root_lock = RootLock(root)
+        self._ownership = None
+        if rig_file.devices is not None:
+            try:
+                self._ownership = Ownership(rig_file.devices.lights, root, take_over)
+            except BaseException:
+                self._root_lock.release()
+                raise
         self.audit = AuditLog(root / "audit.jsonl")
         self.latch = Latch(root / "unsafe.json")
         self._dark: Blackout | None = None
@@ -190,6 +201,7 @@ class CaptureManager:
             self._preparing, blackouts = capture_id, self._blackouts
         run = None
         try:
+            self.take_stage()  # the bank may have been switched off, and its owner forgotten
             run = make()
             with self._lock:
                 if self._closed or self._blackouts != blackouts:
@@ -303,6 +315,16 @@ class CaptureManager:
             return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
         return {"state": last.state, "detail": last.detail, "latched": None}
 
+    def take_stage(self) -> None:
+        """Have the stage for this service, before anything is commanded. Raises `StageInUse`."""
+        if self._ownership is None:
+            return
+        with self._talking:
+            try:
+                self._ownership.claim(self._devices.lights)
+            finally:
+                self._devices.close()
+
     def darken(self) -> None:
         """Put everything off that answers, as the service starts; what does not is latched."""
         if self.rig_file.devices is None:
@@ -354,6 +376,8 @@ class CaptureManager:
             if run.thread.is_alive():  # it is stuck somewhere
                 self._learn(result)
         self._stay_on_exit()
+        if self._ownership is not None:
+            self._ownership.release(self._devices.lights)
         self._root_lock.release()
 
     def _steer(self, capture_id: str, action: str) -> CaptureStatus:

@@ -26,6 +26,7 @@ from stage_service.acquisition.captures import Busy, UnknownCapture
 from stage_service.acquisition.control import Forbidden
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
+from stage_service.devices.ownership import StageInUse
 from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
@@ -65,6 +66,8 @@ bad-input 422 A file or name in the request cannot be used
     `detail` names it and says what was expected. Paths are those of the service's machine.
 busy 409 Another capture is running
     The stage makes one capture at a time. Wait for `running`, or abort it.
+stage-in-use 409 Another service has this stage
+    `detail` says which. Stop it; where its machine is dead, start this one with `--take-over`.
 flash-rate 422 A living subject would see flashes of 3 to 30 Hz
     `problems` has the ways out: a slower plan, or recorded consent that somebody at the stage
     arms. docs/safety.md says why. No lamp was touched.
@@ -130,6 +133,7 @@ BY_ERROR: dict[type[Exception], str] = {
     JournalInUse: "journal-in-use",
     FlashRefusal: "flash-rate",
     Unsafe: "unsafe",
+    StageInUse: "stage-in-use",
     CannotAcknowledge: "cannot-acknowledge",
     Leased: "leased",
     NoLease: "no-lease",

@@ -8,9 +8,11 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import IO
 
 
 class Leased(RuntimeError):
@@ -117,30 +119,73 @@ def _same(token: str | None, own: str) -> bool:
     return token is not None and secrets.compare_digest(token.encode(), own.encode())
 
 
+class LockedBy(OSError):
+    """Somebody else holds the lock; the message is what they left in it."""
+
+
+class FileLock:
+    """Held until `release`; the kernel frees it when the process dies. `text` says who holds it.
+
+    A lock that is `shared` may be taken by every user of the machine. Raises `LockedBy`.
+    """
+
+    def __init__(self, path: Path, text: str, shared: bool = False) -> None:
+        self._path = path
+        while True:
+            self._file = _opened(path, shared)
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                with self._file:
+                    raise LockedBy(self._file.read(1000).strip() or "unknown") from None
+            if self._is_there():
+                break
+            self._file.close()  # it was released, and removed, in between
+        self._file.truncate(0)
+        self._file.write(f"{text}\n")
+        self._file.flush()
+
+    def release(self) -> None:
+        """Give it up before the process ends."""
+        if not self._file.closed:
+            with suppress(OSError):  # another user's file in a folder for all
+                self._path.unlink()
+            self._file.close()
+
+    def _is_there(self) -> bool:
+        try:
+            return os.fstat(self._file.fileno()).st_ino == self._path.stat().st_ino
+        except FileNotFoundError:
+            return False
+
+
+def _opened(path: Path, shared: bool) -> IO[str]:
+    """The file at `path`, made where there is none. In a folder for all, as /tmp, the kernel lets
+    nobody open another user's file who would have made it."""
+    try:
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except FileNotFoundError:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
+            if shared:
+                os.fchmod(handle, 0o666)
+    except PermissionError as error:
+        raise LockedBy(f"another user, to whom {path} belongs") from error
+    return os.fdopen(handle, "r+")
+
+
 class RootInUse(OSError):
     """Another service drives the stage of this root folder."""
 
 
-class RootLock:
-    """Held for as long as a service uses `root`; the kernel frees it when the process dies."""
+class RootLock(FileLock):
+    """Held for as long as a service uses `root`."""
 
     def __init__(self, root: Path) -> None:
-        path = root / "service.lock"
-        self._file = path.open("a+")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._file.seek(0)
-            owner = self._file.read().strip() or "unknown"
-            self._file.close()
+            super().__init__(root / "service.lock", str(os.getpid()))
+        except LockedBy as error:
             raise RootInUse(
-                f"{root} is in use by the service with process id {owner}: two services must not "
+                f"{root} is in use by the service with process id {error}: two services must not "
                 "drive one stage. Stop that one, or use another --root for another stage"
             ) from None
-        self._file.truncate(0)
-        self._file.write(f"{os.getpid()}\n")
-        self._file.flush()
-
-    def release(self) -> None:
-        """Give the root up before the process ends."""
-        self._file.close()

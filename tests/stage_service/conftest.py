@@ -32,6 +32,7 @@ class World:
         self.levels = [65535] * LAMPS
         self.table = [0] * 8192
         self.armed = self.position = 0
+        self.owner = [0] * 17
         self.show = "OFF"
         self.pulses = 0
         self.heartbeats = 0
@@ -96,7 +97,7 @@ class Lights(socketserver.BaseRequestHandler):
             inputs = [bits, len(world.lit), LAMPS, 0x4853, world.position]
             return struct.pack(f">BB{value}H", 4, 2 * value, *inputs[address : address + value])
         if function == 3:
-            holding = {1003: [world.armed], 0: world.levels}.get(address)
+            holding = {1003: [world.armed], 1004: world.owner, 0: world.levels}.get(address)
             words = (holding or world.table[address - 2000 :])[:value]
             return struct.pack(f">BB{value}H", 3, 2 * value, *words)
         if function == 16:
@@ -104,8 +105,14 @@ class Lights(socketserver.BaseRequestHandler):
                 return struct.pack(">BB", 0x90, 3)
             values = struct.unpack(f">{value}H", pdu[6:])
             store, first = (world.table, 2000) if address >= 2000 else (world.levels, 0)
+            if address > 1004 and address < 2000:
+                store, first = world.owner, 1004
             store[address - first : address - first + value] = values
             return struct.pack(">BHH", 16, address, value)
+        if address == 1004 and value != world.owner[0]:
+            if value and world.owner[0]:
+                return struct.pack(">BB", 0x86, 4)
+            world.owner = [value] + 16 * [0]
         if address == 1003:
             world.armed, world.position = value, 0
         if address == 1000 and world.armed:

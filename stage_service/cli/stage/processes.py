@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING
 from stage_service.cli.stage.tokens import TOKENS
 from stage_service.cli.support.commands import (
     PRIVATE,
+    UNREACHABLE,
     BadArgument,
+    CommandError,
     Commands,
     Output,
     add_command,
@@ -40,6 +42,9 @@ def add(commands: Commands) -> None:
     serve.add_argument("--tls-cert", type=Path, help="certificate and what leads to it, PEM")
     serve.add_argument("--tls-key", type=Path, help="its key, where that file lacks it")
     serve.add_argument("--name", action="append", default=[], help="a host name of this service")
+    serve.add_argument(
+        "--take-over", action="store_true", help="the service that has the stage is dead"
+    )
     serve.add_argument(
         "--no-auth", action="store_true", help="everybody on this machine may do everything"
     )
@@ -69,6 +74,7 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     log_to_stderr()
     from stage_service.api.app import Endpoint, serve
     from stage_service.config import load_rig_file
+    from stage_service.devices.ownership import StageInUse
     from stage_service.service import Service
 
     exit_on_sigterm()
@@ -80,7 +86,12 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             "or they could be overheard"
         )
     access = _access(args, output)
-    service = Service(load_rig_file(args.rig, args.devices), args.root)
+    rig_file = load_rig_file(args.rig, args.devices)
+    try:
+        service = Service(rig_file, args.root, take_over=args.take_over)
+        service.take_stage()
+    except StageInUse as error:
+        raise CommandError(str(error), UNREACHABLE, "StageInUse") from error
 
     def ready(url: str) -> None:
         text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"

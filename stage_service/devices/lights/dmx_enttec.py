@@ -104,6 +104,9 @@ class DmxLightBank:
     def heartbeat(self) -> None:
         raise limits.cannot(self.name, "sending a heartbeat", "a watchdog")
 
+    def claim(self, number: int, name: str) -> str | None:
+        raise limits.cannot(self.name, "taking the stage", "an owner register")
+
     def status(self) -> LightStatus:
         raise limits.cannot(self.name, "reading the status", "read-back")
 

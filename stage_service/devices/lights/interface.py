@@ -15,12 +15,14 @@ class LightCapabilities:
     """What link and device can do.
 
     `reads_back`: a blackout can be verified. `dead_man`: the lamps go off by themselves when
-    heartbeats stop. `table`: entries of its sequence table; 0 where it has none.
+    heartbeats stop. `table`: entries of its sequence table; 0 where it has none. `owned`: it keeps
+    who has it.
     """
 
     reads_back: bool
     dead_man: bool
     table: int
+    owned: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,12 @@ class LightBank(Protocol):
 
     def heartbeat(self) -> None:
         """Tell the watchdog that somebody is there."""
+
+    def claim(self, number: int, name: str) -> str | None:
+        """Have the bank for the service `number`, 1 to 65535, until that is written over by 0.
+
+        Returns None, or the name that another service gave, which goes on having it.
+        """
 
     def status(self) -> LightStatus:
         """Read the status back."""

@@ -90,6 +90,9 @@ class LimitedLightBank:
     def set_watchdog(self, seconds: float) -> None:
         self._bank.set_watchdog(seconds)
 
+    def claim(self, number: int, name: str) -> str | None:
+        return self._bank.claim(number, name)
+
     def heartbeat(self) -> None:
         """Tell the watchdog that somebody is there, unless lamps had to be put off."""
         self._raise_refusal()

@@ -8,7 +8,7 @@ from typing import Any
 
 from pymodbus import ModbusException
 
-from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
+from stage_service.config import OWNER_WORDS, ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits, modbus_answers
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
@@ -43,6 +43,7 @@ class ModbusLightBank:
             reads_back=r.lit is not None,
             dead_man=None not in (r.heartbeat, r.watchdog),
             table=TABLE_ENTRIES if config.sequences else 0,
+            owned=r.owner is not None,
         )
         self.count = lamps
         self._level: int | None = None
@@ -118,6 +119,24 @@ class ModbusLightBank:
     def heartbeat(self) -> None:
         doing = "sending a heartbeat"
         self._write([1], self._required(self._map.heartbeat, doing, "a heartbeat register"), doing)
+
+    def claim(self, number: int, name: str) -> str | None:
+        """Write `number` to the owner register, which refuses it (exception 4) while it holds
+        another's, and the name behind it."""
+        doing = "taking the stage" if number else "giving the stage up"
+        first = self._required(self._map.owner, doing, "an owner register")
+        with self._lock:
+            self._trust()
+            try:
+                self._exchange(doing, "write_register", first, number)
+            except DeviceError:
+                held, *words = self._read("read_holding_registers", first, OWNER_WORDS, doing)
+                if held in (0, number):
+                    raise
+                return _text(words) or f"a service that gave no name ({held})"
+            if number:
+                self._exchange(doing, "write_registers", first + 1, _words(name))
+        return None
 
     def status(self) -> LightStatus:
         doing = "reading the status"
@@ -329,3 +348,17 @@ class ModbusLightBank:
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
         return DeviceError(self.name, doing, expected, received, todo)
+
+
+def _words(name: str) -> list[int]:
+    """A name as the registers behind the owner's number: two characters each, then zeros."""
+    data = name.encode("ascii", "replace")[: 2 * (OWNER_WORDS - 1)].ljust(
+        2 * (OWNER_WORDS - 1), b"\0"
+    )
+    return [data[i] << 8 | data[i + 1] for i in range(0, len(data), 2)]
+
+
+def _text(words: list[int]) -> str:
+    """The name in these registers."""
+    data = b"".join(word.to_bytes(2, "big") for word in words).partition(b"\0")[0]
+    return "".join(c if c.isprintable() else "?" for c in data.decode("ascii", "replace"))

@@ -37,6 +37,7 @@ COILS_ALONE = LightRegisters(
     watchdog=None,
     sequence=None,
     table=None,
+    owner=None,
     status=None,
     lit=None,
     count=None,
@@ -52,6 +53,7 @@ ELSEWHERE = LightRegisters(
     watchdog=30,
     sequence=40,
     table=20000,
+    owner=600,
     status=9,
     lit=7,
     count=100,
@@ -180,6 +182,7 @@ class Foreign(DataHandler):  # type: ignore[misc]
         self.on = [False] * lamps
         self.holding = dict.fromkeys(range(lamps), 65535)
         self.holding |= {1000: 0, 1001: 0, 1002: 2000, 1003: 0}
+        self.holding |= dict.fromkeys(range(1004, 1021), 0)
         self.holding |= dict.fromkeys(range(2000, 2000 + 8192), 0)
 
     def powers(self) -> list[float]:
@@ -199,6 +202,10 @@ class Foreign(DataHandler):  # type: ignore[misc]
             return self.Return(3)
         if address == 1000 and self.holding[1003]:
             return self.Return(4)
+        if address == 1004 and words_l[0] != self.holding[1004]:
+            if words_l[0] and self.holding[1004]:
+                return self.Return(4)
+            self.holding |= dict.fromkeys(range(1005, 1021), 0)
         self.holding |= dict(enumerate(words_l, address))
         if address in (1000, 1003):
             what = words_l[0] if address == 1000 else 0

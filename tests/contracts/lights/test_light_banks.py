@@ -246,3 +246,23 @@ def test_dmx_levels_are_rounded_to_8_bits_and_none_vanishes(bench):
         assert set(one.powers()) == {word / 255}
     with pytest.raises(DeviceError, match=r"more than 0\.00196: it has 255 levels above 0"):
         one.driver.set_level(0.0019)
+
+
+def test_it_keeps_who_has_it(bank):
+    driver = bank.driver
+    assert driver.claim(7, "left:123") is None
+    assert driver.claim(7, "left:124") is None  # the same service, started anew
+    driver.close()  # a connection decides nothing
+    assert driver.claim(9, "right:5") == "left:124"
+    driver.all_on()
+    driver.off()  # who has the bank is for services to heed; off is for everybody
+    assert driver.claim(9, "right:5") == "left:124"
+    assert driver.claim(0, "") is None
+    assert driver.claim(9, 40 * "ü") is None
+    assert driver.claim(65535, "x") == 32 * "?"
+
+
+def test_an_owner_without_a_name_is_one(bank):
+    first = bank.driver.config.registers.owner
+    bank.driver._exchange("claiming", "write_register", first, 300)
+    assert bank.driver.claim(7, "left:123") == "a service that gave no name (300)"

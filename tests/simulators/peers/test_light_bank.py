@@ -66,7 +66,7 @@ def test_values_out_of_range_are_refused(bench, address, value):
 def test_unknown_addresses_are_refused(bench):
     assert bench.lights.write_register(5, 1).exception_code == ILLEGAL_ADDRESS
     assert bench.lights.write_coil(5, True).exception_code == ILLEGAL_ADDRESS
-    assert bench.lights.read_holding_registers(1004).exception_code == ILLEGAL_ADDRESS
+    assert bench.lights.read_holding_registers(1021).exception_code == ILLEGAL_ADDRESS
 
 
 def test_watchdog_puts_lamps_off_until_commanded_again(bench):
