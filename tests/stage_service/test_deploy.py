@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import configparser
+import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -13,11 +16,28 @@ from stage_service.cli.support.commands import rig_path
 from stage_service.config import load_rig_file
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
-
-
-@pytest.mark.parametrize(
+MOST_EXPOSED = 3.0
+UNITS = pytest.mark.parametrize(
     "unit", sorted((DEPLOY / "systemd").glob("*.service")), ids=lambda p: p.name
 )
+
+
+@UNITS
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+def test_units_are_sound_and_confined(unit, tmp_path):
+    """By systemd's own judgement: 10 is a unit without any confinement."""
+    copy = tmp_path / unit.name
+    copy.write_text(unit.read_text().replace("/opt/hairstage/.venv/bin/hairstage", "/bin/true"))
+    verified = subprocess.run(["systemd-analyze", "verify", copy], capture_output=True, text=True)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    command = ["systemd-analyze", "security", "--offline=yes", "--no-pager", copy]
+    said = subprocess.run(command, capture_output=True, text=True).stdout
+    found = re.search(r"Overall exposure level for \S+: ([\d.]+)", said)
+    assert found, said
+    assert float(found[1]) <= MOST_EXPOSED
+
+
+@UNITS
 def test_units_start_commands_that_there_are(unit):
     read = configparser.ConfigParser(strict=False, interpolation=None)
     read.optionxform = str
