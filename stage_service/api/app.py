@@ -50,7 +50,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
             }
         },
     )
-    app.state.service, app.state.lanes = service, Lanes()
+    app.state.service, app.state.lanes, app.state.streams = service, Lanes(), 0
     install_problems(app)
     for part in (routes, steering, event_stream):
         app.include_router(part.reading)

@@ -13,6 +13,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 LOOPBACK = "127.0.0.1"
 MOST_CONNECTIONS = 512
 """Half of the descriptors that `select`, and most systems, allow a process."""
+MOST_STREAMS = 256
+"""Of events, which never end: the other places are for requests."""
 HEADER_S = 5.0
 """A request's headers are there within this time."""
 MOST_HEADER_BYTES = 16 << 10
@@ -23,7 +25,7 @@ class Connection(H11Protocol):
     """uvicorn's connection with a deadline for headers, and a place for each that has a request.
 
     Where there are `most`, a new one takes the place of the one that has waited longest for its
-    request: whoever holds connections open keeps nobody from a blackout.
+    request, or the rest of it: whoever holds connections open keeps nobody from a blackout.
     """
 
     most = MOST_CONNECTIONS
@@ -58,7 +60,11 @@ class Connection(H11Protocol):
 
     @property
     def waits(self) -> bool:
-        """Whether no request is under way on it."""
+        """Whether no whole request is under way on it."""
+        return self._between or self.cycle.more_body
+
+    @property
+    def _between(self) -> bool:
         return self.cycle is None or self.cycle.response_complete
 
     def drop(self) -> None:
@@ -67,14 +73,14 @@ class Connection(H11Protocol):
         self.transport.abort()
 
     def _expect_headers(self) -> None:
-        if not self.waits:
+        if not self._between:
             self._forget_deadline()
         elif self._deadline is None:
             self._deadline = self.loop.call_later(HEADER_S, self._too_late)
 
     def _too_late(self) -> None:
         self._deadline = None
-        if self.waits:
+        if self._between:
             self.drop()
 
     def _forget_deadline(self) -> None:

@@ -8,9 +8,10 @@ from collections.abc import AsyncIterator
 from dataclasses import asdict
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Header, HTTPException, Query, Request
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
+from stage_service.api.connections import MOST_STREAMS
 from stage_service.api.steering import READS
 from stage_service.records.events import EventLog
 
@@ -34,6 +35,8 @@ async def stream_events(
     Without either, only new ones; 0 replays all that are kept. Numbers start at 1 with the service:
     a number that it has not reached yet is from before a restart, and replays everything.
     """
+    if request.app.state.streams >= MOST_STREAMS:
+        raise HTTPException(503, f"{MOST_STREAMS} listeners follow the events already")
     events: EventLog = request.app.state.service.events
     asked = last_event_id if last_event_id is not None else after
     newest = events.last
@@ -44,7 +47,11 @@ async def stream_events(
 async def _follow(
     request: Request, events: EventLog, number: int
 ) -> AsyncIterator[ServerSentEvent]:
-    while not await request.is_disconnected():
-        for event in await asyncio.to_thread(events.wait, number, POLL_S):
-            number = event.number
-            yield ServerSentEvent(id=str(number), event=event.kind, data=json.dumps(asdict(event)))
+    request.app.state.streams += 1
+    try:
+        while not await request.is_disconnected():
+            for event in await asyncio.to_thread(events.wait, number, POLL_S):
+                number, data = event.number, json.dumps(asdict(event))
+                yield ServerSentEvent(id=str(number), event=event.kind, data=data)
+    finally:
+        request.app.state.streams -= 1

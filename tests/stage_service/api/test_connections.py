@@ -16,6 +16,7 @@ from stage_service.api import connections
 from stage_service.api.connections import Connection, limits, listening, protocol
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+SLOW = b"POST /slow HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\nx"
 HALF = b"GET / HTTP/1.1\r\nHost: x\r\nX: "
 
 
@@ -25,6 +26,8 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], socke
     monkeypatch.setattr(Connection, "most", 3)
 
     async def app(scope, receive, send):
+        while scope["path"] == "/slow" and (await receive()).get("more_body"):
+            pass
         await send({"type": "http.response.start", "status": 200, "headers": []})
         while scope["path"] == "/stay" and (await receive())["type"] != "http.disconnect":
             pass
@@ -62,8 +65,9 @@ def ended(connection: socket.socket) -> bool:
     return True
 
 
-def test_whoever_holds_connections_open_keeps_nobody_out(connect):
-    held = [connect(HALF) for _ in range(9)]
+@pytest.mark.parametrize("data", [b"", HALF, SLOW])
+def test_whoever_holds_connections_open_keeps_nobody_out(connect, data):
+    held = [connect(data) for _ in range(9)]
     assert connect(REQUEST).recv(12) == b"HTTP/1.1 200"
     assert all(ended(one) for one in held[:6])
 

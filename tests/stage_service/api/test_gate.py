@@ -12,7 +12,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from stage_service.api import gate
+from stage_service.api import event_stream, gate
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.cli import main
@@ -187,6 +187,11 @@ def test_a_page_of_another_site_asks_in_vain(service, origin):
     for host in ("evil.example", "127.0.0.1.evil.example", ""):
         refused(send(app, "GET /lease", {"Host": host}), "http", 421)
     assert [a.action for a in service.audit(10)] == ["blackout"]
+
+
+def test_listeners_leave_places_for_requests(ask, tokens, monkeypatch):
+    monkeypatch.setattr(event_stream, "MOST_STREAMS", 0)
+    assert "already" in refused(ask("GET /events", "mine"), "http", 503)["detail"]
 
 
 def test_a_request_is_no_larger_than_it_need_be(ask, tokens):
