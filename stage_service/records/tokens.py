@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import pwd
 import secrets
 import threading
 from pathlib import Path
@@ -58,7 +59,7 @@ class Tokens:
         """Whose token this is."""
         hashed = _hash(token)
         if hashed == self._own:
-            return Identity(name="owner", scopes=SCOPES)
+            return Identity(name=_user(), scopes=SCOPES)
         return self._known().get(hashed)
 
     def entries(self) -> list[Entry]:
@@ -133,6 +134,13 @@ def write_secret(path: Path, text: str) -> None:
     with writing(path) as temporary:
         temporary.touch(0o600)
         temporary.write_text(text)
+
+
+def _user() -> str:
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # a container's user may have no name
+        return f"user {os.getuid()}"
 
 
 def _hash(token: str) -> str:
