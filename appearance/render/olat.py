@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -79,19 +79,58 @@ def render_olat(
     `OlatOptions`. Same arguments, same bytes, with any number of threads.
     Raises `ValueError` for options out of range.
     """
-    chosen = OlatOptions(**options)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    size = camera.height * camera.width if pixels is None else len(index)
-    out = np.zeros((len(lights), size, 3), np.float32)
-    if len(lights) and len(index):
-        plan = _plan(scene, camera, lights, index, chosen, seed)
+    (out,) = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed, 1)
+    return out if pixels is not None else spread_out(out, index, camera)
+
+
+def render_olat_parts(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    pixels: ArrayLike,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> tuple[Floats, Floats]:
+    """`render_olat` of `pixels (P,)` in two parts, `(L, P, 3)` each, of the same paths.
+
+    The first is the light that reaches the first hit directly, the second what comes by way of
+    others.
+    """
+    index = pixel_indices(camera, pixels)
+    out = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed, 2)
+    return out[0], out[1]
+
+
+def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
+    """Images `(L, H, W, 3)` of `radiance (L, P, 3)` at the flat `index (P,)`, 0 elsewhere."""
+    out = np.zeros((len(radiance), camera.height * camera.width, 3), np.float32)
+    out[:, index] = radiance
+    return out.reshape(-1, camera.height, camera.width, 3)
+
+
+class _View(NamedTuple):
+    """What is rendered: the flat `pixels (P,)` of a camera under each of the lights."""
+
+    scene: HairScene
+    camera: Camera
+    lights: Sequence[Light]
+    pixels: Ints
+
+
+def _rendered(view: _View, options: OlatOptions, seed: int, films: int) -> Floats:
+    """`(films, L, P, 3)`: all light on one film, or direct and other light on two."""
+    index, count = view.pixels, len(view.lights)
+    out = np.zeros((films, count, len(index), 3), np.float32)
+    if out.size:
+        plan = replace(_plan(view, options, seed), films=films)
         # the film, its copy and the mean; each tile is spread over the whole image
-        tiles = tile_count(index, 3 * 12 * len(lights), chosen.memory)
+        tiles = tile_count(index, films * 3 * 12 * count, options.memory)
         for k in range(tiles):
             part = slice(k, None, tiles)
-            radiance = plan.render(index[part], chosen.spp, (seed, k))
-            out[:, index[part] if pixels is None else part] = radiance
-    return out if pixels is not None else out.reshape(-1, camera.height, camera.width, 3)
+            out[:, :, part] = plan.render(index[part], options.spp, (seed, k))
+    return out
 
 
 @dataclass(frozen=True)
@@ -99,7 +138,8 @@ class _Plan:
     """What is rendered, and how paths and shadow rays are spent.
 
     `counts`: lights asked at the first and at later vertices. `dim (L,)`: contributions below this
-    radiance cast their shadow ray with a probability in proportion.
+    radiance cast their shadow ray with a probability in proportion. Two `films` part the light of
+    the first vertex from that of later ones.
     """
 
     scene: HairScene
@@ -108,15 +148,17 @@ class _Plan:
     counts: tuple[int, int]
     limits: PathLimits
     dim: Floats
+    films: int = 1
 
     def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> Floats:
-        """Mean over `spp` paths a pixel: `(L, P, 3)`."""
+        """Mean over `spp` paths a pixel: `(films, L, P, 3)`."""
         count, slots = len(self.lights), opaque_index(len(index))
-        film, surface = dr.zeros(mi.Float, 3 * count * len(index)), Surface(self.scene)
+        film = dr.zeros(mi.Float, self.films * 3 * count * len(index))
+        surface = Surface(self.scene)
         bank, dim = PackedLights.of(self.lights), mi.Float(self.dim)
-        gather = _Gather(surface, film, slots, bank, dim, self.counts)
+        gather = _Gather(surface, film, slots, bank, dim, self.counts, self.films > 1)
         follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
-        image = np.array(film).reshape(count, 3, len(index)).transpose(0, 2, 1)
+        image = np.array(film).reshape(self.films, count, 3, len(index)).transpose(0, 1, 3, 2)
         return np.asarray(image / np.float32(spp), dtype=np.float32)
 
     def spread(self, index: Ints, spp: int, seed: int) -> Floats:
@@ -129,7 +171,7 @@ class _Plan:
         few = index[:: -(-len(index) // wanted)]
 
         def pilot(plan: _Plan, pixels: Ints, number: int) -> Floats:
-            brightest = plan.render(pixels, 1, (seed, _PILOT_STREAM + number)).max(-1)
+            brightest = plan.render(pixels, 1, (seed, _PILOT_STREAM + number))[0].max(-1)
             return np.minimum(brightest, np.quantile(brightest, _USUAL, axis=1, keepdims=True))
 
         # the mean of fewer still, with every shadow ray, is enough to spare most in the rest
@@ -138,14 +180,8 @@ class _Plan:
         return np.asarray(np.sqrt(((one - other) ** 2).mean(1) / 2), np.float32)
 
 
-def _plan(
-    scene: HairScene,
-    camera: Camera,
-    lights: Sequence[Light],
-    index: Ints,
-    options: OlatOptions,
-    seed: int,
-) -> _Plan:
+def _plan(view: _View, options: OlatOptions, seed: int) -> _Plan:
+    scene, camera, lights, index = view
     wanted = (options.first_lights, options.deep_lights)
     first, deep = (len(lights) if n is None else min(n, len(lights)) for n in wanted)
     depth = options.max_depth or bounce_limit(scene, camera, pixels=index, seed=seed).depth
@@ -159,7 +195,10 @@ def _plan(
 
 @dataclass(frozen=True)
 class _Gather:
-    """Light from the bank, or a systematic sample of it, at a path's vertex."""
+    """Light from the bank, or a systematic sample of it, at a path's vertex.
+
+    Where `parted`, the light of later vertices goes to a second film behind the first.
+    """
 
     surface: Surface
     film: Any
@@ -167,9 +206,13 @@ class _Gather:
     bank: PackedLights
     dim: Any
     counts: tuple[int, int]
+    parted: bool
 
     def __call__(self, si: Any, paths: Paths) -> None:
         total, active = self.bank.count, paths.active
+        slot = paths.slot
+        if self.parted:
+            slot = slot + dr.select(paths.depth == 0, 0, 3 * opaque_index(total) * self.slots)
         count = dr.select(paths.depth == 0, *(opaque_index(n) for n in self.counts))
         stride = mi.Float(total) / mi.Float(count)
         sampled = min(self.counts) < total
@@ -186,7 +229,7 @@ class _Gather:
             source = PointSource(target, intensity, dr.gather(mi.Float, self.dim, light, active))
             throughput, chance = paths.throughput * stride, rng.next_float32()
             value, lit = light_from(self.surface, si, throughput, source, chance, active)
-            add_light(self.film, value, light * 3 * self.slots + paths.slot, lit, self.slots)
+            add_light(self.film, value, light * 3 * self.slots + slot, lit, self.slots)
             return j + 1, rng
 
         dr.while_loop((mi.UInt32(0), paths.rng), more, body, label="lights of a vertex")

@@ -17,29 +17,41 @@ from scipy.ndimage import gaussian_filter
 
 from appearance.render.coverage import coverage
 from appearance.render.environment import direct_environment, render_environment
-from appearance.render.olat import render_olat
+from appearance.render.olat import render_olat, render_olat_parts, spread_out
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light
-from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.arrays import AnyFloats, Floats
 
-SIGMA = 1.5
+SIGMA = 1.25
 """Pixels that indirect light is averaged over."""
+_WIDE = 4.0
+"""Times as far that the light of rare bright paths is spread."""
+_RARE = 2.0
+"""Times the mean over the wide window from which on light counts as a rare path's."""
+_AT_A_TIME = 16
 SHOWN = Sampling(36, 16)
 
 
 def olat_smoothed(
     scene: HairScene, camera: Camera, lights: Sequence[Light], sampling: Sampling = SHOWN
 ) -> Floats:
-    """`render_olat` with its indirect light smoothed over `SIGMA` pixels: `(L, H, W, 3)`."""
-    spp, seed = sampling.spp, sampling.seed
+    """`render_olat` with its indirect light smoothed over `SIGMA` pixels: `(L, H, W, 3)`.
+
+    `sampling.spp` paths a pixel bring all light, as many again direct light only: these take a
+    third of the time. Where few pixels are wanted, smoothing still needs all.
+    """
+    spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     share = coverage(scene, camera, max(spp, 16), seed)
-    # the first hits and their light are the same in both: they draw the same random numbers first
-    first, whole = (
-        render_olat(scene, camera, lights, spp=spp, max_depth=depth, thrift=0, seed=seed)
-        for depth in (1, sampling.max_depth)
+    index = np.flatnonzero((share["hair"] + share["head"]).ravel() > 0)
+    first, rest = render_olat_parts(
+        scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed
     )
-    return first + smoothed(whole - first, share, SIGMA)
+    again = render_olat(
+        scene, camera, lights, spp=spp, max_depth=1, seed=seed + (1 << 31), pixels=index
+    )
+    direct = spread_out(0.5 * (first + again), index, camera)
+    return direct + smoothed(spread_out(rest, index, camera), share, SIGMA)
 
 
 def environment_smoothed(
@@ -64,8 +76,8 @@ def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
     """`images (L, H, W, 3)` averaged over `sigma` pixels, hair and head apart.
 
     `share` is what `coverage` returns. A pixel belongs to what covers more of it, and gets the
-    local mean of that, by area, times its own share of it. Where a pixel has over three times the
-    mean over 4 `sigma`, a rare path has hit it: the excess is averaged over 4 `sigma`, so that the
+    local mean of that, by area, times its own share of it. Where a pixel has over twice the mean
+    over 4 `sigma`, a rare path has hit it: the excess is averaged over 4 `sigma`, so that the
     sum is kept and no blot is left. Raises `ValueError` for `sigma` <= 0.
     """
     if not sigma > 0:
@@ -73,19 +85,29 @@ def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
     out = np.zeros(images.shape, np.float32)
     is_hair = share["hair"] >= share["head"]
     for kind, mask in (("hair", is_hair), ("head", ~is_hair)):
-        weight = (share[kind] * mask).astype(np.float64)
-        light = images.astype(np.float64) * mask[..., None]
-        wide = _local_mean(light, weight, 4 * sigma).max(axis=-1, keepdims=True)
-        peak = np.maximum(light.max(axis=-1, keepdims=True), 1e-30)
-        usual = light * np.minimum(1.0, 3.0 * wide / peak)
-        both = _local_mean(usual, weight, sigma) + _local_mean(light - usual, weight, 4 * sigma)
-        out += both.astype(np.float32)
+        weight = (share[kind] * mask).astype(np.float32)
+        if not weight.any():
+            continue
+        rows, columns = (np.flatnonzero(weight.any(axis)) for axis in (1, 0))
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        for k in range(0, len(images), _AT_A_TIME):
+            part = (slice(k, k + _AT_A_TIME), *box)
+            out[part] += _without_blots(images[part] * mask[box][..., None], weight[box], sigma)
     return out
 
 
-def _local_mean(light: Array, weight: Array, sigma: float) -> Array:
-    """Gaussian mean of `light (L, H, W, 3)` per `weight (H, W)`, times each pixel's weight."""
-    area = gaussian_filter(weight, sigma, mode="constant")
+def _without_blots(light: Floats, weight: Floats, sigma: float) -> Floats:
+    """The local mean of `light (L, H, W, 3)`, and of what is rare over a wider window."""
+    peak = light.max(axis=-1, keepdims=True)
+    usual = light * np.minimum(
+        1.0, _RARE * _local_mean(peak, weight, _WIDE * sigma) / np.maximum(peak, 1e-30)
+    )
+    return _local_mean(usual, weight, sigma) + _local_mean(light - usual, weight, _WIDE * sigma)
+
+
+def _local_mean(light: Floats, weight: Floats, sigma: float) -> Floats:
+    """Gaussian mean of `light (L, H, W, C)` per `weight (H, W)`, times each pixel's weight."""
+    area = gaussian_filter(weight, sigma, mode="constant", truncate=3.0)
     over = np.divide(weight, area, out=np.zeros_like(area), where=weight > 0)
-    mixed = gaussian_filter(light, (0, sigma, sigma, 0), mode="constant")
-    return np.asarray(mixed * over[..., None])
+    mixed = gaussian_filter(light, (0, sigma, sigma, 0), mode="constant", truncate=3.0)
+    return np.asarray(mixed * over[..., None], np.float32)

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class Quality:
     """Paths per pixel and lights per vertex: what a frame costs and how noisy the truth is.
 
-    `lights` paths serve all lights of a camera at once, `sweep` paths all rows of a camera and
-    pose, `together` paths one light vector.
+    `lights` paths serve all lights of a camera at once (see `olat_smoothed`), `sweep` paths all
+    rows of a camera and pose, `together` paths one light vector.
     """
 
-    lights: int = 16
+    lights: int = 20
     sweep: int = 16
     together: int = 24
     depth: int = 16
@@ -37,7 +37,7 @@ class Quality:
     @classmethod
     def scaled(cls, spp: int) -> Quality:
         """The default proportions with `spp` paths for the lights."""
-        return cls(spp, spp, spp + spp // 2)
+        return cls(spp, max(1, 4 * spp // 5), max(1, 6 * spp // 5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,19 +108,13 @@ class MitsubaResponder:
 
     def lights(self, camera: str) -> Response:
         """See `Responder.lights`."""
-        from appearance import render_olat
+        from appearance import Sampling
+        from appearance.render.smoothed import olat_smoothed
 
         seen, pixels = self._view(camera, 0)
-        images = render_olat(
-            self._scene,
-            seen,
-            self._rig.lights,
-            spp=self._quality.lights,
-            max_depth=self._quality.depth,
-            seed=self._seeds(camera, 0, 1),
-            pixels=pixels,
-        )
-        return Response(pixels, images)
+        paths = Sampling(self._quality.lights, self._quality.depth, self._seeds(camera, 0, 1))
+        images = olat_smoothed(self._scene, seen, self._rig.lights, paths)
+        return Response(pixels, images.reshape(len(images), -1, 3)[:, pixels])
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lights_together`; `power (L,)`. A vertex asks a sample of them."""

@@ -8,6 +8,7 @@ from benchmarks.renderers.path_reference import PathReference
 
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.render.coverage import covered_pixels
+from appearance.render.olat import render_olat_parts
 from appearance.scene.hair_appearance import DiffuseHair
 from reconstruction import Camera, Light, Strands, read_exr
 
@@ -125,6 +126,23 @@ def test_radiance_is_linear_in_intensity(tufted):
         2 * render_olat(scene, camera, lights, spp=4, seed=5),
         rtol=1e-5,
     )
+
+
+def test_parts_are_the_direct_light_and_the_rest(small, tufted):
+    """The first is what paths of one vertex bring; a plane cannot see itself: it has no rest."""
+    scene, camera, lights = tufted
+    pixels = covered_pixels(scene, camera)
+    first, rest = render_olat_parts(scene, camera, lights, pixels, spp=64, max_depth=4, seed=1)
+    direct, whole = (
+        render_olat(scene, camera, lights, spp=64, max_depth=n, seed=2, pixels=pixels)
+        for n in (1, 4)
+    )
+    np.testing.assert_allclose(first.mean((1, 2)), direct.mean((1, 2)), rtol=0.03)
+    np.testing.assert_allclose((first + rest).mean((1, 2)), whole.mean((1, 2)), rtol=0.05)
+    flat = build_scene(small.no_hair, small.plane(), hair=HAIR)
+    first, rest = render_olat_parts(flat, camera, lights, pixels, spp=4, max_depth=4)
+    assert first.any()
+    assert not rest.any()
 
 
 def test_same_seed_same_bytes(tufted):
