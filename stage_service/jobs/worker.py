@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -36,6 +37,8 @@ from stage_service.signals import taken
 
 log = logging.getLogger("hairstage.worker")
 
+CANCEL_S = 10.0
+"""A cancelled step that has not stopped by then, deep in native code, ends with its process."""
 MOST_ATTEMPTS = 20
 """A job whose worker died, or was stopped, this often is given up."""
 
@@ -50,6 +53,7 @@ class Worker:
         # A cancelled job leaves DBOS's count at once, but its thread only at its next progress
         # call: this keeps the next job from running beside it.
         self._slots = threading.BoundedSemaphore(concurrency)
+        self._under_way: set[str] = set()
 
     def stop(self) -> None:
         """Make running steps stop at their next progress call, for another worker to take up."""
@@ -75,6 +79,7 @@ class Worker:
         with self._slots:
             log.info("%s: %s begins", job, step)
             start = time.perf_counter()
+            self._under_way.add(job)
             try:
                 progress(step, 0.0)
                 figures = STEPS[step](context)
@@ -87,9 +92,29 @@ class Worker:
             except Exception:
                 log.exception("%s: %s failed", job, step)
                 raise
+            finally:
+                self._under_way.discard(job)
             seconds = time.perf_counter() - start
         log.info("%s: %s took %.1f s", job, step, seconds)
         return {"seconds": seconds, "figures": figures}
+
+    def watch(self) -> None:
+        """Start the process anew, in its place, once a cancelled step has not stopped in time.
+
+        Other jobs of this worker go on at the step that they were at.
+        """
+        since: dict[str, float] = {}
+        while not self._stopping.wait(CANCEL_S / 10):
+            now = time.monotonic()
+            going = list(self._under_way)
+            late = [job for job in going if isinstance(self._interrupted(job), JobCancelled)]
+            since = {job: since.get(job, now) for job in late}
+            if any(now - begun > CANCEL_S for begun in since.values()):
+                log.warning(
+                    "%s: cancelled, and not stopped: the worker starts anew", ", ".join(late)
+                )
+                logging.shutdown()
+                os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
     def _interrupted(self, job: str) -> JobInterrupted | None:
         if self._stopping.is_set():
@@ -127,6 +152,7 @@ def run_worker(
 
     stop = taken(signal.SIGTERM, signal.SIGINT)
     DBOS.launch()
+    threading.Thread(target=worker.watch, name="cancelled-steps", daemon=True).start()
     DBOS.register_queue(QUEUE, worker_concurrency=concurrency, polling_interval_sec=0.2)
     ready(slot.name)
     stop()

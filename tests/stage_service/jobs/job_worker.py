@@ -4,7 +4,7 @@ import sys
 import time
 from pathlib import Path
 
-from stage_service.jobs import steps
+from stage_service.jobs import steps, worker
 from stage_service.jobs.worker import run_worker
 
 
@@ -19,8 +19,11 @@ def first(context: steps.StepContext) -> steps.Figures:
 
 
 def slow(context: steps.StepContext) -> steps.Figures:
-    """Goes on until the file `go` is there; tells its progress as real steps do."""
+    """Goes on until the file `go` is there; tells its progress as real steps do, but where the
+    file `deaf` is: as native code that takes long."""
     _log(context, "slow begins")
+    while (context.model.path / "deaf").exists():
+        time.sleep(0.02)
     while not (context.model.path / "go").exists():
         time.sleep(0.02)
         try:
@@ -41,5 +44,6 @@ def bad(context: steps.StepContext) -> steps.Figures:
 
 
 if __name__ == "__main__":
+    worker.CANCEL_S = 1.0
     steps.STEPS.update(reconstruct=first, evaluate=slow, results=last, fit=bad)
     run_worker(Path(sys.argv[1]), ready=lambda name: print(name, flush=True))

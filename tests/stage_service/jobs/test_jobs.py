@@ -130,6 +130,30 @@ def test_cancelling_stops_the_step_and_failures_carry_their_reason(
     assert (failed.error.type, failed.error.detail) == ("ValueError", "this capture has no frames")
 
 
+def test_a_cancelled_step_that_does_not_stop_ends_with_its_process(
+    queue: JobQueue, tmp_path: Path
+) -> None:
+    job = submit(queue, tmp_path)
+    Model(job.model).create()
+    (Path(job.model) / "deaf").touch()
+    log = Path(job.model) / "log.txt"
+    worker = start_worker(tmp_path)
+    try:
+        until(lambda: log.is_file() and "slow begins" in log.read_text())
+        queue.cancel(job.id)
+        assert worker.stdout is not None
+        assert worker.stdout.readline() == "worker-0\n", "the worker is there again, with its name"
+        after = submit(queue, tmp_path, "fit")
+        until(lambda: queue.get(after.id).state == "done")
+        assert worker.poll() is None, "in the same process"
+        assert queue.get(job.id).outcome == "cancelled"
+        worker.terminate()
+        assert worker.wait(60) == 0
+    finally:
+        end(worker)
+    assert log.read_text().splitlines() == ["first", "slow begins"]
+
+
 def test_progress_is_throttled_but_never_late_at_the_end(tmp_path: Path) -> None:
     now, asked = [0.0], [0]
 
