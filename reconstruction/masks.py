@@ -2,13 +2,13 @@
 
 Hair is wherever the user's mask says so, or else the user's network, of what is lit. Without one,
 a pixel whose triangulated point stands off the head, or that shows the subject where the head is
-not, is hair. On the head, the light
-decides. Without a head mesh, the light and the fineness of the lines do (`hair_features`).
+not, is hair. What these look like, and what is matte, tells the pixels on the head, in all cameras
+together: `hair_features`. Without a head mesh, gloss and the fineness of lines do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,13 +20,15 @@ from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.mesh_queries import mesh_depth
+from reconstruction.geometry.mesh_queries import depth_map, mesh_depth
 from reconstruction.images.hair_features import (
     FAINTEST_LINES,
-    light_contrast,
+    TwoClasses,
     line_strength,
-    otsu,
+    looks,
+    split,
     tell_apart,
+    two_classes,
 )
 from reconstruction.images.segmentation import Network
 from reconstruction.images.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
@@ -36,6 +38,11 @@ from reconstruction.report.report import Stage
 Source = Literal["user", "network", "geometry", "light and lines", "lines", "silhouette"]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
+_PLACE = 3e-3  # metres: what is so near looks alike
+_SAME_PLACE = 5e-3  # metres: as far apart may two cameras' depths of one place be
+MOST_DISAGREEMENT = 0.15
+"""Of a camera's pixels, `disagreements` above which its mask is doubted: true masks have up to 0.09
+(one pixel is 2 mm, hair and skin are seen past each other), one that lacks half its hair 0.5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +86,7 @@ def hair_masks(
     digitised head in the world. A camera without any frame to take a silhouette from, and without
     a user's mask, is left out. An empty silhouette gives empty masks.
     """
-    off = None
-    if head is not None and points is not None and len(points):
-        off = distance_to(head, points.points)
-    masks, unknown = {}, {}
+    geometry, masks, views = _Geometry.of(points, head), {}, []
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
         try:
@@ -98,11 +102,13 @@ def hair_masks(
             masks[camera.name] = HairMask(subject, hair, subject & ~hair, "network", 1.0)
         elif not subject.any():
             masks[camera.name] = HairMask(subject, subject, subject, "silhouette", 0.0)
-        elif head is not None:
-            masks[camera.name] = _decide(capture, camera, subject, points, head, off)
         else:
-            unknown[camera.name] = subject
-    return masks | _by_looks(capture, unknown)
+            views.append(_View.of(capture, camera, subject, geometry))
+    masks |= _by_looks(capture, [v for v in views if v.looks is not None], geometry)
+    left = [v for v in views if v.camera.name not in masks]
+    if head is not None:
+        return masks | {v.camera.name: v.by_points() for v in left}
+    return masks | _by_lines(capture, left)
 
 
 def usable_masks(
@@ -126,82 +132,262 @@ def usable_masks(
     return out
 
 
-def _by_looks(capture: Capture, subjects: dict[str, Bools]) -> dict[str, HairMask]:
-    """Masks from light and lines alone; where these show one class, all of it may be hair."""
-    features = {}
-    for name, subject in subjects.items():
-        contrast = light_contrast(capture, name, subject)
-        lines = line_strength(lit_image(capture, name), subject)
-        features[name] = lines[None] if contrast is None else np.stack([contrast, lines])
+@dataclass(frozen=True, eq=False)
+class _Geometry:
+    """Triangulated points and the head, as cameras see them; `off` is the points' distance to it.
+
+    `depth (H, W)` along z is that of a camera's own points, or else of the head, 0 for neither.
+    """
+
+    points: PointCloud | None
+    head: Mesh | None
+    off: Array | None
+
+    @classmethod
+    def of(cls, points: PointCloud | None, head: Mesh | None) -> _Geometry:
+        """With the distances, where there are both."""
+        if points is None or head is None or not len(points):
+            return cls(points, head, None)
+        return cls(points, head, distance_to(head, points.points))
+
+    def own(self, camera: Camera) -> Bools:
+        """Which points the camera saw: none where it took no part in the triangulation."""
+        assert self.points is not None
+        names = self.points.cameras
+        return self.points.camera == (names.index(camera.name) if camera.name in names else -1)
+
+    def depth(self, camera: Camera) -> Array:
+        """Depth along z of the camera's own points, or else of the head; 0 for neither `(H, W)`."""
+        out = np.zeros((camera.height, camera.width))
+        if self.points is not None:
+            out = depth_map(camera, self.points.points[self.own(camera)])
+        if self.head is not None:
+            depth = mesh_depth(camera, self.head)
+            out = np.where((out == 0) & np.isfinite(depth), depth, out)
+        return out
+
+    def votes(self, camera: Camera) -> tuple[Array, Array]:
+        """Weights of the points that stand off the head and that lie on it, per pixel `(H, W)`."""
+        size = camera.height, camera.width
+        if self.points is None or self.off is None:
+            return np.zeros(size), np.zeros(size)
+        mine = self.own(camera)
+        seen, x, y, _ = camera.pixels_of(self.points.points[mine])
+        flat = (y * camera.width + x)[seen]
+        weight, standing = self.points.weight[mine][seen], self.off[mine][seen] > STANDS_OFF
+
+        def votes(which: Bools) -> Array:
+            total: Array = np.bincount(flat[which], weight[which], size[0] * size[1]).astype(float)
+            return total.reshape(size)
+
+        return votes(standing), votes(~standing)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A camera's `subject`, and what is known of each of its pixels `(H, W)`.
+
+    `outside` shows the subject off the head's outline, `standing` and `lying` have points off and
+    on the head. `looks` are those of `hair_features`, None where too few lights were shot.
+    """
+
+    camera: Camera
+    subject: Bools
+    outside: Bools
+    standing: Bools
+    lying: Bools
+    looks: Array | None
+
+    @property
+    def seen(self) -> Array:
+        """`looks` that are there."""
+        assert self.looks is not None
+        return self.looks
+
+    @classmethod
+    def of(cls, capture: Capture, camera: Camera, subject: Bools, geometry: _Geometry) -> _View:
+        """What `geometry` and the OLAT frames of `capture` say of a camera."""
+        outside, covered = np.zeros((2, *subject.shape), bool)
+        if geometry.head is not None:
+            covered = np.isfinite(mesh_depth(camera, geometry.head))
+            outside = subject & ~ndimage.binary_dilation(covered)
+        off, on = geometry.votes(camera)
+        standing, lying = subject & (off > on), subject & covered & (on > off)
+        seen = looks(capture, camera.name, subject)
+        return cls(camera, subject, outside, standing, lying, seen)
+
+    def mask(self, hair: Bools, source: Source, decided: float) -> HairMask:
+        """The mask whose hair is `hair (H, W)`, of the subject."""
+        hair = hair & self.subject
+        return HairMask(self.subject, hair, self.subject & ~hair, source, decided)
+
+    def by_points(self) -> HairMask:
+        """The mask by geometry alone: what has no point follows its neighbours."""
+        hair = self.outside | self.standing
+        skin = self.lying & ~hair
+        if not (hair | skin).any():
+            return self.mask(self.subject, "geometry", 0.0)
+        decided = float((hair | skin).sum() / self.subject.sum())
+        return self.mask(_fill(self.subject, hair, skin), "geometry", decided)
+
+
+def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:
+    """Masks of `views` with looks; none where these show one class and geometry knows no hair.
+
+    The classes are learned from all cameras together. What a place looks like from all of them
+    counts half as much as what one pixel does.
+    """
+    if not views:
+        return {}
+    pixels = np.concatenate([v.seen[:, v.subject].T for v in views])
+    hair = np.concatenate([(v.outside | v.standing)[v.subject] for v in views])
+    if hair.any():
+        classes: TwoClasses | None = two_classes(pixels, hair)
+    else:
+        subjects = {v.camera.name: v.subject for v in views}
+        glossy = {
+            v.camera.name: np.stack(
+                [v.seen[0], line_strength(lit_image(capture, v.camera.name), v.subject)]
+            )
+            for v in views
+        }
+        start = tell_apart(glossy, subjects)
+        if start is None:
+            return {}
+        skin = np.concatenate([start[v.camera.name][v.subject] <= 0 for v in views])
+        classes = split(pixels, hair, skin)
+    if classes is None:
+        return {}
+    source: Source = "light and lines" if geometry.head is None else "geometry"
+    scores = [classes.scores(v.seen) + v.standing for v in views]
+    places = [_positions(v.camera, v.subject, geometry) for v in views]
+    common = _by_place(places, scores)
     out = {}
-    for count in {len(f) for f in features.values()}:
-        group = {name: f for name, f in features.items() if len(f) == count}
-        scores = tell_apart(group, subjects)
-        if scores is not None and count == 1:
-            hairs = [f[0][subjects[n] & (scores[n] > 0)] for n, f in group.items()]
-            if np.median(np.concatenate(hairs)) < FAINTEST_LINES:
-                scores = None  # what stands out is an outline, or noise
-        for name in group:
-            subject = subjects[name]
-            if scores is None:
-                nothing = np.zeros_like(subject)
-                out[name] = HairMask(subject, subject, nothing, "silhouette", 0.0)
-                continue
-            hair = subject & (scores[name] > 0)
-            hair = _fill(subject, hair, subject & ~hair)
-            source: Source = "light and lines" if count == 2 else "lines"
-            out[name] = HairMask(subject, hair, subject & ~hair, source, 1.0)
+    for view, score, place in zip(views, scores, common, strict=True):
+        near = ndimage.gaussian_filter(view.subject.astype(np.float64), 0.5)
+        total = np.where(view.outside, 6.0, score + 0.5 * place) * view.subject
+        smooth = ndimage.gaussian_filter(total, 0.5) / np.maximum(near, 1e-9)
+        out[view.camera.name] = view.mask(smooth > 0, source, 1.0)
     return out
 
 
-def _decide(
-    capture: Capture,
-    camera: Camera,
-    subject: Bools,
-    points: PointCloud | None,
-    head: Mesh,
-    off: Array | None,
-) -> HairMask:
-    """A mask from where points lie on the head, and from the light where they lie on it."""
-    contrast = light_contrast(capture, camera.name, subject)
-    covered = np.isfinite(mesh_depth(camera, head))
-    hair, skin = subject & ~ndimage.binary_dilation(covered), np.zeros_like(subject)
-    if points is not None and off is not None:
-        standing, lying = _votes(points, camera, off)
-        hair |= subject & (standing > lying)
-        skin |= subject & covered & (lying > standing) & ~hair
-    if contrast is not None:
-        # a point on the head may be hair that lies flat, and one may be missing: ask the light
-        level = _threshold(contrast, subject, hair, skin)
-        asked = (skin | (subject & covered)) & ~hair
-        hair |= asked & (contrast > level)
-        skin |= asked & ~hair
-        skin &= ~hair
-    decided = float((hair | skin).sum() / subject.sum())
-    if not (hair | skin).any():
-        # nothing told them apart: all of the subject may be hair
-        return HairMask(subject, subject, np.zeros_like(subject), "geometry", 0.0)
-    hair = _fill(subject, hair, skin)
-    return HairMask(subject, hair, subject & ~hair, "geometry", decided)
+def _by_lines(capture: Capture, views: list[_View]) -> dict[str, HairMask]:
+    """Masks from lines alone; where these show one class, all of it may be hair."""
+    subjects = {v.camera.name: v.subject for v in views}
+    lines = {
+        name: line_strength(lit_image(capture, name), subject)[None]
+        for name, subject in subjects.items()
+    }
+    scores = tell_apart(lines, subjects) if views else None
+    if scores is not None:
+        hairs = [lines[n][0][subject & (scores[n] > 0)] for n, subject in subjects.items()]
+        if np.median(np.concatenate(hairs)) < FAINTEST_LINES:
+            scores = None  # what stands out is an outline, or noise
+    if scores is None:
+        return {v.camera.name: v.mask(v.subject, "silhouette", 0.0) for v in views}
+    out = {}
+    for view in views:
+        hair = view.subject & (scores[view.camera.name] > 0)
+        hair = _fill(view.subject, hair, view.subject & ~hair)
+        out[view.camera.name] = view.mask(hair, "lines", 1.0)
+    return out
 
 
-def _votes(points: PointCloud, camera: Camera, off: Array) -> tuple[Array, Array]:
-    """Weights of the points that stand off the head and that lie on it, per pixel `(H, W)`.
+def _positions(camera: Camera, subject: Bools, geometry: _Geometry) -> Array:
+    """Where in the world the subject's pixels are `(H, W, 3)`, NaN where that is not known."""
+    depth = geometry.depth(camera)
+    y, x = np.nonzero(subject & (depth > 0))
+    rays = camera.rays(np.stack([x, y], axis=1))
+    out = np.full((*subject.shape, 3), np.nan)
+    out[y, x] = camera.center + rays * (depth[y, x] / (rays @ camera.R[2]))[:, None]
+    return out
 
-    The camera's own points, none where it took no part in the triangulation.
+
+def _by_place(places: list[Array], scores: list[Array]) -> list[Array]:
+    """The mean of `scores (H, W)` of all cameras about each pixel's place, 0 where it has none.
+
+    Of the cells of `_PLACE` metres, weighted by a Gaussian as wide.
     """
-    own = points.cameras.index(camera.name) if camera.name in points.cameras else -1
-    mine = points.camera == own
-    seen, x, y, _ = camera.pixels_of(points.points[mine])
-    flat = (y * camera.width + x)[seen]
-    weight, standing = points.weight[mine][seen], off[mine][seen] > STANDS_OFF
+    known = [np.isfinite(p[..., 0]) for p in places]
+    points = np.concatenate([p[k] for p, k in zip(places, known, strict=True)])
+    out = [np.zeros(s.shape) for s in scores]
+    if not len(points):
+        return out
+    values = np.concatenate([s[k] for s, k in zip(scores, known, strict=True)])
+    cell, count = np.unique(
+        np.floor(points / _PLACE).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )[1:]
+    cell = cell.ravel()
+    middle = np.stack([np.bincount(cell, p) / count for p in points.T], axis=1)
+    total = np.bincount(cell, values)
+    distance, index = cKDTree(middle).query(middle, k=min(24, len(middle)))
+    weight = np.exp(-0.5 * (distance / _PLACE) ** 2).reshape(len(middle), -1)
+    index = index.reshape(weight.shape)
+    pooled = (weight * total[index]).sum(axis=1) / (weight * count[index]).sum(axis=1)
+    parts = np.split(pooled[cell], np.cumsum([int(k.sum()) for k in known])[:-1])
+    for image, k, part in zip(out, known, parts, strict=True):
+        image[k] = part
+    return out
 
-    def votes(which: Bools) -> Array:
-        size = camera.height, camera.width
-        total: Array = np.bincount(flat[which], weight[which], size[0] * size[1]).astype(float)
-        return total.reshape(size)
 
-    return votes(standing), votes(~standing)
+def report_agreement(
+    capture: Capture,
+    masks: Mapping[str, HairMask],
+    points: PointCloud | None,
+    head: Mesh | None,
+    stage: Stage,
+) -> None:
+    """Leave `disagreements` in the report; warn of those above `MOST_DISAGREEMENT`."""
+    found = disagreements(masks, capture.rig.cameras, points, head)
+    stage.figures["disagreement"] = found
+    if doubted := {k: v for k, v in found.items() if v > MOST_DISAGREEMENT}:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in doubted.items())
+        stage.warn(
+            "masks disagree about what is hair; share of the pixels that other cameras contradict: "
+            f"{shares}: look at masks/, give hair masks for these cameras or check their poses"
+        )
+
+
+def disagreements(
+    masks: Mapping[str, HairMask],
+    cameras: Sequence[Camera],
+    points: PointCloud | None = None,
+    head: Mesh | None = None,
+) -> dict[str, float]:
+    """By camera, the share of its pixels that the other cameras that see their place contradict.
+
+    A place is a cell of `_SAME_PLACE` metres, where the camera's own triangulated points or else
+    the head put a pixel. Three in four of the other cameras' pixels there must say hair where the
+    mask says skin, or the reverse: cells at a hairline hold both. Cameras with under a hundred
+    such places are left out.
+    """
+    geometry = _Geometry(points, head, None)
+    cells, hairs, owners = [], [], []
+    for number, camera in enumerate(c for c in cameras if c.name in masks):
+        mask = masks[camera.name]
+        place = _positions(camera, mask.subject, geometry)
+        known = np.isfinite(place[..., 0])
+        cells.append(np.floor(place[known] / _SAME_PLACE).astype(np.int64))
+        hairs.append(mask.hair[known])
+        owners.append(np.full(len(hairs[-1]), number))
+    names = [c.name for c in cameras if c.name in masks]
+    if not names or not sum(map(len, cells)):
+        return {}
+    hair, owner = np.concatenate(hairs), np.concatenate(owners)
+    cell = np.unique(np.concatenate(cells), axis=0, return_inverse=True)[1].ravel()
+    size = cell.max() + 1
+    all_hair, all_count = np.bincount(cell, hair, size), np.bincount(cell, minlength=size)
+    out = {}
+    for number, name in enumerate(names):
+        mine = owner == number
+        own_hair = np.bincount(cell[mine], hair[mine], size)
+        others = all_count - np.bincount(cell[mine], minlength=size)
+        there = others[cell[mine]] > 0
+        share = (all_hair - own_hair)[cell[mine]][there] / others[cell[mine]][there]
+        if there.sum() >= 100:
+            against = np.where(hair[mine][there], share < 0.25, share > 0.75)
+            out[name] = float(against.mean())
+    return out
 
 
 def distance_to(head: Mesh, points: Array) -> Array:
@@ -231,22 +417,6 @@ def _samples(head: Mesh, step: float) -> tuple[Array, Array]:
         points.append(np.einsum("kc,fci->fki", weights, corners[of]).reshape(-1, 3))
         faces.append(np.repeat(of, len(weights)))
     return np.concatenate(points), normals[np.concatenate(faces)]
-
-
-def _threshold(contrast: Array, subject: Bools, hair: Bools, skin: Bools) -> float:
-    """The contrast above which a pixel is hair: between what sure hair and likely skin have.
-
-    The split of the whole subject where one of them is missing. Where the two do not differ by a
-    third, likely skin is hair that lies flat on the head if sure hair is far from matte: what
-    equals it is hair, too. Else the light cannot tell: infinite, so that none is hair.
-    """
-    if not hair.any() or not skin.any():
-        return otsu(contrast[subject])[0]
-    third = np.log(4 / 3)
-    sure, likely = float(np.median(contrast[hair])), float(np.median(contrast[skin]))
-    if sure > likely + third:
-        return 0.5 * (sure + likely)
-    return sure - third if sure > 2 * third else np.inf
 
 
 def _fill(subject: Bools, hair: Bools, skin: Bools) -> Bools:

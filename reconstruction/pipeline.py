@@ -34,7 +34,7 @@ from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.line_strands import line_strands, merge
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, sweep_peaks, triangulate
-from reconstruction.masks import MaskedCapture, hair_masks, usable_masks
+from reconstruction.masks import MaskedCapture, hair_masks, report_agreement, usable_masks
 from reconstruction.methods import METHODS, Method
 from reconstruction.model import Model
 from reconstruction.reconstruct_options import ReconstructOptions
@@ -190,6 +190,7 @@ class _Stages:
             for name, mask in every.items():
                 self.model.write_mask(name, "hair", whole.mask_as_shot(name, mask.hair))
                 self.model.write_mask(name, "skin", whole.mask_as_shot(name, mask.skin))
+            report_agreement(whole, every, cloud, mesh, stage)
             masks = usable_masks(capture, every, stage)
             stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
             stage.figures["source"] = {k: m.source for k, m in masks.items()}

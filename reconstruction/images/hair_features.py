@@ -1,12 +1,18 @@
-"""What tells hair from skin without geometry: how pixels answer lights, and how fine lines are.
+"""What tells hair from skin by its looks: gloss, colour, and how fine lines are.
 
-A matte surface answers half of the lights by `albedo n·l`; fibres mirror a few lights and hide from
-the others. Skin is smooth at the width of a few pixels; fibres are lines there.
+A matte surface answers a light by `albedo max(n·l, 0)` or, in a shadow, by less. Fibres answer with
+more than any such surface that fits them: they mirror some lights and let others through. How much
+more is the `gloss` of a pixel, a property of the true signal: noise adds to it and is averaged and
+taken off, so cleaner frames only tell better. Gloss needs a subject's pixels by the dozen; colour
+tells pixel by pixel, but not which class is hair: `two_classes` learns it from what is hair for
+sure, and what is less glossy.
+Skin is smooth at the width of a few pixels; fibres are lines there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -14,38 +20,165 @@ from scipy import ndimage
 from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.images.orientation import responses, texture
+from reconstruction.images.silhouettes import background_noise
 from reconstruction.reconstruct_options import LogGaborBank
 
-MATTE_CONTRAST = 1.29  # sqrt(1/6 - 1/16) / (1/4): cosine over all directions, deviation over mean
-
 FAINTEST_LINES = float(np.log(0.025))
-"""`line_strength` that hair surpasses: rendered hair in focus has 0.047, skin 0.009 to 0.02."""
+"""`line_strength` that hair surpasses: rendered hair has 0.04, skin 0.01 to 0.025; the noise of 16
+paths a pixel adds half as much to both."""
+
+FEWEST_LIGHTS = 8
+"""OLAT lights of a camera under which a pixel's answers to them say nothing."""
+
+FAINTEST_GLOSS = float(np.log(0.12 + 0.03))
+"""Log gloss, as in `looks`, that hair surpasses: rendered hair has a gloss of 0.2, skin 0.05."""
 
 _BANK = LogGaborBank(wavelength=3.0, count=16, spread=1.0)
 _ONE_CLASS = 3.0
 """Deviations between classes' means under which they are one: 2.65 for a Gaussian cut in two."""
+_RIGHT = 0.8
+"""Of known hair, and of known skin, on its own side: half of each where the classes are one."""
+_ITERATIONS = 25
+_SHADOWED = 0.5  # of what the matte surface in the open answers
+_LEAST_GLOSS = 0.03  # what a matte fit leaves of a matte surface that others light, too
+_MOST_PIXELS = 20_000  # that classes are learned from
+_BLOCK = 1 << 14
+_LIKE_HAIR = 0.1  # the share of sure hair that is as little glossy as skin
 
 
-def light_contrast(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Array | None:
-    """How unlike a matte surface each pixel answers single lights: log ratio `(H, W)`, 0 for matte.
+def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Array | None:
+    """How each pixel of `subject` answers single lights: `(4, H, W)`, 0 outside.
 
-    The deviation over the mean of the answers to a dome of lights is 1.29 for a matte surface in
-    the open, up to 2 with half of the lights in its own shadow; fibres mirror few: 2 to 7.
-    Smoothed over 3×3 pixels. None where under eight lights were shot.
+    The log of the gloss, see `matte_fit`; log ratios of red to green and of green to blue under all
+    lights together; the log of the matte surface's albedo. Gloss and albedo of answers averaged
+    over 3×3 pixels. At most about `lights` of the lights are read. None where fewer than
+    `FEWEST_LIGHTS` were shot, or the subject is empty.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
-    if len(names) < 8:
+    if len(names) < FEWEST_LIGHTS or not subject.any():
         return None
     names = names[:: max(1, len(names) // lights)]
-    intensities = [capture.rig.light(n).intensity_towards(np.zeros(3)) for n in names]
-    power = np.array([max(intensity.mean(), 1e-12) for intensity in intensities])
-    values = capture.olat(camera, names).mean(axis=-1) / power[:, None, None]
-    mean = np.maximum(values.mean(axis=0), 0)
-    ratio = np.divide(values.std(axis=0), mean, out=np.ones_like(mean), where=mean > 0)
-    logs = np.where(subject, np.log(np.maximum(ratio, 0.1) / MATTE_CONTRAST), 0.0)
-    near = ndimage.uniform_filter(subject.astype(np.float64), 3)
-    smooth = ndimage.uniform_filter(logs, 3) / np.where(near > 0, near, 1.0)
-    return np.asarray(np.where(subject, smooth, 0.0))
+    near = ndimage.uniform_filter(subject.astype(np.float64), 3)[subject]
+    values = np.empty((int(subject.sum()), len(names)), np.float32)
+    colour, noise = np.zeros((len(values), 3)), 0.0
+    for k, name in enumerate(names):
+        intensity = capture.rig.light(name).intensity_towards(np.zeros(3)).mean()
+        image = capture.light(name, camera)[0] / np.float32(max(intensity, 1e-12))
+        colour += image[subject]
+        grey = image.mean(axis=-1)
+        noise += background_noise(grey) ** 2 / 9
+        smooth = ndimage.uniform_filter(np.where(subject, grey, np.float32(0)), 3)
+        values[:, k] = smooth[subject] / near
+    directions = np.stack([capture.rig.light(n).position for n in names])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    gloss, albedo = matte_fit(values, directions, noise)
+    faint = max(1e-3 * float(np.median(colour)), 1e-12)
+    logs = np.log(np.maximum(colour, faint))
+    out = np.zeros((4, *subject.shape))
+    out[0, subject] = np.log(gloss + _LEAST_GLOSS)
+    out[1, subject], out[2, subject] = logs[:, 0] - logs[:, 1], logs[:, 1] - logs[:, 2]
+    out[3, subject] = np.log(np.maximum(albedo, faint / len(names)))
+    return out
+
+
+def matte_fit(values: AnyFloats, directions: Array, noise: float = 0.0) -> tuple[Array, Array]:
+    """Gloss and albedo `(N,)` of pixels that answer `values (N, L)` to lights from `directions`.
+
+    The matte surface `max(g·l, 0)` that fits best, with what answers less than half of it taken as
+    shadowed. Gloss is the root of the energy above that surface as a share of all of it, less
+    `noise`, the variance of the noise summed over lights; the albedo is |g|, in `values`' units.
+    `directions (L, 3)` are unit vectors.
+    """
+    outer = (directions[:, :, None] * directions[:, None]).reshape(len(directions), 9)
+    gloss, albedo = np.zeros((2, len(values)))
+    for begin in range(0, len(values), _BLOCK):
+        block = np.s_[begin : begin + _BLOCK]
+        v = np.asarray(values[block], np.float64)
+        lit = v > 0.25 * np.quantile(v, 0.95, axis=1, keepdims=True)
+        for _ in range(4):
+            moments = (lit @ outer).reshape(-1, 3, 3) + 1e-2 * np.eye(3)
+            g = np.linalg.solve(moments, ((lit * v) @ directions)[..., None])[..., 0]
+            matte = np.maximum(g @ directions.T, 0)
+            lit = (v > _SHADOWED * matte) & (matte > 0)
+        # half of the noise about zero lies above it
+        above = (np.maximum(v - matte, 0) ** 2).sum(axis=1) - noise / 2
+        energy = np.maximum((v**2).sum(axis=1) - noise, np.finfo(float).tiny)
+        gloss[block] = np.sqrt(np.clip(above / energy, 0, 1))
+        albedo[block] = np.linalg.norm(g, axis=1)
+    return gloss, albedo
+
+
+@dataclass(frozen=True, eq=False)
+class TwoClasses:
+    """Hair and skin by `looks`: the log of the odds that a pixel is hair is linear in them."""
+
+    weights: Array
+    offset: float
+
+    def scores(self, looks: Array) -> Array:
+        """Log odds `(...)` for hair of `looks (4, ...)`, at most 5 either way."""
+        return np.asarray(np.clip(np.tensordot(self.weights, looks, 1) + self.offset, -5, 5))
+
+
+def two_classes(looks: Array, hair: Bools) -> TwoClasses:
+    """Hair and skin among pixels with `looks (N, 4)`, where some, `hair (N,)`, are sure to be hair.
+
+    Skin is looked for among the others with less gloss than nine in ten of the sure ones; where
+    these are no more than in hair itself, all of it is hair. Where the classes that start from
+    them overlap, the rest is as a whole what most of it is. Where sure hair is matte, as what
+    stands off a head that was misplaced, light cannot tell, and all of the rest is skin.
+    """
+    if np.median(looks[hair, 0]) < FAINTEST_GLOSS:
+        return TwoClasses(np.zeros(4), -5.0)
+    matte = ~hair & (looks[:, 0] < np.quantile(looks[hair, 0], _LIKE_HAIR))
+    share = float(matte.sum() / max((~hair).sum(), 1))
+    if share <= 2 * _LIKE_HAIR:
+        return TwoClasses(np.zeros(4), 5.0)
+    return split(looks, hair, matte) or TwoClasses(np.zeros(4), 1.0 if share < 0.5 else -1.0)
+
+
+def split(looks: Array, hair: Bools, skin: Bools) -> TwoClasses | None:
+    """Hair and skin among pixels with `looks (N, 4)`, learned from examples of both.
+
+    Two Gaussians of one covariance, by expectation and maximisation: `hair (N,)` stays hair, `skin
+    (N,)` is where the other class starts. Of colour and albedo, or where these do not tell the
+    examples apart, of gloss, too, which is blurred and rises in hair's shadow. None where they
+    still do not: on its own side must be `_RIGHT` of each.
+    """
+    few = np.random.default_rng(0).permutation(len(looks))[:_MOST_PIXELS]
+    x, hair, skin = looks[few], hair[few], skin[few]
+    examples = hair if hair.any() else ~skin
+    for columns in ([1, 2, 3], [0, 1, 2, 3]):
+        found = _mixture(x[:, columns], hair, skin)
+        if found is not None:
+            weights = np.zeros(4)
+            weights[columns] = found[0]
+            classes = TwoClasses(weights, found[1])
+            odds = classes.scores(x.T)
+            if min((odds[examples] > 0).mean(), (odds[skin] < 0).mean()) > _RIGHT:
+                return classes
+    return None
+
+
+def _mixture(x: Array, hair: Bools, start: Bools) -> tuple[Array, float] | None:
+    """Weights and offset of the log odds for hair at even priors; None for a class that vanishes.
+
+    Even, since a prior would move the line between the classes where pixels show both.
+    """
+    skin = np.where(hair, 0.0, np.where(start, 0.95, 0.05))
+    for _ in range(_ITERATIONS):
+        classes = (1 - skin, skin)
+        if min(w.sum() for w in classes) < 10:
+            return None
+        means = [np.average(x, axis=0, weights=w) for w in classes]
+        within = sum(((x - m).T * w) @ (x - m) for w, m in zip(classes, means, strict=True))
+        within = within / len(x) + 1e-8 * np.eye(x.shape[1])
+        weights = np.linalg.solve(within, means[0] - means[1])
+        offset = -0.5 * float(weights @ (means[0] + means[1]))
+        prior = np.clip(skin[~hair].mean(), 0.02, 0.98)
+        odds = np.clip(x @ weights + offset + np.log(1 / prior - 1), -30, 30)
+        skin = np.where(hair, 0.0, 1 / (1 + np.exp(odds)))
+    return weights, offset
 
 
 def line_strength(lit: AnyFloats, subject: Bools) -> Array:

@@ -18,6 +18,7 @@ BENCHMARKS = {
     "gradients": "path replay beside finite differences",
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, beside baselines",
+    "masks": "automatic hair masks beside true ones, at several path counts",
     "renderers": "our renderers beside Mitsuba's path integrator, light by light and line by line",
     "all": "every one of them",
 }

@@ -25,6 +25,7 @@ MODULES = {
     "gradients": "benchmarks.renderers.gradients",
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",
+    "masks": "benchmarks.light_planes.masks",
     "renderers": "benchmarks.renderers.errors",
 }
 """Each has its `BENCHMARK`."""

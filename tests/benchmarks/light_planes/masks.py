@@ -1,0 +1,113 @@
+"""Automatic hair masks beside the true ones, at several path counts: noise must not decide them.
+
+Captures of the demo's rig go through the wires once and are kept. Leaves `masks.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from appearance import HairAppearance, build_scene
+from appearance.render.coverage import coverage
+from benchmarks.captures import SimulatedCapture
+from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, option, within
+from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
+from benchmarks.results import save
+from reconstruction import Capture, Progress, Stage, read_strands
+from reconstruction.growth.hair_envelope import build_envelope
+from reconstruction.light_planes import triangulate
+from reconstruction.masks import HairMask, MaskedCapture, disagreements, hair_masks
+from stage_service.cli.support.commands import rig_path
+
+SUBJECTS = ("wavy", "curly", "sintel")
+LEAST_SHARE = 0.1
+"""Of a pixel that the subject must cover to be in its true mask: less is near a frame's noise."""
+
+PATHS = option("--paths", "paths a pixel of the frames", type=int, nargs="+", default=[16, 64])
+
+
+def true_masks(capture: Capture, folder: Path) -> dict[str, HairMask]:
+    """What each pixel shows most of, hair or skin, by rendering the truth in `folder`."""
+    hair = HairAppearance.from_dict(json.loads((folder / "appearance.json").read_text())["hair"])
+    scene = build_scene(read_strands(folder / "strands.npz"), capture.head, hair=hair)
+    out = {}
+    for camera in capture.rig.cameras:
+        share = coverage(scene, camera, 64)
+        subject = share["hair"] + share["head"] > LEAST_SHARE
+        hairy = subject & (share["hair"] >= share["head"])
+        out[camera.name] = HairMask(subject, hairy, subject & ~hairy, "user", 1.0)
+    return out
+
+
+def overlaps(masks: Mapping[str, HairMask], true: Mapping[str, HairMask]) -> dict[str, float]:
+    """Intersection over union of hair, by camera."""
+    out = {}
+    for name, mask in true.items():
+        found, both = masks[name].hair, masks[name].hair & mask.hair
+        out[name] = float(both.sum() / max((found | mask.hair).sum(), 1))
+    return out
+
+
+def judge(folder: Path, truth_folder: Path) -> dict[str, Any]:
+    """Overlaps, disagreements and the envelope, with masks of the light, without head and true."""
+    capture = Capture(folder)
+    cloud, head = triangulate(capture), capture.head
+    assert head is not None
+    true = true_masks(capture, truth_folder)
+    out: dict[str, Any] = {}
+    kinds = {
+        "automatic": hair_masks(capture, cloud, head),
+        "without head": hair_masks(capture, cloud),
+        "true": true,
+    }
+    for kind, masks in kinds.items():
+        stage = Stage("envelope")
+        masked = MaskedCapture(capture, masks)
+        build_envelope(masked, cloud, head, grid=2e-3, margin=2e-3, stage=stage)
+        out[kind] = {
+            "overlap": overlaps(masks, true),
+            "disagreement": disagreements(masks, capture.rig.cameras, cloud, head),
+            "envelope_litres": stage.figures["envelope_litres"],
+        }
+    return out
+
+
+def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCapture]:
+    """By subject and paths."""
+    if args.quick:
+        framing = replace(FRAMINGS["curly"], rows=21, coarser=6)
+        return {("curly", 16): subject_capture("curly", framing, args.cache, 0.0)}
+    rig, data = rig_path("demo").read_text(), data_folder()
+    names = [n for n in SUBJECTS if args.only in (None, n) and (n != "sintel" or data)]
+    if not names:
+        raise LeftOut(f"no subject {args.only!r}; there are {', '.join(SUBJECTS)}")
+    out = {}
+    for name in names:
+        subject, head = name, None
+        if name == "sintel" and data:
+            subject, head = (str(data / name / f) for f in ("sintel.npz", "sintel_head.obj"))
+        for paths in args.paths:
+            label = f"masks-{name}-{paths}"
+            out[name, paths] = SimulatedCapture(
+                label, rig, subject, head, spp=paths, seed=args.seed
+            )
+    return out
+
+
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Each subject at each number of paths; see `judge`."""
+    results: dict[str, Any] = {}
+    captures = _captures(args)
+    for k, ((name, paths), capture) in enumerate(captures.items()):
+        tell = within(progress, f"{name}, {paths} paths", k / len(captures), 1 / len(captures))
+        results.setdefault(name, {})[str(paths)] = judge(*capture.make(args.cache, tell))
+        save(args.out / "masks.json", results)
+    return results
+
+
+BENCHMARK = Benchmark(run, (CACHE, ONLY, PATHS))
