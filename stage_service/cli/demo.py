@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import time
 from fnmatch import fnmatch
@@ -61,6 +62,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     exit_on_sigterm()
     begin = time.perf_counter()
     out: Path = args.out
+    os.environ.setdefault("HAIRSTAGE_TOKEN_FILE", str((out / "token").resolve()))
     rig = Rig.load(args.rig)
     held_out = _held_out(rig, args.hold_out_camera)
     for field in ("subject", "environment"):

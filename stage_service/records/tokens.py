@@ -113,10 +113,16 @@ class Tokens:
 
 
 def own_file() -> Path:
-    """Where this user's own token lies, which the commands send to a service on this machine."""
+    """Where this user's own token lies, which the commands send to a service on this machine.
+
+    Raises `OSError` for a user without a home.
+    """
     if named := os.environ.get("HAIRSTAGE_TOKEN_FILE"):
         return Path(named)
-    home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    try:
+        home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    except RuntimeError as error:
+        raise OSError(f"{error}; set HAIRSTAGE_TOKEN_FILE") from error
     return Path(home) / "hairstage" / "token"
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stage_service.cli.support.commands import (
-    PRIVATE,
     BadArgument,
     Commands,
     Output,
@@ -51,7 +49,7 @@ def run_make(args: argparse.Namespace, output: Output) -> None:
     scopes = tuple(s for s in SCOPES if s in asked)
     if unknown := asked - set(SCOPES):
         raise BadArgument(f"--scopes: there is no {sorted(unknown)}; there are {', '.join(SCOPES)}")
-    os.umask(PRIVATE)
+    args.root.mkdir(mode=0o750, parents=True, exist_ok=True)
     token = _tokens(args).make(args.name, scopes)
     _record(args, "token.make", ", ".join(scopes))
     output.result({"name": args.name, "scopes": scopes, "token": token}, token)
