@@ -71,7 +71,9 @@ def test_segments_that_three_views_find_alike_lie_on_fibres(fibres: Any, segment
     dense = fibres.strands.resampled(2e-4).points
     off = np.array([np.linalg.norm(dense - p, axis=1).min() for p in segments.points[::50]])
     agreed = segments.supports[::50] >= 3
-    assert np.quantile(off[agreed], 0.9) < 6e-4
+    camera = fibres.cameras[0]
+    pixel = np.linalg.norm(camera.center) / camera.K[0, 0]  # metres at the ball
+    assert np.quantile(off[agreed], 0.9) < 0.8 * pixel
     assert off[agreed].mean() < 0.5 * off[~agreed].mean()
     assert segments.supports.max() <= len(fibres.views)
 
