@@ -83,7 +83,9 @@ class FittedModel:
         if self.maps.uniform and hair != appearance.hair:
             red, green, blue = colour_of_absorption(hair.sigma_a, hair.beta_n)
             v = float(variance_of_roughness(hair.beta_m))
-            appearance = replace(appearance, hair=hair, colour=(red, green, blue), v=v)
+            appearance = replace(
+                appearance, hair=hair, colour=(red, green, blue), v=v, uncertainty=None
+            )
         model.create().write_strands(self.strands)
         if self.head is not None:
             model.write_head(self.head)

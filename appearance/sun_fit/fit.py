@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -19,26 +19,53 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from appearance.sun_fit.fitted_appearance import FittedAppearance
-from appearance.sun_fit.mirror_samples import MirrorSamples, binned, mirror_lights, mirror_samples
+from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
+from appearance.sun_fit.light_correlation import (
+    WINDOW,
+    Highlights,
+    Roughness,
+    disordered,
+    match_roughness,
+)
+from appearance.sun_fit.mirror_samples import (
+    MirrorSamples,
+    binned,
+    mirror_lights,
+    mirror_samples,
+    usable,
+)
 from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import (
+    LEAST_ALBEDO,
+    LEAST_SKIN,
+    MOST_ALBEDO,
+    MOST_SKIN,
     Colours,
     FitPixels,
     Lobe,
     fit_colour,
     fit_lobe,
     fit_lobe_as_printed,
-    match_roughness,
 )
 from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
 from reconstruction import Capture, Model, Progress, Report, Stage, silent
-from reconstruction.arrays import Array
+from reconstruction.arrays import Array, Floats
 from reconstruction.report.report import Series
 
 MAX_DEPTH = 16
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
+ROUGHNESSES = (0.04, 0.12, 0.3, 0.6, 0.95)
+"""β_M of the first renderings; nothing outside is found."""
+NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
+"""Those that follow, as factors on the answer of the first."""
+DISORDER = 2.0
+"""Turn of single strands over the error of a pixel's mean inclination.
+
+√2 for the two ways across, √2 for a mean over two strands or so.
+"""
+ROUGHNESS_PIXELS = 350
+"""Pixels a camera, at most, whose highlights are matched."""
 
 
 def fit(
@@ -70,19 +97,33 @@ def fit(
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
     head = model.head(capture)
     scene = build_scene(strands, head, hair=start)
-    fitting = SunFit(scene, pixels, options, seed, progress)
+    fitting = SunFit(
+        scene,
+        pixels,
+        options,
+        seed,
+        progress,
+        lambda angle: build_scene(disordered(strands, angle, seed), head, hair=start),
+    )
     with report.stage("roughness") as stage:
-        plain, printed, corrected, first = fitting.roughness(stage)
+        plain, printed, found, first = fitting.roughness(stage)
     with report.stage("colour") as stage:
-        colours = fitting.colour(corrected, np.array(first.colour), np.array(first.skin), stage)
+        colours = fitting.colour(found.beta_m, np.array(first.colour), np.array(first.skin), stage)
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
             stage.warn("no camera sees skin: its colour is a guess")
-    v = float(variance_of_roughness(corrected))
-    found = (colours.hair, colours.colour, colours.skin, exposure)
+        red, green, blue = (
+            x if np.isfinite(x) else None for x in colours.absorption_error(first.pairs).tolist()
+        )
+        known = Uncertainty(found.error, found.low, found.high, (red, green, blue))
+        stage.figures["sigma_a_error"] = list(known.sigma_a)
+        for warning in known.warnings(colours.hair.sigma_a):
+            stage.warn(warning)
+    v = float(variance_of_roughness(found.beta_m))
+    made = (colours.hair, colours.colour, colours.skin, exposure)
     model.forget_appearance()
-    FittedAppearance(*found, v, plain.v, printed, held_out).save(model)
+    FittedAppearance(*made, v, plain.v, printed, held_out, known).save(model)
     for stale in ("inverse_rendering", "images"):
         report.drop(stale)
     model.write_report(report)
@@ -119,6 +160,11 @@ def _observed(
             stage.warn(f"{name}: {missing} of {len(lights)} lights have no usable frame")
     if not hair:
         raise ValueError(f"{model}: the hair masks of the cameras {cameras} are all empty")
+    if not any((o.radiance[o.valid] > 0).any() for o in hair):
+        raise ValueError(
+            f"{training.path}: every hair pixel of every frame is dark, saturated or missing: "
+            "check the exposure"
+        )
     kept = sum(len(o.pixels) for o in hair)
     stage.figures |= {"cameras": len(cameras), "lights": len(lights), "hair_pixels": kept}
     if kept < seen:
@@ -156,16 +202,21 @@ def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: St
 
 @dataclass(frozen=True)
 class SunFit:
-    """The observations and the geometry that the two fits share."""
+    """The observations and the geometry that the two fits share.
+
+    `disordered` makes the scene of strands whose tangents are turned by so many radians RMS, for
+    strands that were reconstructed; without it they are taken to be exact.
+    """
 
     scene: HairScene
     pixels: FitPixels
     options: FitOptions
     seed: int
     progress: Progress
+    disordered: Callable[[float], HairScene] | None = None
 
-    def roughness(self, stage: Stage) -> tuple[Lobe, float, float, Colours]:
-        """The plain lobe, Eq. 10's variance, the corrected β_M and a first colour."""
+    def roughness(self, stage: Stage) -> tuple[Lobe, float, Roughness, Colours]:
+        """The plain lobe, Eq. 10's variance, the roughness by rendering and a first colour."""
         start = time.perf_counter()
         self.progress("measuring the highlight", 0.3)
         hair = self.pixels.hair
@@ -179,39 +230,61 @@ class SunFit:
             )
         views = [(o, f) for o, f in views if len(o.lights)]
         if not views:
-            raise ValueError("no light lies near a mirror direction of any hair pixel")
+            raise ValueError(
+                "no light lies near a mirror direction of any hair pixel: the roughness needs more "
+                "lights"
+            )
         mean = sum(o.radiance.mean((0, 1)) for o, _ in views)
         channel = int(np.argmin(mean))
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
         first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"), 2)
-        series = Series("roughness", "|log β_M measured − log β_M of the rendering|")
+        highlights = Highlights(views, self._tilt, channel)
+        captured = highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in views])
+        series = Series("roughness", "standard error of log β_M")
         stage.series.append(series)
+        rendered: dict[float, list[Floats]] = {}
 
-        def rendered(beta: float) -> float:
-            self.progress("matching the highlight", 0.5 + 0.05 * len(series.points))
-            lit = self.scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
-            found = self._read([(self._render(lit, o), f) for o, f in views], channel)[0].beta_m
-            error = abs(float(np.log(found / plain.beta_m)))
-            series.points.append((time.perf_counter() - start, error))
+        def matched(scene: HairScene, roughnesses: Iterable[float]) -> Roughness:
+            rendered.clear()
+            for beta in roughnesses:
+                hair, number = replace(first.hair, beta_m=beta), len(series.points) * 16
+                self.progress("matching the highlight", 0.5 + (number + len(rendered)) / 200)
+                lit = scene.with_hair(hair).with_skin(first.skin)
+                rendered[beta] = [self._halves(lit, o, number + len(rendered)) for o, _ in views]
+            family = [(beta, highlights.of(rendered[beta])) for beta in rendered]
+            found = match_roughness(captured, family)
+            series.points.append((time.perf_counter() - start, found.error))
             return found
 
-        corrected, pairs = match_roughness(plain.beta_m, rendered, plain.beta_m)
+        about = matched(self.scene, ROUGHNESSES)
+        scene, off = self.scene, DISORDER * np.radians(about.tangents_deg)
+        if self.disordered is not None and off > 0:
+            scene = self.disordered(float(off))
+        nearer = np.clip(np.array(NEARER) * about.beta_m, ROUGHNESSES[0], ROUGHNESSES[-1])
+        found = matched(scene, np.unique(nearer).tolist()).after(about)
         stage.figures |= {
             "samples": count,
+            "pairs_of_lights": int(captured.pairs.sum()),
             "channel": "RGB"[channel],
             "sun_v": plain.v,
             "sun_beta_m": plain.beta_m,
             "sun_v_as_printed": printed,
             "sun_beta_m_as_printed": float(roughness_of_variance(printed)),
             "lobe_residual": plain.residual,
-            "beta_m": corrected,
-            "v": float(variance_of_roughness(corrected)),
-            "rendered_against_read": [list(p) for p in pairs],
+            "v": float(variance_of_roughness(found.beta_m)),
+            **asdict(found),
+            "range": list(found.range),
+            "views": list(found.views),
+            "correlation_deg": float(np.degrees(captured.angle())),
+            "rendered_correlation_deg": [
+                [beta, float(np.degrees(highlights.of(rendered[beta]).angle()))]
+                for beta in rendered
+            ],
         }
-        if plain.gain <= 0 or plain.residual > 0.4:
-            stage.warn("no clear highlight: the roughness is poorly determined")
-        return plain, printed, corrected, first
+        for warning in found.warnings():
+            stage.warn(warning)
+        return plain, printed, found, first
 
     def colour(
         self,
@@ -245,21 +318,31 @@ class SunFit:
         stage.figures |= {
             "colour": list(result.colour),
             "sigma_a": list(result.hair.sigma_a),
-            "sigma_a_of_first_guess": absorption_of_colour(result.first, BETA_N).tolist(),
+            "sigma_a_of_first_guess": absorption_of_colour(result.pairs[0][0], BETA_N).tolist(),
             "skin": list(result.skin),
             "relative_error": min(result.errors),
         }
+        for what, values, least, most in (
+            ("colour of dense hair", result.colour, LEAST_ALBEDO, MOST_ALBEDO),
+            ("skin's albedo", result.skin, LEAST_SKIN, MOST_SKIN),
+        ):
+            if min(values) <= least or max(values) >= most:
+                stage.warn(f"the {what} is at the end of its range, {least:g} to {most:g}")
         if min(result.errors) > 0.05:
             off = f"the mean colour is off by {min(result.errors):.0%}"
             stage.warn(f"{off}: is the geometry whole?")
         return result
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:
-        """Observed pixels with their fibres, under the lights near a mirror direction."""
+        """Some pixels of hair of one direction, their fibres, the lights near a mirror."""
         out = []
         for o in hair:
             fibres = visible_fibres(self.scene, o.camera, o.pixels, seed=self.seed)
-            near = mirror_lights(o, fibres, tilt_deg=self._tilt)
+            found = np.flatnonzero(usable(fibres))
+            few = np.linspace(0, len(found) - 1, min(len(found), ROUGHNESS_PIXELS)).astype(int)
+            keep = np.isin(np.arange(len(o.pixels)), found[few])
+            o, fibres = o.where(keep), fibres.where(keep)
+            near = mirror_lights(o, fibres, tilt_deg=self._tilt, window=WINDOW)
             out.append((o.under(near), fibres))
         return out
 
@@ -270,9 +353,12 @@ class SunFit:
         bins = binned(MirrorSamples.joined(parts))
         return fit_lobe(bins), fit_lobe_as_printed(bins), int(bins.count.sum())
 
-    def _render(self, scene: HairScene, o: Observed) -> Observed:
-        spent = asdict(Sampling(self.options.roughness_spp, MAX_DEPTH, self.seed))
-        return replace(o, radiance=render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent))
+    def _halves(self, scene: HairScene, o: Observed, number: int) -> Floats:
+        """Two renderings `(2, L, P, 3)` of a view, half the samples and own noise each."""
+        spp = max(self.options.roughness_spp // 2, 1)
+        spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 12)))
+        twice = render_olat(scene, o.camera, o.lights, pixels=np.tile(o.pixels, 2), **spent)
+        return np.stack(np.split(twice, 2, axis=1))
 
     @property
     def _tilt(self) -> float:

@@ -5,10 +5,39 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
 from reconstruction import Model, ModelError
+
+UNCERTAIN = 0.2
+"""Standard error of log sigma_a above which a user is warned."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What a fit knows of its error.
+
+    `beta_m` is the standard error of log β_M, `beta_m_low` and `beta_m_high` the ends of an
+    interval of about 95 %; `sigma_a (3,)` the standard error of log sigma_a, None where the hair's
+    colour does not answer to it.
+    """
+
+    beta_m: float
+    beta_m_low: float
+    beta_m_high: float
+    sigma_a: tuple[float | None, float | None, float | None]
+
+    def warnings(self, sigma_a: tuple[float, float, float]) -> list[str]:
+        """What a user has to know of an absorption `sigma_a` before believing it."""
+        return [
+            f"sigma_a of {name}, {value:.2g}, "
+            + ("cannot be told from the colour" if e is None else f"is uncertain by {e:.0%}")
+            for name, value, e in zip(("red", "green", "blue"), sigma_a, self.sigma_a, strict=True)
+            if e is None or e > UNCERTAIN
+        ]
 
 
 @dataclass(frozen=True)
@@ -19,7 +48,7 @@ class FittedAppearance:
     absorption, `skin (3,)` a diffuse albedo, `exposure` the capture's. `v` is the longitudinal
     variance behind `hair.beta_m`; `plain_v` and `printed_v` are what the captured lobe reads before
     the correction by rendering, with a floor and (as Sun's Eq. 10) without. `held_out` is what
-    the fit did not observe.
+    the fit did not observe. `uncertainty` is None where `hair` is not what was fitted.
     """
 
     hair: HairAppearance
@@ -30,6 +59,7 @@ class FittedAppearance:
     plain_v: float
     printed_v: float
     held_out: HeldOut
+    uncertainty: Uncertainty | None = None
 
     def save(self, model: Model) -> None:
         """Write `appearance.json`."""
@@ -62,6 +92,7 @@ class FittedAppearance:
                 float(data["plain_v"]),
                 float(data["printed_v"]),
                 HeldOut(*(tuple(data["held_out"][k]) for k in ("cameras", "lights"))),
+                TypeAdapter(Uncertainty | None).validate_python(data["uncertainty"]),
             )
         except (KeyError, IndexError, TypeError, ValueError) as error:
             path = model.file("appearance.json")

@@ -74,30 +74,31 @@ def mirror_samples(
     """Samples of one view with |θ_i + θ_o + 2 tilt| and |φ_i − φ_o| below π/6 (Eq. 9).
 
     `channel` is the colour channel to take: the darkest has the least light from inside the fibres.
-    Pixels with less hair than `LEAST_SHARE`, or whose tangents vary by more than `MOST_SPREAD`
-    rad², are left out.
+    Pixels that are not `usable` are left out.
     """
-    near, theta, towards, squared = _near_mirror(observed, fibres, tilt_deg)
-    light, pixel = np.nonzero(near)
-    middle = _middle(fibres)
+    found = near_mirror(observed, fibres, tilt_deg)
+    light, pixel = np.nonzero(found.near)
+    middle = found.middle
     shines = np.array([light.intensity_towards(middle)[:, channel] for light in observed.lights])
     tangent = fibres.tangent[pixel].astype(float)
     intensity = np.maximum(shines[light, pixel], 1e-12)
-    value = observed.radiance[light, pixel, channel] * squared[light, pixel] / intensity
+    value = observed.radiance[light, pixel, channel] * found.squared[light, pixel] / intensity
     to_camera = _unit(observed.camera.center - middle)
     theta_o = _angle(np.einsum("pi,pki->pk", to_camera, fibres.tangent)) + 2 * np.radians(tilt_deg)
     return MirrorSamples(
-        theta[light, pixel],
+        found.deviation[light, pixel],
         value / fibres.share[pixel],
-        _angle(np.einsum("ni,nki->nk", towards[light, pixel], tangent)),
+        _angle(np.einsum("ni,nki->nk", found.towards[light, pixel], tangent)),
         theta_o[pixel],
         fibres.hair[pixel],
     )
 
 
-def mirror_lights(observed: Observed, fibres: VisibleFibres, *, tilt_deg: float) -> Ints:
+def mirror_lights(
+    observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, window: float = WINDOW
+) -> Ints:
     """Indices `(K,)` of the lights near the mirror direction of a share of 3 % of the pixels."""
-    near = _near_mirror(observed, fibres, tilt_deg)[0]
+    near = near_mirror(observed, fibres, tilt_deg, window).near
     return np.flatnonzero(near.sum(axis=1) > 0.03 * near.shape[1])
 
 
@@ -132,12 +133,34 @@ def binned(samples: MirrorSamples, *, seed: int = 0) -> LobeBins:
     )
 
 
-def _near_mirror(
-    observed: Observed,
-    fibres: VisibleFibres,
-    tilt_deg: float,
-) -> tuple[Bools, Array, Array, Array]:
-    """Which samples to take `(L, P)`, their deviations, and the way to the light and its square."""
+@dataclass(frozen=True, eq=False)
+class NearMirror:
+    """Which lights are near the mirror direction of which pixels, `near (L, P)`.
+
+    `deviation (L, P)` is θ_i + θ_o + 2 tilt at the pixel's mean tangent; `middle (P, 3)` the mean
+    of the points that its rays met, `towards (L, P, 3)` and `squared (L, P)` the unit direction and
+    the squared distance from there to the light.
+    """
+
+    near: Bools
+    deviation: Array
+    middle: Array
+    towards: Array
+    squared: Array
+
+
+def usable(fibres: VisibleFibres) -> Bools:
+    """Pixels `(P,)` with enough hair, of one direction: `LEAST_SHARE` and `MOST_SPREAD`, rad²."""
+    return np.asarray((fibres.share >= LEAST_SHARE) & (fibres.spread() <= MOST_SPREAD))
+
+
+def near_mirror(
+    observed: Observed, fibres: VisibleFibres, tilt_deg: float, window: float = WINDOW
+) -> NearMirror:
+    """Samples with |θ_i + θ_o + 2 tilt| below `window` and |φ_i − φ_o| below π/6.
+
+    Pixels that are not `usable` are left out.
+    """
     middle = _middle(fibres)
     mean = _unit(fibres.tangent.sum(axis=1, dtype=float))
     to_camera = _unit(observed.camera.center - middle)
@@ -149,11 +172,11 @@ def _near_mirror(
     across_o = _unit(to_camera - sin_o[:, None] * mean)
     across_i = _unit(towards - sin_i[..., None] * mean)
     deviation = _angle(sin_i) + _angle(sin_o) + 2 * np.radians(tilt_deg)
-    near = (np.abs(deviation) < WINDOW) & observed.valid
+    near = (np.abs(deviation) < window) & observed.valid
     near &= (across_i * across_o).sum(-1) > np.cos(WINDOW)
-    near &= (fibres.share >= LEAST_SHARE) & (fibres.spread() <= MOST_SPREAD)
+    near &= usable(fibres)
     near &= np.array([(light.intensity > 0).all() for light in observed.lights])[:, None]
-    return near, deviation, towards, squared
+    return NearMirror(near, deviation, middle, towards, squared)
 
 
 def _middle(fibres: VisibleFibres) -> Array:

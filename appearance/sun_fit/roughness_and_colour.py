@@ -2,9 +2,9 @@
 
 Roughness: pixel values near the mirror direction, binned over the deviation from it, are a lobe on
 a floor of multiple scattering; the lobe's variance is the roughness (`fit_lobe`).
-Two things bias that: hairs light each other near the mirror direction too, and other lobes lie
-under the first. `match_roughness` measures renderings of known roughness in the same way and
-reads the true value off them. Colour: Algorithm 1 with Eq. 11 and 12 (`fit_colour`).
+Three things bias that: hairs light each other near the mirror direction too, other lobes lie under
+the first, and tangents that are off widen it. The roughness that a fit ends at is that of
+`light_correlation`. Colour: Algorithm 1 with Eq. 11 and 12 (`fit_colour`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar, nnls
-from scipy.stats import theilslopes
 
 from appearance.bsdf.longitudinal import (
     absorption_of_colour,
@@ -26,10 +25,13 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import HairScene
+from appearance.sun_fit.light_correlation import SIDE, parts_of
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
+LEAST_ALBEDO, MOST_ALBEDO = 0.005, 0.995
+LEAST_SKIN, MOST_SKIN = 0.005, 0.98
 SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
@@ -89,36 +91,6 @@ def _minimum(error: Callable[[float], float]) -> float:
     return float(minimize_scalar(error, bounds=(low, high), method="bounded").x)
 
 
-def match_roughness(
-    measured: float, rendered: Callable[[float], float], start: float
-) -> tuple[float, list[tuple[float, float]]]:
-    """The β_M whose renderings read `measured` when they are measured as the capture was.
-
-    `measured` and `rendered(β_M)` are roughnesses by the same estimator, so that its bias cancels.
-    Three renderings around `start` give a line in log β_M, a fourth where that says the answer is.
-    Readings scatter by a few per cent and one may be far off: the line is Theil and Sen's, through
-    medians, and the answer stays within a factor of 2 of `start`. Returns β_M and the pairs (β_M,
-    rendered(β_M)).
-    """
-    pairs: list[tuple[float, float]] = []
-    lowest, highest = (
-        float(np.clip(start * factor, LEAST_ROUGHNESS, GREATEST_ROUGHNESS)) for factor in (0.5, 2.0)
-    )
-    for factor in (1.0, 0.75, 1.3):
-        near = float(np.clip(start * factor, lowest, highest))
-        pairs.append((near, rendered(near)))
-    beta = start
-    for last in (False, True):
-        x, y = np.log(np.array(pairs)).T
-        # an estimator that hardly answers to β_M must not throw the answer out of range
-        gradient = float(np.clip(theilslopes(y, x)[0], 0.4, 1.5))
-        wanted = (np.log(measured) - float(np.median(y - gradient * x))) / gradient
-        beta = float(np.clip(np.exp(wanted), lowest, highest))
-        if not last:
-            pairs.append((beta, rendered(beta)))
-    return beta, pairs
-
-
 @dataclass(frozen=True, eq=False)
 class FitPixels:
     """What the cameras observed: hair, and skin where they see some."""
@@ -131,15 +103,32 @@ class FitPixels:
 class Colours:
     """What Algorithm 1 found: C, its hair and the skin's albedo.
 
-    `first` is the C it started from; `errors` are the relative errors of the rendered mean colour
-    of the hair, one a rendering.
+    `pairs` are the C that were rendered, each `(3,)`, and the hair's mean colours; `errors` how far
+    off each was, relative. `scatter (3,)` is the standard error of the logarithm of the last one's
+    mean over the captured one's, over parts of the hair and between views.
     """
 
     colour: tuple[float, float, float]
     hair: HairAppearance
     skin: tuple[float, float, float]
-    first: tuple[float, float, float]
+    pairs: list[tuple[Array, Array]]
     errors: list[float]
+    scatter: Array
+
+    def absorption_error(self, earlier: Sequence[tuple[Array, Array]] = ()) -> Array:
+        """Standard error of log sigma_a `(3,)`: `scatter`, by how the mean colour answers to C.
+
+        That is read off all pairs, those `earlier` too. It is infinite where the colour does not
+        answer: black hair is no darker for more absorption.
+        """
+        c, r = (
+            np.log(np.maximum(x, 1e-12)) for x in np.array([*earlier, *self.pairs]).swapaxes(0, 1)
+        )
+        spread = ((c - c.mean(0)) ** 2).sum(0)
+        answers = ((c - c.mean(0)) * (r - r.mean(0))).sum(0)
+        gradient = np.where(spread > 1e-4, answers / np.maximum(spread, 1e-4), 1.0)
+        slope = gradient * np.abs(np.log(np.array(self.colour)))
+        return np.where(slope > 0, 2 * self.scatter / np.maximum(slope, 1e-12), np.inf)
 
 
 def fit_colour(
@@ -174,18 +163,22 @@ def fit_colour(
         current = _with_colour(scene.hair, colour, beta_n)
         lit = scene.with_hair(current).with_skin(np.clip(albedo, 0, 1))
         now = replace(sampling, seed=sampling.seed + step)
-        seen = _mean_colour([_rendered(lit, o, now) for o in pixels.hair])
+        views = [_rendered(lit, o, now) for o in pixels.hair]
+        seen = _mean_colour(views)
         errors.append(float(np.linalg.norm(seen - target) / np.linalg.norm(target)))
         on_iteration(errors[-1])
         pairs.append((colour, seen))
         if skin_target is not None and step < 3:
             skin_seen = _mean_colour([_rendered(lit, o, now) for o in pixels.skin])
-            albedo = np.clip(albedo * skin_target / np.maximum(skin_seen, 1e-12), 0.005, 0.98)
+            albedo = np.clip(
+                albedo * skin_target / np.maximum(skin_seen, 1e-12), LEAST_SKIN, MOST_SKIN
+            )
         if errors[-1] < TOLERANCE and step > 0:
             break
         colour = next_colour(pairs, target)
     best = _with_colour(scene.hair, colour, beta_n)
-    return Colours(_rgb(colour), best, _rgb(albedo), _rgb(pairs[0][0]), errors)
+    scatter = _scatter(pixels.hair, views)
+    return Colours(_rgb(colour), best, _rgb(albedo), pairs, errors, scatter)
 
 
 def fit_diffuse(
@@ -211,7 +204,7 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
     The first step scales C by the ratio of captured to rendered; later ones solve Eq. 12's line,
     fitted to all pairs, for the captured R. Pairs weigh more the nearer the target they are, so
     that the line follows the curve's bend. A step stays within a factor of 2 of the nearest pair,
-    and C in [0.005, 0.995].
+    and C in [`LEAST_ALBEDO`, `MOST_ALBEDO`].
     """
     c, r = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     out = np.empty(3)
@@ -227,7 +220,7 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
             if gradient > 0:  # noise may turn it between two colours that are all but equal
                 value = middle + (target[k] - level) / gradient
         out[k] = np.clip(value, 0.5 * c[nearest, k], 2.0 * c[nearest, k])
-    return np.clip(out, 0.005, 0.995)
+    return np.clip(out, LEAST_ALBEDO, MOST_ALBEDO)
 
 
 def _with_colour(hair: HairAppearance, colour: Array, beta_n: float) -> HairAppearance:
@@ -248,6 +241,26 @@ def _mean_colour(views: Sequence[Observed]) -> Array:
     """Mean radiance `(3,)` over the valid samples of all views: the hair under uniform light."""
     total = sum(np.where(o.valid[..., None], o.radiance, 0).sum((0, 1), dtype=float) for o in views)
     return np.asarray(total / max(sum(int(o.valid.sum()) for o in views), 1))
+
+
+def _scatter(captured: Sequence[Observed], rendered: Sequence[Observed]) -> Array:
+    """Standard error `(3,)` of the log ratio of mean colours: jackknife over parts, or views."""
+    one, other = (np.stack([_sums(o) for o in views]) for views in (captured, rendered))
+    flat = [x.reshape(-1, 3) for x in (one, other)]
+    left = [np.maximum(x.sum(0) - x, 1e-12) for x in flat]
+    ratio = np.log(left[0] / left[1])
+    scatter = np.sqrt((len(ratio) - 1) * ratio.var(axis=0))
+    if len(one) > 1:
+        views = np.log(np.maximum(one.sum(1), 1e-12) / np.maximum(other.sum(1), 1e-12))
+        scatter = np.maximum(scatter, views.std(axis=0, ddof=1) / np.sqrt(len(views)))
+    return np.asarray(scatter)
+
+
+def _sums(o: Observed) -> Array:
+    """Radiance summed over each part of a view's hair `(9, 3)`."""
+    of_pixel = np.where(o.valid[..., None], o.radiance, 0).sum(axis=0, dtype=float)
+    part = parts_of(o)
+    return np.stack([of_pixel[part == k].sum(axis=0) for k in range(SIDE**2)])
 
 
 def _as_albedo(views: Sequence[Observed]) -> Array:

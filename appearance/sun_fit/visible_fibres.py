@@ -33,6 +33,10 @@ class VisibleFibres:
         """Share of each pixel that shows hair `(P,)`."""
         return np.asarray(self.hair.mean(axis=1))
 
+    def where(self, pixels: Bools) -> VisibleFibres:
+        """Those of some of the pixels, marked by `pixels (P,)`."""
+        return VisibleFibres(self.point[pixels], self.tangent[pixels], self.hair[pixels])
+
     def spread(self) -> Array:
         """Variance `(P,)`, rad², of the tangents' angle to their undirected mean in a pixel."""
         t = self.tangent.astype(float)

@@ -55,7 +55,9 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
 
     Fitted is what is rendered; where inverse rendering was run, both fits also stand by themselves
-    (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells.
+    (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells. Sun's fit has
+    the standard errors of its logarithms: `beta_m_error`, and `sigma_a_error (3,)`, in which None
+    stands for what the colour does not tell.
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
@@ -77,6 +79,8 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
 
     sun, true = FittedAppearance.load(model), json.loads(truth.read_text())
     out = {"fitted": figures(HairMaps.of(sun.hair), sun.skin)}
+    if (known := sun.uncertainty) is not None:
+        out["fitted"] |= {"beta_m_error": known.beta_m, "sigma_a_error": list(known.sigma_a)}
     for folder in (model, model.rejected()):
         if folder.has("hair_maps.npz"):
             out["sun_fit"] = out["fitted"]

@@ -66,4 +66,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     if options.held_out_cameras or options.held_out_lights:
         with progress_bar("assess") as progress:
             data["images"] = assess(StepContext(args.capture, model, options, progress))
+    data["warnings"] = [f"{s.name}: {w}" for s in model.report().stages for w in s.warnings]
+    for warning in data["warnings"]:
+        output.note(f"warning: {warning}")
     output.result(data)

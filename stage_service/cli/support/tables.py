@@ -37,6 +37,7 @@ _APPEARANCE = {
     "colour": "colour of dense hair",
     "skin": "colour of skin",
 }
+_ERRORS = {"beta_m_error": "standard error of β_M", "sigma_a_error": "standard error of σ_a"}
 
 
 def figures_table(results: Mapping[str, Any], out: Path) -> Group:
@@ -52,6 +53,9 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     hair = Table("appearance", *(_PICTURES.get(name, name) for name in fits))
     for key, what in _APPEARANCE.items():
         hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
+    for key, what in _ERRORS.items():
+        if any(key in figures for figures in fits.values()):
+            hair.add_row(what, *(_per_cent(figures.get(key)) for figures in fits.values()))
     capture = results["capture"]
     return Group(
         geometry,
@@ -132,6 +136,7 @@ def _rows() -> dict[str, list[_Part]]:
     for fit in ("fitted", "sun_fit", "true"):
         title = {"fitted": "ours", "true": "the truth"}.get(fit, _PICTURES.get(fit, fit))
         rows[f"β_M: {title}"] = [(partial(_beta_m, fit=fit), ".2f", "")]
+    rows["β_M: standard error that Sun's fit gives"] = [(_beta_m_error, ".2f", "")]
     return rows
 
 
@@ -154,6 +159,17 @@ def _score(results: Mapping[str, Any], group: str, name: str, score: str) -> flo
 def _beta_m(results: Mapping[str, Any], fit: str) -> float | None:
     found = results["appearance"].get(fit)
     return None if found is None else float(found["beta_m"])
+
+
+def _beta_m_error(results: Mapping[str, Any]) -> float | None:
+    fits = results["appearance"]
+    found = fits.get("sun_fit", fits["fitted"])
+    return float(found["beta_m"] * found["beta_m_error"]) if "beta_m_error" in found else None
+
+
+def _per_cent(value: Any) -> str:
+    values = value if isinstance(value, list) else [value] * (value is not None)
+    return ", ".join("?" if x is None else f"{100 * x:.0f} %" for x in values)
 
 
 def _numbers(value: Any) -> str:

@@ -9,7 +9,7 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
-from appearance.sun_fit.fitted_appearance import FittedAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
     Camera,
@@ -104,8 +104,47 @@ def test_fit_reports_what_it_did(made, fitted):
     assert "dark" in dark[0].what
     errors = [e for _, e in report["colour"].series[0].points]
     assert min(errors) < 0.05
-    assert len(report["roughness"].series[0].points) == 4
+    assert len(report["roughness"].series[0].points) == 2
     assert made[1].report().to_dict() == report.to_dict()
+
+
+def test_fit_says_how_far_off_it_may_be(fitted):
+    appearance, report = fitted
+    known = appearance.uncertainty
+    assert known is not None
+    assert known.beta_m_low < TRUTH.beta_m < known.beta_m_high
+    off = np.log(np.array(appearance.hair.sigma_a) / TRUTH.sigma_a)
+    assert (np.abs(off) < 3 * np.array(known.sigma_a, float)).all()
+    assert report["roughness"].figures["error"] == known.beta_m
+
+
+def fit_of(folder, made, change, lights):
+    """What a fit makes of some of `made`'s frames; `change`: a factor, and the full scale."""
+    capture, model = made
+    steps = [Step(i, "olat", 0.02, light=x) for i, x in enumerate(lights)]
+    plan = {"steps": [s.to_dict() for s in steps]}
+    writer = CaptureWriter.create(folder / "capture", capture.rig, plan, head=capture.head)
+    fresh = Model(folder / "model").create()
+    fresh.write_strands(model.strands())
+    factor, full = change
+    for name in ("cam_0", "cam_1"):
+        for step in steps:
+            image = np.minimum(capture.light(step.light, name)[0] * factor, full)
+            writer.write_frame(step, name, image, full_scale=full)
+        for kind in ("hair", "skin"):
+            fresh.write_mask(name, kind, model.mask(name, kind, capture))
+    writer.finish("completed", {})
+    fit(Capture(folder / "capture"), fresh, held_out=HeldOut(("cam_2",)), options=OPTIONS)
+
+
+def test_one_light_is_refused(made, tmp_path):
+    with pytest.raises(ValueError, match="needs more lights"):
+        fit_of(tmp_path, made, (1.0, np.inf), lights=["l3"])
+
+
+def test_frames_that_are_all_saturated_are_refused(made, tmp_path):
+    with pytest.raises(ValueError, match="saturated"):
+        fit_of(tmp_path, made, (1e6, 1e-3), lights=["l3", "l4", "l6"])
 
 
 def test_missing_frames_and_masks_are_named(made, tmp_path):
@@ -150,7 +189,10 @@ def test_saturated_samples_are_not_valid(made, tmp_path):
 
 
 def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
-    a = FittedAppearance(TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT)
+    known = Uncertainty(0.1, 0.2, 0.3, (0.1, 0.2, None))
+    a = FittedAppearance(
+        TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT, known
+    )
     model = Model(tmp_path)
     assert not FittedAppearance.is_of(model, LEFT_OUT)
     a.save(model)

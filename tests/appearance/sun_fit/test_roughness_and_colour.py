@@ -22,7 +22,6 @@ from appearance.sun_fit.roughness_and_colour import (
     fit_diffuse,
     fit_lobe,
     fit_lobe_as_printed,
-    match_roughness,
     next_colour,
 )
 from appearance.sun_fit.visible_fibres import visible_fibres
@@ -69,21 +68,6 @@ def test_too_few_samples_are_an_error_that_says_what_to_do():
     )
     with pytest.raises(ValueError, match="needs more lights"):
         binned(few)
-
-
-def test_matching_cancels_the_bias_of_the_estimator():
-    def biased(beta):
-        return 1.4 * beta**0.8
-
-    beta, pairs = match_roughness(biased(0.23), biased, biased(0.23))
-    assert beta == pytest.approx(0.23, rel=1e-6)
-    assert len(pairs) == 4
-
-
-def test_matching_survives_one_reading_that_is_far_off():
-    readings = iter([0.33, 0.24, 0.02, 0.28])
-    beta, _ = match_roughness(0.3, lambda beta: next(readings), 0.3)
-    assert 0.2 < beta < 0.5
 
 
 def test_colour_iteration_solves_a_line_in_three_steps():

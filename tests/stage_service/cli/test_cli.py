@@ -276,7 +276,11 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     assert {"| β_M: ours | 0.89 |", "| β_M: the truth | 0.28 |"} <= set(rest)
     assert rest[-1] == "[1] fit: the roughness is at its bound"
     again = tmp_path / "again.json"
+    results["appearance"]["fitted"] |= {"beta_m": 0.3, "beta_m_error": 0.1}
     again.write_text(json.dumps(results))
+    assert main(["evaluate", "table", str(again)]) == 0
+    row = "| β_M: standard error that Sun's fit gives | 0.03 |"
+    assert row in capsys.readouterr().out.splitlines()
     code, data = run(capsys, "evaluate", "table", file, again)
     assert (code, list(data["results"])) == (0, [f"curly, seed 3 ({f})" for f in (file, again)])
 

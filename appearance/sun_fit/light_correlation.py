@@ -1,0 +1,347 @@
+"""Roughness from highlights, by strands whose tangents are not exact.
+
+An error ε of a tangent's inclination moves the pixel's whole highlight by 2ε, so the mean profile
+over many pixels is wider than the lobe and its roughness too large. The product of a pixel's
+answers to two lights near its mirror direction, averaged over the angle Δ between them, does not
+ask where the highlight is: its width over Δ is the lobe's. For broad lobes, where Δ does not reach
+far enough, the profile decides, with the spread of its shifts as an unknown. Renderings of known
+roughness are measured in the same way; the roughness is where theirs meet the capture's.
+
+Reconstructed strands are smoother than hair: a pixel of theirs mixes fewer directions, which the
+products do see. The renderings are of strands that are `disordered` by as much as the profile says
+that tangents are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from appearance.observations import Observed
+from appearance.sun_fit.mirror_samples import near_mirror
+from appearance.sun_fit.visible_fibres import VisibleFibres
+from reconstruction import Strands
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+
+WINDOW = np.pi / 3
+"""How far from the mirror direction lights are taken, both ways."""
+EDGES = np.radians([0, 8, 16, 24, 32, 40, 50, 60, 75, 90, 120])
+"""Bins of |θ_i − θ_i'| of two lights."""
+SIDE = 3
+"""A view's hair is parted in 3 × 3."""
+FEWEST_PAIRS = 1000
+"""Pairs of lights, over all pixels, without which there is no answer."""
+WIDEST = 1.5
+"""Ratio of the interval's ends above which a roughness is called uncertain."""
+LARGEST_ERROR = 0.1
+WORST_MISFIT = 3.0
+_DEVIATIONS = np.linspace(-WINDOW, WINDOW, 31)
+_INNER = slice(4, 26)  # a shift brings in nothing unknown there
+_SHIFTS = np.radians(np.arange(0, 31, 3))
+_FLOOR = 0.01  # what a mean of a bin is off by at least, of the mean over bins
+_BETWEEN_RENDERINGS = 0.015  # error of log β_M by interpolation
+_STEPS = 400
+_WAVE = 0.06  # metres of strand: about the pitch of wavy hair
+
+
+@dataclass(frozen=True, eq=False)
+class Highlight:
+    """Sums over `J` parts of the hair, `SIDE`² of each view.
+
+    `products (J, 10)` of a pixel's answers to two lights, over `EDGES`, and `pairs` how many;
+    `values (J, 30)` of its answers over the signed deviation from the mirror direction, and
+    `samples` how many.
+    """
+
+    products: Array
+    pairs: Array
+    values: Array
+    samples: Array
+
+    @classmethod
+    def joined(cls, views: Sequence[Self]) -> Self:
+        """The highlights of several views as one."""
+        names = [f.name for f in fields(cls)]
+        return cls(*(np.concatenate([getattr(v, name) for v in views]) for name in names))
+
+    def correlation(self, parts: Array) -> Array:
+        """Mean products over `EDGES`, relative to their mean `(M, 10)`; `parts (M, J)` weigh."""
+        return _relative(parts @ self.products, parts @ self.pairs)
+
+    def profiles(self, parts: Array) -> Array:
+        """Mean answers over deviation if shifted at random `(M, S, 11)`, relative to their mean.
+
+        `S` are normal shifts of `_SHIFTS`.
+        """
+        mean = _relative(parts @ self.values, parts @ self.samples)
+        middle = 0.5 * (_DEVIATIONS[1:] + _DEVIATIONS[:-1])
+        spread = np.maximum(_SHIFTS, 1e-3)[:, None, None]
+        kernel = np.exp(-0.5 * ((middle[:, None] - middle) / spread) ** 2)
+        kernel /= kernel.sum(axis=2, keepdims=True)
+        inner = (mean @ kernel.swapaxes(1, 2)).swapaxes(0, 1)[..., _INNER]
+        two = inner.reshape(*inner.shape[:2], -1, 2).mean(axis=3)
+        return np.asarray(two / np.maximum(two.mean(axis=2, keepdims=True), 1e-30))
+
+    def angle(self) -> float:
+        """Mean |θ_i − θ_i'|, radians, with the correlation as weight: grows with the roughness."""
+        middle, width = 0.5 * (EDGES[1:] + EDGES[:-1]), np.diff(EDGES)
+        weight = self.correlation(np.ones((1, len(self.pairs))))[0] * width
+        return float((weight * middle).sum() / weight.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class LightPairs:
+    """`N` lights near the mirror directions of a view's pixels, and `M` pairs for the same pixel.
+
+    `sample (N,)`, `first` and `second (M,)` are flat indices into an `(L, P)` array; `bin_of_sample
+    (N,)` and `bin_of_pair (M,)` count through the bins of one part of the hair after the other;
+    `scale (L, P)` turns radiance into the fibre's answer, 1/sr.
+    """
+
+    sample: Ints
+    bin_of_sample: Ints
+    first: Ints
+    second: Ints
+    bin_of_pair: Ints
+    scale: Array
+
+    @classmethod
+    def of(
+        cls, observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, channel: int
+    ) -> LightPairs:
+        """Those of `observed`, whose pixels see `fibres`."""
+        found = near_mirror(observed, fibres, tilt_deg, WINDOW)
+        part, count = parts_of(observed), observed.valid.shape[1]
+        deviation = found.deviation.ravel()
+        pixel, light = np.nonzero(found.near.T)
+        sample = light * count + pixel
+        ends = np.searchsorted(pixel, np.arange(count + 1))
+        pairs = [np.stack(np.triu_indices(b - a, 1)) + a for a, b in pairwise(ends)]
+        i, j = sample[np.concatenate(pairs, axis=1)]
+        angle = np.abs(deviation[i] - deviation[j])
+        i, j, angle = (x[angle < EDGES[-1]] for x in (i, j, angle))
+        shines = [light.intensity_towards(found.middle)[:, channel] for light in observed.lights]
+        return cls(
+            sample,
+            part[pixel] * (len(_DEVIATIONS) - 1) + _bin(deviation[sample], _DEVIATIONS),
+            i,
+            j,
+            part[i % count] * (len(EDGES) - 1) + _bin(angle, EDGES),
+            found.squared / np.maximum(shines, 1e-12) / np.maximum(fibres.share, 1e-12),
+        )
+
+    def highlight(self, one: AnyFloats, other: AnyFloats) -> Highlight:
+        """What the radiances `one`, `other (L, P)` of the same pixels show.
+
+        They are the same twice, or two renderings: then mean products are free of their noise.
+        """
+        a, b = (np.asarray(self.scale * x, float).ravel() for x in (one, other))
+        i, j, k = self.first, self.second, self.sample
+        of_pairs, of_samples = len(EDGES) - 1, len(_DEVIATIONS) - 1
+        return Highlight(
+            _summed(self.bin_of_pair, 0.5 * (a[i] * b[j] + a[j] * b[i]), of_pairs),
+            _summed(self.bin_of_pair, np.ones(len(i)), of_pairs),
+            _summed(self.bin_of_sample, 0.5 * (a[k] + b[k]), of_samples),
+            _summed(self.bin_of_sample, np.ones(len(k)), of_samples),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Highlights:
+    """How highlights of `views` are read, in one colour `channel`."""
+
+    views: Sequence[tuple[Observed, VisibleFibres]]
+    tilt_deg: float
+    channel: int
+
+    def of(self, radiances: Sequence[Floats]) -> Highlight:
+        """The highlights in two renderings (or twice the capture) of each view `(2, L, P, 3)`."""
+        found = zip(self._pairs, radiances, strict=True)
+        return Highlight.joined([p.highlight(*both[..., self.channel]) for p, both in found])
+
+    @cached_property
+    def _pairs(self) -> list[LightPairs]:
+        return [
+            LightPairs.of(o, f, tilt_deg=self.tilt_deg, channel=self.channel) for o, f in self.views
+        ]
+
+
+@dataclass(frozen=True)
+class Roughness:
+    """A roughness with what is known of its error.
+
+    `error` is the standard error of log β_M: the larger of those over parts of the hair (`parts`)
+    and between views, and `systematic`. `low`, `high` are the ends of an interval of about 95 %,
+    inside `range`, that of the renderings. `views` are the answers of single views that have pairs
+    enough. `misfit` is the χ² of the best match per degree of freedom. `tangents_deg` is how far
+    inclinations are off, root mean square, more than in the renderings.
+    """
+
+    beta_m: float
+    error: float
+    low: float
+    high: float
+    range: tuple[float, float]
+    parts: float
+    views: tuple[float, ...]
+    misfit: float
+    tangents_deg: float
+    systematic: float = 0.0
+
+    def after(self, other: Roughness) -> Roughness:
+        """This one, of disordered strands, with `other`, of the strands as they are.
+
+        Half of what lies between the two answers joins the error: how the strands are wrong is not
+        known better. The tangents' error is that of `other`.
+        """
+        systematic = 0.5 * abs(float(np.log(self.beta_m / other.beta_m)))
+        wider = np.exp(np.hypot(self.error, systematic) * 2 - self.error * 2)
+        return replace(
+            self,
+            error=float(np.hypot(self.error, systematic)),
+            low=float(max(self.low / wider, self.range[0])),
+            high=float(min(self.high * wider, self.range[1])),
+            tangents_deg=other.tangents_deg,
+            systematic=systematic,
+        )
+
+    def warnings(self) -> list[str]:
+        """What a user has to know before believing it, a sentence each."""
+        said, either = [], f"{self.low:.2g} to {self.high:.2g}"
+        least, most = self.range
+        if self.low <= least * 1.001 or self.high >= most / 1.001:
+            said.append(
+                f"β_M {self.beta_m:.2g} is known to lie in {either} only, which reaches an end of "
+                f"the range that was rendered, {least:g} to {most:g}"
+            )
+        elif self.high > WIDEST * self.low:
+            said.append(f"β_M {self.beta_m:.2g} is uncertain: the highlight fits {either}")
+        if np.sqrt(self.error**2 - self.systematic**2) > max(2 * self.parts, LARGEST_ERROR):
+            views = ", ".join(f"{beta:.2g}" for beta in self.views)
+            said.append(f"views disagree about β_M by more than their noise: {views}")
+        if self.misfit > WORST_MISFIT:
+            said.append(
+                f"no roughness fits the highlight (χ² {self.misfit:.1f} per degree of freedom): "
+                "are the strands where the hair is?"
+            )
+        return said
+
+
+def disordered(strands: Strands, angle: float, seed: int) -> Strands:
+    """`strands` that each wave on their own, so that tangents turn by `angle` (radians RMS)."""
+    rng, strand = np.random.default_rng(seed), strands.strand_of_point
+    points, tangents = strands.points.astype(float), strands.tangents().astype(float)
+    step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
+    arc = np.cumsum(step)
+    turns = 2 * np.pi * (arc - arc[strands.offsets[:-1]][strand]) / _WAVE
+    across = np.cross(tangents, rng.normal(size=3))
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    for direction in (across, np.cross(tangents, across)):
+        phase = rng.uniform(0, 2 * np.pi, len(strands))[strand]
+        wave = np.sin(turns + phase) - np.sin(phase)
+        points += angle * _WAVE / (2 * np.pi) * wave[:, None] * direction
+    return replace(strands, points=points.astype(np.float32))
+
+
+def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlight]]) -> Roughness:
+    """The β_M whose rendered highlights are nearest the `captured` one.
+
+    Between the `rendered` roughnesses, which ascend, each bin is interpolated monotonically in log
+    β_M. Bins weigh by their scatter over parts of the hair; the error of the answer is the
+    jackknife's over the same parts, or what the views' answers differ by where that is more. Raises
+    `ValueError` where there are too few pairs of lights.
+    """
+    if (pairs := int(captured.pairs.sum())) < FEWEST_PAIRS:
+        raise ValueError(
+            f"only {pairs} pairs of lights lie near the mirror directions of hair pixels, fewer "
+            f"than {FEWEST_PAIRS}: the roughness needs more lights, or more hair pixels"
+        )
+    nodes = np.log([beta for beta, _ in rendered])
+    x = np.linspace(nodes[0], nodes[-1], _STEPS)
+    parts = len(captured.pairs)
+    left_out = (1 - np.eye(parts))[captured.pairs.sum(axis=1) > 0]
+    views = np.kron(np.eye(parts // SIDE**2), np.ones(SIDE**2))
+    views = views[views @ captured.pairs.sum(axis=1) >= FEWEST_PAIRS]
+    chosen = np.concatenate([np.ones((1, parts)), left_out, views])
+    jackknife = slice(1, len(left_out) + 1)
+
+    def distance(target: Array, family: Array) -> Array:
+        """χ² `(_STEPS, M, ...)` between `target (M, B)` and renderings `(nodes, M, ..., B)`."""
+        target = target.reshape(len(target), *[1] * (family.ndim - 3), -1)
+        plain = family.reshape(*family.shape[:2], -1, target.shape[-1])[:, :, 0]
+        nearest = np.argmin(((plain[:, 0] - target.reshape(len(target), -1)[0]) ** 2).sum(axis=1))
+        off = (target.reshape(plain.shape[1:]) - plain[nearest])[jackknife]
+        variance = (len(left_out) - 1) * off.var(axis=0) + _FLOOR**2
+        curves = PchipInterpolator(nodes, family, axis=0)(x)
+        return np.asarray(((curves - target) ** 2 / variance).sum(axis=-1))
+
+    by_correlation = distance(
+        captured.correlation(chosen), np.stack([h.correlation(chosen) for _, h in rendered])
+    )
+    by_profile = distance(
+        captured.profiles(chosen)[:, 0], np.stack([h.profiles(chosen) for _, h in rendered])
+    )
+    chi2 = by_correlation + by_profile.min(axis=2)
+    best = np.array([_lowest(x, c) for c in chi2.T])
+    answer, alone = best[0], best[len(left_out) + 1 :]
+    scatter = float(np.sqrt((len(left_out) - 1) * best[jackknife].var()))
+    between = float(alone.std(ddof=1) / np.sqrt(len(alone))) if len(alone) > 1 else 0.0
+    least = chi2[:, 0].min()
+    bins = captured.pairs.shape[1] + (_INNER.stop - _INNER.start) // 2
+    misfit = float(least / (bins - 4))
+    error = float(np.hypot(max(scatter, between) * max(misfit, 1.0) ** 0.5, _BETWEEN_RENDERINGS))
+    inside = x[chi2[:, 0] <= least + 4 * max(misfit, 1.0)]
+    low, high = min(answer - 2 * error, inside[0]), max(answer + 2 * error, inside[-1])
+    shift = _SHIFTS[by_profile[chi2[:, 0].argmin(), 0].argmin()]
+    return Roughness(
+        float(np.exp(answer)),
+        error,
+        float(np.exp(max(low, x[0]))),
+        float(np.exp(min(high, x[-1]))),
+        (rendered[0][0], rendered[-1][0]),
+        scatter * max(misfit, 1.0) ** 0.5,
+        tuple(np.exp(alone).tolist()),
+        misfit,
+        float(np.degrees(shift) / 2),
+    )
+
+
+def _relative(total: Array, count: Array) -> Array:
+    mean = total / np.maximum(count, 1)
+    return np.asarray(mean / np.maximum(mean.mean(axis=1, keepdims=True), 1e-30))
+
+
+def _bin(values: Array, edges: Array) -> Ints:
+    return np.clip(np.digitize(values, edges) - 1, 0, len(edges) - 2)
+
+
+def _summed(bin_of: Ints, values: Array, bins: int) -> Array:
+    return np.asarray(np.bincount(bin_of, values, SIDE**2 * bins).reshape(SIDE**2, bins), float)
+
+
+def _lowest(x: Array, y: Array) -> float:
+    """Where the sampled `y (N,)` is least over `x (N,)`, refined by a parabola."""
+    k = int(y.argmin())
+    if not 0 < k < len(x) - 1:
+        return float(x[k])
+    a, b, c = y[k - 1 : k + 2]
+    bend = a - 2 * b + c
+    return float(x[k] + (x[1] - x[0]) * (0.5 * (a - c) / bend if bend > 0 else 0.0))
+
+
+def parts_of(observed: Observed) -> Ints:
+    """Part of the view's hair `(P,)` that each pixel lies in: thirds by column, thirds of those."""
+    row, column = np.divmod(observed.pixels, observed.camera.width)
+    out = np.zeros(len(row), np.int64)
+    for i, third in enumerate(np.array_split(np.argsort(column, kind="stable"), SIDE)):
+        for j, part in enumerate(
+            np.array_split(third[np.argsort(row[third], kind="stable")], SIDE)
+        ):
+            out[part] = SIDE * i + j
+    return out
