@@ -86,14 +86,17 @@ class HairParameters:
 
     def frame(self, place: StrandHit) -> ShadingFrame:
         """The fibre's frame at a hit: its own direction, and the corrective of its cell."""
-        tangent = place.tangent if self._many_segments() else None
-        straight = ShadingFrame(tangent, None)
+        straight = self.straight(place)
         if not self._turns and not dr.grad_enabled(self.values.get("rotation")):
             return straight
         turn = self._look_up("rotation", mi.Vector2f, place)
         normal = straight.enter(place.si.to_local(place.normal))
         axis = mi.Vector3f(*axis_in_frame(turn.x, turn.y, normal.x, normal.z))
-        return ShadingFrame(tangent, axis)
+        return ShadingFrame(straight.tangent, axis)
+
+    def straight(self, place: StrandHit) -> ShadingFrame:
+        """The fibre's frame at a hit without its corrective."""
+        return ShadingFrame(place.tangent if self._many_segments() else None, None)
 
     def _many_segments(self) -> bool:
         """Whether the curves have more segments than Mitsuba finds a frame for."""

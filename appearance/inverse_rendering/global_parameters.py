@@ -1,24 +1,26 @@
 """Roughness, index, mean colour and light intensities: few numbers, found from pictures alone.
 
-Gauss-Newton, its derivatives on the left and on the right estimated apart: the square of a path
-tracer's derivative is mostly noise. On the left stand instruments Z, the hardly noisy derivative
-of the light of the first hit; with weights W and the difference r of rendered and captured, Zᵀ W r
-is zero on average at the truth, whatever Z is. On the right stand quotients of whole pictures over
-wide steps: their noise, independent of Z's and r's, changes only the length of a step.
+Gauss-Newton on kept paths, its derivatives on the left and on the right estimated apart: the square
+of a path tracer's derivative is mostly noise. On the left stand instruments Z, the hardly noisy
+derivative of the light of the first hit; with weights W and the difference r of rendered and
+captured, Zᵀ W r is zero on average at the truth, whatever Z is. On the right stand the exact
+derivatives of whole pictures. Z is of one half of the paths, r and the right side of the other, and
+the other way round: their noise is independent, and changes only the length of a step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from appearance.inverse_rendering import losses
-from appearance.inverse_rendering.batches import Batch, Comparison
+from appearance.inverse_rendering.batches import Batch
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.inverse_rendering.unknowns import Raw
+from appearance.inverse_rendering.unknowns import Raw, slopes
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
 
@@ -28,14 +30,10 @@ Number = tuple[str, int]
 PRIOR = 0.03
 """Standard deviation of a light's calibrated intensity, relative."""
 WIDE = {"sigma_a": 0.4, "beta_m": 0.4, "beta_n": 0.6, "eta": 0.6, "gain": PRIOR}
-"""Half the width of a quotient, and how far one estimate may step, in `Raw`'s units."""
+"""The unit of steps, in those of `Raw`."""
 _FARTHEST = 1.5
-_LINEARISATIONS, _ESTIMATES = 10, 4
-"""Derivatives are taken anew when a number has moved by its width; residuals with the same ones."""
-_FIRST_HITS = 1000
-"""Number of the random numbers of instruments; derivatives' are less, those of estimates follow."""
-_FEWEST = 8
-"""Paths a pixel of a picture that derivatives are made of."""
+_TURNS, _ESTIMATES = 12, 4
+"""Most draws of paths; the result is the mean of as many estimates as come near together."""
 _BEGINS = (-1.8, 0.4)
 """Roughness begins between 0.15 and 0.6: a much narrower lobe is met by too few paths."""
 _ALIKE = 3 * 32
@@ -65,9 +63,8 @@ def solve_global_parameters(
     their mean kept at 1. What no pixel of the pairs depends on stays where it is: every estimate
     has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Found are beta_m of
     0.05 to 0.7 and beta_n of 0.2 to 0.7, wherever they begin; a narrower beta_n ends at up to 0.3.
-    Takes the time of about ten pictures of `effort.spp` paths a pixel near the answer, five more
-    for each time that a number moves by its width. Where a picture is not finite, it gives back
-    what it got.
+    Takes the time of five to twelve pictures of twice `effort.spp` paths a pixel. Where a picture
+    is not finite, it gives back what it got.
     """
     lights = np.unique(np.concatenate([b.lights for b in evidence.pairs]))
     numbers = [
@@ -80,20 +77,18 @@ def solve_global_parameters(
     for name in {"beta_m", "beta_n"} & set(names):
         raw = raw | {name: np.clip(raw[name], *_BEGINS)}
     estimates: list[tuple[Raw, Array]] = []
-    for turn in range(_LINEARISATIONS):
-        progress("derivatives of the global parameters", turn / _LINEARISATIONS)
-        system = _System(problem, numbers, evidence, turn)
-        system.differentiate(raw, gain)
-        away, estimates = np.zeros(len(numbers)), []
-        while len(estimates) < _ESTIMATES and np.abs(away[system.bends]).max() < 1:
-            step = system.step(raw, gain, len(estimates))
-            if not np.isfinite(step).all():
-                return given
-            away += step
-            for number, d in zip(numbers, step * system.wide, strict=True):
-                raw, gain = _moved(raw, gain, number, d)
-            gain = gain / np.exp(np.log(gain).mean())
-            estimates.append((raw, gain))
+    system = _System(problem, numbers, evidence)
+    for turn in range(_TURNS):
+        progress("global parameters", turn / _TURNS)
+        step = system.step(raw, gain, turn)
+        if not np.isfinite(step).all():
+            return given
+        for number, d in zip(numbers, step * system.wide, strict=True):
+            raw, gain = _moved(raw, gain, number, d)
+        gain = gain / np.exp(np.log(gain).mean())
+        if np.abs(step[system.bends]).max(initial=0) >= 1:
+            estimates = []
+        estimates.append((raw, gain))
         if len(estimates) == _ESTIMATES:
             break
     # each is of independent noise, once the first has come near
@@ -115,77 +110,34 @@ def _moved(raw: Raw, gain: Array, number: Number, d: float) -> tuple[Raw, Array]
     return raw | {name: value}, gain
 
 
-@dataclass
 class _System:
-    """The normal equations of some pixels, about which everything is flat over patches `(N,)`."""
+    """The normal equations of some pixels, about which everything is flat `(N,)` over patches."""
 
-    problem: FitProblem
-    numbers: Sequence[Number]
-    evidence: Evidence
-    turn: int
-
-    def __post_init__(self) -> None:
-        rng = np.random.default_rng((self.evidence.seed, self.turn))
+    def __init__(self, problem: FitProblem, numbers: Sequence[Number], evidence: Evidence) -> None:
+        self.problem, self.numbers, self.effort = problem, numbers, evidence.effort
+        rng = np.random.default_rng(evidence.seed)
         self.seed = int(rng.integers(1 << 30))
-        self.effort = self.evidence.effort
-        self.patches = [self.problem.patch(b, self.effort.pixels, rng) for b in self.evidence.pairs]
-        self.wide = np.array([WIDE[name] for name, _ in self.numbers])
-        self.bends = np.array([name != "gain" for name, _ in self.numbers])
+        self.patches = [problem.patch(b, self.effort.pixels, rng) for b in evidence.pairs]
+        self.wide = np.array([WIDE[name] for name, _ in numbers])
+        self.bends = np.array([name != "gain" for name, _ in numbers])
+        self.noise: list[Array] = [np.zeros(0)] * len(self.patches)
 
-    def differentiate(self, raw: Raw, gain: Array) -> None:
-        """Instruments, derivatives, noise and weights about `raw` and `gain`."""
-        drawn = [n for n in self.numbers if n[0] != "gain"]
-        few = max(_FEWEST, self.effort.spp // 8)
-        quotients: dict[Number, Array] = {}
-        means, squares = [], []
-        for k, number in enumerate(drawn):
-            more, less = (
-                [
-                    self._picture(*_moved(raw, gain, number, side * WIDE[number[0]]), few, drawing)
-                    for drawing in (8 * k + 1 - side, 8 * k + 2 - side)
-                ]
-                for side in (1, -1)
-            )
-            quotients[number] = (more[0] + more[1] - less[0] - less[1]) / 4
-            means.append((more[0] + more[1] + less[0] + less[1]) / 4)
-            squares.append((more[0] - more[1]) ** 2 + (less[0] - less[1]) ** 2)
-        mean, noise = np.mean(means, axis=0), np.mean(squares, axis=0)
-        seen = self._compared(mean)
-        level = np.concatenate([s.level.ravel() for s in seen])
-        light = np.concatenate([np.repeat(p.lights, 3 * len(p.few)) for p in self.patches])
-        channel = np.arange(len(level)) % 3
-        self.left, self.right = [], []
-        for number in self.numbers:
-            name, i = number
-            if name == "gain":
-                self.left.append(np.where(light == i, level, 0))
-                self.right.append(np.where(light == i, mean, 0) * WIDE[name])
-                continue
-            self.right.append(quotients[number])
-            if name == "sigma_a":
-                self.left.append(np.where(channel == i, level, 0))
-            else:
-                self.left.append(self._first_hit(raw, gain, number))
-        weights = [np.where(s.valid[..., None], losses.weights(s.level), 0) for s in seen]
-        parts = zip(weights, self._split(noise), strict=True)
-        self.weight = np.concatenate([losses.noise_weighted(w, n).ravel() for w, n in parts])
-
-    def step(self, raw: Raw, gain: Array, estimate: int) -> Array:
-        """How far to move each number, by its width: the first estimate is from half the paths."""
-        spp = self.effort.spp * (2 if estimate else 1)
-        picture = self._picture(raw, gain, spp, _FIRST_HITS + 1 + estimate)
-        residual = picture - np.concatenate([s.captured.ravel() for s in self._compared(picture)])
-        left = np.array(self.left) * self.weight
-        moment, matrix = left @ residual, left @ np.array(self.right).T
+    def step(self, raw: Raw, gain: Array, turn: int) -> Array:
+        """How far to move each number, by its width."""
+        parts = [self._patch(raw, gain, k, turn) for k in range(len(self.patches))]
+        left, right, residual = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
+        moment, matrix = left @ residual, left @ right.T
         # the prior: of each estimate about where it begins, of gains about the calibration
         about = np.array([np.log(gain[i]) / PRIOR if n == "gain" else 0 for n, i in self.numbers])
         step = np.zeros(len(about))
         for _ in range(2):
             # what the moment is off by: noise, and what no step explains, alike over some pixels
             # (of the steps, only intensities': other derivatives would add their own noise)
-            left_over = residual + (step * ~self.bends) @ np.array(self.right)
-            parts = np.add.reduceat(left * left_over, np.arange(0, len(residual), _ALIKE), axis=1)
-            spread = parts @ parts.T
+            left_over = residual + (step * ~self.bends) @ right
+            parts_of = np.add.reduceat(
+                left * left_over, np.arange(0, len(residual), _ALIKE), axis=1
+            )
+            spread = parts_of @ parts_of.T
             size = np.sqrt(np.diag(spread))
             if size.max() == 0:
                 return step
@@ -198,30 +150,43 @@ class _System:
             step = np.clip(step, -_FARTHEST, _FARTHEST)
         return step
 
-    def _first_hit(self, raw: Raw, gain: Array, number: Number) -> Array:
-        """Half the difference that a number's width makes to what a camera ray meets first."""
-        once = replace(self.effort, max_depth=1)
-        spp = max(_FEWEST, self.effort.spp // 2)
-        more, less = (
-            self._picture(*_moved(raw, gain, number, d), spp, _FIRST_HITS, once)
-            for d in (WIDE[number[0]], -WIDE[number[0]])
-        )
-        return np.asarray((more - less) / 2)
+    def _patch(self, raw: Raw, gain: Array, k: int, turn: int) -> tuple[Array, Array, Array]:
+        """Weighted instruments and derivatives `(numbers, N)` of a patch, and residuals `(N,)`."""
+        patch = self.patches[k]
+        seed = self.seed + turn * len(self.patches) + k
+        # the first step need not be exact
+        effort = replace(self.effort, spp=self.effort.spp * (2 if turn else 1))
+        pictures = self.problem.linearised(raw, gain, patch, effort, seed)
+        halves = pictures.picture()
+        seen = self.problem.compare(patch, halves.mean(axis=0))
+        weight = np.where(seen.valid[..., None], losses.weights(seen.level), 0)
+        if self.noise[k].size:
+            # of other paths: weights that know this picture's noise would choose among it
+            weight = losses.noise_weighted(weight, self.noise[k])
+        self.noise[k] = (halves[0] - halves[1]) ** 2
+        left, right = [], []
+        for name, i in self.numbers:
+            if name == "gain":
+                of_light = (patch.lights == i)[:, None, None]
+                left.append(np.broadcast_to(of_light * seen.level, halves.shape))
+                right.append(of_light * halves * WIDE[name])
+                continue
+            moved = _changes(raw, (name, i))
+            right.append(pictures.change(moved))
+            if name == "sigma_a":
+                channel = np.arange(3) == i
+                left.append(np.broadcast_to(channel * seen.level, halves.shape))
+            else:
+                left.append(pictures.change(moved, first_hit=True))
+        crossed = np.array(right)[:, ::-1].reshape(len(right), -1)
+        residual = (halves - seen.captured)[::-1].ravel()
+        return (np.array(left) * weight).reshape(len(left), -1), crossed, residual
 
-    def _picture(
-        self, raw: Raw, gain: Array, spp: int, number: int, effort: Effort | None = None
-    ) -> Array:
-        effort = replace(effort or self.effort, spp=spp)
-        first = self.seed + number * len(self.patches)
-        render, patches = self.problem.render, enumerate(self.patches)
-        return np.concatenate([render(raw, gain, p, effort, first + k).ravel() for k, p in patches])
 
-    def _compared(self, picture: Array) -> list[Comparison]:
-        parts = zip(self.patches, self._split(picture), strict=True)
-        return [self.problem.compare(patch, part) for patch, part in parts]
-
-    def _split(self, values: Array) -> list[Array]:
-        """Flat values as `(k, P, 3)` of each patch."""
-        shapes = [(len(p.lights), len(p.few), 3) for p in self.patches]
-        ends = np.cumsum([np.prod(s) for s in shapes])
-        return [v.reshape(s) for v, s in zip(np.split(values, ends[:-1]), shapes, strict=True)]
+def _changes(raw: Raw, number: Number) -> dict[str, Any]:
+    """By how much a number's width changes the renderer's value, to first order."""
+    name, i = number
+    slope = slopes(raw)[name]
+    if name != "sigma_a":
+        return {name: float(slope[i]) * WIDE[name]}
+    return {name: slope * (np.arange(3) == i) * WIDE[name]}

@@ -16,7 +16,6 @@ from scipy.ndimage import gaussian_filter
 
 from appearance.bsdf.maps import HairMaps
 from appearance.bsdf.parameters import StrandHit
-from appearance.inverse_rendering.batches import Patch
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import BRACKET, Raw, decode, encode_absorption
@@ -27,6 +26,8 @@ from reconstruction.arrays import Array, Ints
 
 Shape = tuple[int, int, int]
 _RAYS = 8
+_PATHS = 100_000
+"""Of a round, over all views: the more pixels show a cell, the fewer paths each of them needs."""
 _WIDE = 0.02
 """Share of what a cell's far neighbours say: all that a cell has which no ray meets."""
 
@@ -36,10 +37,13 @@ def absorption_of_cells(
 ) -> HairMaps:
     """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
 
-    The light is the mean of the valid single lights of each pixel. A cell's mean needs fewer paths
-    a pixel than a step does: a quarter of `effort`'s.
+    The light is the mean of the valid single lights of each pixel. A round costs what 100,000 paths
+    do, however many pixels and lights there are: at most a quarter of `effort`'s paths a pixel,
+    at least one.
     """
-    effort = replace(effort, spp=max(1, effort.spp // 4))
+    pixels = sum(len(o.pixels) for o in problem.views)
+    spp = int(np.clip(_PATHS // max(pixels, 1), 1, max(1, effort.spp // 4)))
+    effort = replace(effort, spp=spp)
     maps = decode(raw)
     cells = [visible_cells(problem, o, maps.shape, seed) for o in problem.views]
     captured = [_mean(o, o.radiance.astype(float) * problem.scale) for o in problem.views]
@@ -49,9 +53,8 @@ def absorption_of_cells(
         trial = replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
         now = raw | {"sigma_a": encode_absorption(trial.sigma_a)}
         for i, o in enumerate(problem.views):
-            lights = np.arange(len(o.lights))
-            every = Patch(i, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
-            rendered = problem.render(now, gain, every, effort, (seed << 16) + 997 * k + i)
+            picture_seed = (seed << 16) + 997 * k + i
+            rendered = problem.render_all(now, gain, i, effort, picture_seed)
             for total, values in zip(sums, (captured[i], _mean(o, rendered)), strict=True):
                 _add(total, cells[i], values)
         ratio = _smoothed(sums[0]) / np.maximum(_smoothed(sums[1]), 1e-12)

@@ -12,7 +12,7 @@ from appearance.inverse_rendering.found_lights import lights_as_found, save_ligh
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import Monitor, Outcome, run
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
-from appearance.inverse_rendering.problem import FitProblem
+from appearance.inverse_rendering.problem import FitProblem, memory_needed
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
 from appearance.observations import HeldOut, observe_hair
@@ -20,9 +20,9 @@ from appearance.render.bounces import bounce_limit
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import Capture, Mesh, Model, Progress, Stage, Strands, silent
+from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, Strands, silent
 from reconstruction.arrays import Array
-from reconstruction.report.report import Series
+from reconstruction.report.report import Series, free_memory
 
 JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
@@ -52,6 +52,7 @@ def fit_maps(
     fitted, strands, head = FittedAppearance.load(model), model.strands(), model.head(capture)
     report = model.report()
     with report.stage("inverse_rendering") as stage:
+        _check_memory(training, model, request, stage, progress)
         progress("reading hair pixels", 0.0)
         rng = np.random.default_rng(seed)
         views = observe_hair(training, model, training.olat_lights(), request.hair_pixels, rng)
@@ -96,6 +97,27 @@ def fit_maps(
         model.checkpoint(variant).unlink(missing_ok=True)
     progress("inverse rendering done", 1.0)
     return result
+
+
+def _check_memory(
+    training: Capture,
+    model: Model,
+    request: InverseRenderingRequest,
+    stage: Stage,
+    progress: Progress,
+) -> None:
+    """Say what the fit will take, and refuse where that is more than there is."""
+    hair = [int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras]
+    pixels, lights = [min(n, request.hair_pixels) for n in hair], len(training.olat_lights())
+    needed, free = memory_needed(pixels, lights, request.fit.effort), free_memory()
+    stage.figures["memory_needed_gb"] = needed
+    progress(f"will take about {needed:.1f} GB of memory beside the scene", 0.0)
+    if free is not None and needed > free:
+        raise ModelError(
+            f"{model}: inverse rendering of {sum(pixels)} pixels under {lights} lights takes about "
+            f"{needed:.1f} GB of memory, and {free:.1f} GB are free: lower hair_pixels, now "
+            f"{request.hair_pixels}, or hold out more lights"
+        )
 
 
 def root_uv(model: Model, strands: Strands, head: Mesh | None) -> Array:

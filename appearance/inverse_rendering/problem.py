@@ -14,18 +14,26 @@ import numpy as np
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering import losses
 from appearance.inverse_rendering.batches import Batch, Comparison, Pairs, Patch
+from appearance.inverse_rendering.linearised import LinearisedPictures
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode, encode, hair_values
 from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
+from appearance.render.kept_paths import KeptSampling, WeightedPixels, keep_paths
 from appearance.render.olat import render_olat
-from appearance.scene.hair_scene import HairScene
+from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Ints
 
 ValidationSet = Sequence[tuple[Patch, Array]]
 """Patches, and the share `(k, P, 3)` of its weight that each value keeps."""
+
+
+_FRAME_BYTES, _PICTURE_BYTES, _PATH_BYTES = 25, 96, 3000
+"""Of a captured pixel under a light, of a rendered one, and of a kept path, about."""
+_FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
+"""Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,14 @@ class Objective:
     free: Sequence[str]
     error: float = 1.0
     smooth: bool = False
+
+
+def memory_needed(pixels: Sequence[int], lights: int, effort: Effort) -> float:
+    """GB that a fit takes beside its scene, about: views of so many `pixels` under `lights`."""
+    frames = sum(pixels) * lights * _FRAME_BYTES
+    picture = max(pixels, default=0) * lights * _PICTURE_BYTES
+    paths = min(max(pixels, default=0), effort.pixels) * 2 * effort.spp * _PATH_BYTES
+    return (frames + max(picture, paths)) / 1e9
 
 
 class FitProblem:
@@ -154,6 +170,32 @@ class FitProblem:
         spent: dict[str, int] = {"spp": effort.spp, "max_depth": effort.max_depth, "thrift": 0}
         radiance = render_olat(scene, camera, lights, seed=seed, pixels=pixels, **spent)
         return radiance.astype(float) * self.scale
+
+    def render_all(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:
+        """All pixels of a view under all lights `(L, P, 3)`, for means over lights: those of single
+        lights are noisy, as a path asks few of them."""
+        o = self.views[view]
+        lights = np.arange(len(o.lights))
+        whole = Patch(view, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
+        spent = {"first_lights": _FIRST_LIGHTS, "deep_lights": _DEEP_LIGHTS}
+        scene, camera, packed, pixels = self._seen(raw, gain, whole)
+        spent |= {"spp": effort.spp, "max_depth": effort.max_depth}
+        radiance = render_olat(scene, camera, packed, seed=seed, pixels=pixels, **spent)
+        return radiance.astype(float) * self.scale
+
+    def linearised(
+        self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int
+    ) -> LinearisedPictures:
+        """A patch under `gain (L,)` on paths of its own, and its derivatives, in exposure units."""
+        scene, camera, lights, pixels = self._seen(raw, gain, patch)
+        level = self._level[patch.view][patch.lights][:, patch.few].astype(float)
+        # what a light is worth is what it changes in a displayed picture
+        importance = self.scale * np.sqrt(losses.weights(level)).mean(axis=-1)
+        wanted = WeightedPixels(pixels, importance)
+        sampling = KeptSampling(max(2, effort.spp), effort.max_depth)
+        paths = keep_paths(scene, camera, lights, wanted, sampling, seed)
+        intensities = light_arrays(lights)[1] * self.scale
+        return LinearisedPictures(paths, self.mapped, decode(raw), intensities)
 
     def deviations(self, raw: Raw, gain: Array) -> LightDeviations:
         """How `raw` and `gain (L,)` have the lights."""

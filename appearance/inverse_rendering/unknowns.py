@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from appearance.bsdf.maps import HairMaps
 from reconstruction import Light
@@ -115,6 +116,16 @@ def decode(raw: Raw) -> HairMaps:
         tilt_deg=float(MOST_TILT * np.tanh(raw["tilt_deg"][0] / MOST_TILT)),
         **scalars,
     )
+
+
+def slopes(raw: Raw) -> Raw:
+    """Derivatives of the maps' absorption, roughnesses and index by their numbers."""
+    x = raw["sigma_a"]
+    out = {"sigma_a": -2 / BRACKET**2 * np.logaddexp(0, -x) * expit(-x)}
+    for name, (low, high) in RANGES.items():
+        share = expit(raw[name])
+        out[name] = (high - low) * share * (1 - share)
+    return out
 
 
 def encode_absorption(sigma_a: Array) -> Array:

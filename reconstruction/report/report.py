@@ -49,6 +49,15 @@ def peak_memory() -> Iterator[Peak]:
         _open.remove(peak)
 
 
+def free_memory() -> float | None:
+    """GB that processes may still take; None where it is not known."""
+    with suppress(OSError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable"):
+                return int(line.split()[1]) * 1024 / 1e9
+    return None
+
+
 def _note() -> None:
     with suppress(OSError):
         for line in _STATUS.read_text().splitlines() if _open else ():

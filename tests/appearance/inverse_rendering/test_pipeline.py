@@ -15,7 +15,16 @@ from appearance.inverse_rendering import pipeline
 from appearance.inverse_rendering.loop import Outcome
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import BadOptions, Capture, CaptureWriter, Model, Rig, Step, parse_options
+from reconstruction import (
+    BadOptions,
+    Capture,
+    CaptureWriter,
+    Model,
+    ModelError,
+    Rig,
+    Step,
+    parse_options,
+)
 
 REQUEST = parse_options(
     InverseRenderingRequest,
@@ -125,6 +134,22 @@ def test_held_out_cameras_are_judged_under_the_lights_as_found(made, tufted, tmp
     ]
     assert judged["inverse_rendering"]["relative_error"] == pytest.approx(1, abs=0.2)
     assert judged["start"]["relative_error"] < 0.8
+
+
+def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    effort = replace(REQUEST.fit.effort, pixels=10**6, spp=10**9)
+    request = replace(REQUEST, fit=replace(REQUEST.fit, effort=effort))
+    told = []
+    monkeypatch.setattr(pipeline, "free_memory", lambda: 20.0)
+    with pytest.raises(
+        ModelError, match=r"takes about \d+\.\d GB of memory, and 20\.0 GB are free"
+    ):
+        fit_maps(capture, other, request=request, progress=lambda what, share: told.append(what))
+    assert len(told) == 1
+    assert "GB of memory" in told[0]
 
 
 def test_unknown_fields_of_the_fit_are_refused_by_name():

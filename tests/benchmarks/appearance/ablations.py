@@ -38,6 +38,12 @@ OPTIONS = InverseRenderingOptions(
     effort=Effort(pixels=400, spp=512, gradient_spp=64, max_depth=8),
 )
 STAGE = SmallStage(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
+AT_SIZE = {
+    128: SmallStage(128, cameras=10, lights=48, spp=96, judged_spp=48, truth=(12, 96, 96)),
+    256: SmallStage(256, cameras=18, lights=128, spp=96, judged_spp=48, truth=(12, 96, 96)),
+}
+"""By pixels a side: 8 training views and 24 lights, 16 and 64; the truth is finer than the fit."""
+AT_SIZE_OPTIONS = replace(OPTIONS, effort=Effort(pixels=600, spp=64, gradient_spp=16))
 STARTS = (
     (0.4, 0.2, 1.45, (0.75, 1.25, 1.3)),
     (0.9, 0.9, 1.55, (1.0, 1.0, 1.0)),
@@ -88,6 +94,34 @@ def run_bench(
             _write(out, result)
             result["time"] = error_against_time(captured, options, progress, seed)
         _write(out, result)
+    return result
+
+
+def run_at_size(
+    out: Path,
+    subject: Subject,
+    size: int,
+    *,
+    seeds: int = 1,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The table of (b) and (c) at `size` of `AT_SIZE`, for `seeds`; `appearance_SIZE.json`."""
+    rig, options = AT_SIZE[size], AT_SIZE_OPTIONS
+    result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
+    captured: Captured | None = None
+    for name in ("b", "c"):
+        captured = known_subject(name, subject, rig, seed, captured)
+        found = []
+        for k in range(seeds):
+            table = Table(captured, options, progress=within(progress, f"({name})"), seed=seed + k)
+            variants = table.run()
+            found.append(_final(variants))
+            result["subjects"][f"{name}, seed {seed + k}"] = variants
+            save(out / f"appearance_{size}.json", result)
+        result[f"seeds of {name}"] = {n: spread([f[n] for f in found]) for n in found[0]}
+    save(out / f"appearance_{size}.json", result)
+    (out / f"appearance_{size}.md").write_text(report(result))
     return result
 
 
@@ -278,7 +312,8 @@ def report(result: dict[str, Any]) -> str:
         "β_M off",
         "β_N off",
         "most σ off",
-        "s",
+        "CPU s",
+        "GB",
     ]
     errors = ("beta_m_error", "beta_n_error", "sigma_a_error")
     lines = []
@@ -288,8 +323,9 @@ def report(result: dict[str, Any]) -> str:
             held, train = figures[GROUPS[1]], figures[GROUPS[0]]
             scores = [f"{held['psnr_clean']:.2f}", f"{held['psnr']:.2f}", f"{held['ssim']:.3f}"]
             off = [f"{100 * figures[k]:+.1f} %" if k in figures else "" for k in errors]
-            seconds = f"{figures.get('seconds', 0):.0f}"
-            cells.append([variant, *scores, f"{train['psnr_clean']:.2f}", *off, seconds])
+            seconds = f"{figures.get('cpu_seconds', figures.get('seconds', 0)):.0f}"
+            memory = f"{figures.get('memory_gb') or 0:.1f}"
+            cells.append([variant, *scores, f"{train['psnr_clean']:.2f}", *off, seconds, memory])
         lines += [f"## Subject ({name})", "", markdown(head, cells)]
     for name, found in result.get("seeds", {}).items():
         sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
@@ -330,6 +366,10 @@ SMALL = SmallStage(size=14, cameras=3, lights=6, spp=64, max_depth=4)
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     subject = simulated(args.rig, args.subject, args.head, args.seed)
+    if args.size in AT_SIZE and not args.quick:
+        return run_at_size(
+            args.out, subject, args.size, seeds=args.seeds, seed=args.seed, progress=progress
+        )
     effort: dict[str, Any] = {"options": QUICK, "rig": SMALL} if args.quick else {}
     seeds = min(args.seeds, 1) if args.quick else args.seeds
     result = run_bench(args.out, subject, seeds=seeds, seed=args.seed, progress=progress, **effort)
@@ -349,5 +389,10 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 BENCHMARK = Benchmark(
     _bench,
-    (*SUBJECT, CAPTURE, option("--seeds", "of the spread on subject (b)", type=int, default=3)),
+    (
+        *SUBJECT,
+        CAPTURE,
+        option("--size", "pixels a side: 36, or the ladder at 128 or 256", type=int, default=36),
+        option("--seeds", "of the spread on subject (b)", type=int, default=3),
+    ),
 )

@@ -31,7 +31,8 @@ _BEND = 0.1
 class SmallStage:
     """A small stage: cameras on a ring, lights on a dome; every other one is held out.
 
-    Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`.
+    Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`. `truth`
+    are the cells (n_c, w, h) of subject (b)'s dye.
     """
 
     size: int = 64
@@ -41,6 +42,7 @@ class SmallStage:
     spp: int = 384
     judged_spp: int = 384
     max_depth: int = 10
+    truth: tuple[int, int, int] = (6, 24, 24)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,7 @@ def known_subject(
     strands, head, hair = subject.strands, subject.head, subject.hair
     scene = subject.scene()
     mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, head))
-    truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed)
+    truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed, rig.truth)
     shown = mapped.with_maps(truth)
     cameras, lights = _ring(strands, rig), _dome(rig)
     views, halves = [], []

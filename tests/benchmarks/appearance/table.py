@@ -23,6 +23,7 @@ from benchmarks.appearance.known_subjects import Captured
 from benchmarks.command import within
 from reconstruction import Light, Progress, Stage, silent
 from reconstruction.arrays import Array, Floats, Ints
+from reconstruction.report.report import peak_memory
 
 GROUPS = ("train views", "held-out views")
 TRUTH = "truth, fresh numbers"
@@ -76,17 +77,22 @@ class Table:
         for variant in variants:
             begun = time.perf_counter()
             self.progress(variant, 0.0)
-            found = run(
-                problem,
-                maps,
-                lights,
-                options=replace(self.options, variant=variant),
-                seed=self.seed,
-                monitor=Monitor(within(self.progress, f"({variant})")),
-            )
+            worked = time.process_time()
+            with peak_memory() as peak:
+                found = run(
+                    problem,
+                    maps,
+                    lights,
+                    options=replace(self.options, variant=variant),
+                    seed=self.seed,
+                    monitor=Monitor(within(self.progress, f"({variant})")),
+                )
+            worked = time.process_time() - worked
             maps, lights = found.maps, found.lights
             self.score_maps(variant, maps, captured.mapped, time.perf_counter() - begun)
             self.variants[variant] |= {
+                "cpu_seconds": worked,
+                "memory_gb": peak.gb,
                 "ended": found.ended,
                 "steps": found.steps,
                 "gain_spread": float(found.lights.gain.std()),
