@@ -32,8 +32,10 @@ PRIOR = 0.03
 WIDE = {"sigma_a": 0.4, "beta_m": 0.4, "beta_n": 0.6, "eta": 0.6, "gain": PRIOR}
 """The unit of steps, in those of `Raw`."""
 _FARTHEST = 1.5
-_TURNS, _ESTIMATES = 12, 4
-"""Most draws of paths; the result is the mean of as many estimates as come near together."""
+_TURNS, _ESTIMATES = 16, 4
+"""Most draws of paths; the result is the mean of so many estimates within a width of each other."""
+_FEWEST = 32
+"""Paths a pixel of a draw."""
 _BEGINS = (-1.8, 0.4)
 """Roughness begins between 0.15 and 0.6: a much narrower lobe is met by too few paths."""
 _ALIKE = 3 * 32
@@ -63,7 +65,7 @@ def solve_global_parameters(
     their mean kept at 1. What no pixel of the pairs depends on stays where it is: every estimate
     has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Found are beta_m of
     0.05 to 0.7 and beta_n of 0.2 to 0.7, wherever they begin; a narrower beta_n ends at up to 0.3.
-    Takes the time of five to twelve pictures of twice `effort.spp` paths a pixel. Where a picture
+    Takes the time of five to sixteen pictures of twice `effort.spp` paths a pixel. Where a picture
     is not finite, it gives back what it got.
     """
     lights = np.unique(np.concatenate([b.lights for b in evidence.pairs]))
@@ -77,6 +79,7 @@ def solve_global_parameters(
     for name in {"beta_m", "beta_n"} & set(names):
         raw = raw | {name: np.clip(raw[name], *_BEGINS)}
     estimates: list[tuple[Raw, Array]] = []
+    away = np.zeros(len(numbers))
     system = _System(problem, numbers, evidence)
     for turn in range(_TURNS):
         progress("global parameters", turn / _TURNS)
@@ -86,8 +89,9 @@ def solve_global_parameters(
         for number, d in zip(numbers, step * system.wide, strict=True):
             raw, gain = _moved(raw, gain, number, d)
         gain = gain / np.exp(np.log(gain).mean())
-        if np.abs(step[system.bends]).max(initial=0) >= 1:
-            estimates = []
+        away += step
+        if np.abs(away[system.bends]).max(initial=0) >= 1:
+            away, estimates = np.zeros(len(numbers)), []
         estimates.append((raw, gain))
         if len(estimates) == _ESTIMATES:
             break
@@ -155,7 +159,8 @@ class _System:
         patch = self.patches[k]
         seed = self.seed + turn * len(self.patches) + k
         # the first step need not be exact
-        effort = replace(self.effort, spp=self.effort.spp * (2 if turn else 1))
+        spp = max(_FEWEST, self.effort.spp * (2 if turn else 1))
+        effort = replace(self.effort, spp=spp)
         pictures = self.problem.linearised(raw, gain, patch, effort, seed)
         halves = pictures.picture()
         seen = self.problem.compare(patch, halves.mean(axis=0))
