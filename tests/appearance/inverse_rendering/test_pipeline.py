@@ -29,7 +29,7 @@ from reconstruction import (
 REQUEST = parse_options(
     InverseRenderingRequest,
     {
-        "judged_spp": 4,
+        "judged_spp": 256,
         "max_depth": 5,
         "fit": {
             "variant": "correctives",
