@@ -68,7 +68,9 @@ def fit_maps(
         start = HairMaps.of(fitted.hair)
         fit = _Fit(problem, model, stage, progress, seed)
         one_colour = fit.run(replace(options, variant="original"), start, None, (0.05, 0.3))
-        outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
+        outcome = one_colour
+        if options.variant != "original":
+            outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
         outcome.maps.save(model, mapped.root_uv)
         save_lights(model, outcome.lights, problem.lights)
         progress("judging held-out images", 0.92)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from appearance.render.coverage import coverage
 from appearance.render.environment import direct_environment, render_environment
@@ -60,7 +60,8 @@ def environment_smoothed(
     """`render_environment` with its indirect light smoothed: `(H, W, 3)`.
 
     `envmap (h, w, 3)`. Smoothed over `SIGMA` pixels, of large pictures over 1/160 of their width.
-    Direct light takes 12 `spp` paths a pixel: they are short, and the strands show in it.
+    Direct light takes 12 `spp` paths a pixel: they are short, and the strands show in it. What only
+    one half of them saw is spread (`without_rare`).
     """
     spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
@@ -68,8 +69,21 @@ def environment_smoothed(
         render_environment(scene, camera, envmap, replace(sampling, max_depth=depth))
         for depth in (1, sampling.max_depth)
     )
-    direct = direct_environment(scene, camera, envmap, 12 * spp, seed + 1)
-    return direct + smoothed((whole - first)[None], share, max(SIGMA, camera.width / 160))[0]
+    one, other = (direct_environment(scene, camera, envmap, 6 * spp, 2 * seed + k) for k in (1, 2))
+    sigma = max(SIGMA, camera.width / 160)
+    indirect = smoothed((whole - first)[None], share, sigma)[0]
+    return without_rare(one, other, share, sigma) + indirect
+
+
+def without_rare(one: Floats, other: Floats, share: dict[str, Floats], sigma: float) -> Floats:
+    """The mean of two independent pictures `(H, W, 3)` of one thing, without rare bright paths.
+
+    What a pixel of one has above all nine neighbours of the other is a rare path's: a glint along a
+    strand is in both. It is spread over `sigma` pixels (see `smoothed`), so that the sum is kept.
+    """
+    highest_one, highest_other = (maximum_filter(x, (3, 3, 1)) for x in (one, other))
+    usual = 0.5 * (np.minimum(one, highest_other) + np.minimum(other, highest_one))
+    return usual + smoothed((0.5 * (one + other) - usual)[None], share, sigma)[0]
 
 
 def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:

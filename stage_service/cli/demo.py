@@ -32,6 +32,16 @@ MARK = ".hairstage-demo"
 EVERY_NTH_LIGHT = 28
 """One of so many lights is held out: a dozen of 331. Of few lights, four are."""
 
+INVERSE_RENDERING = {
+    "lights": 12,
+    "validation_lights": 4,
+    "hair_pixels": 600,
+    "judged_spp": 8,
+    "max_depth": 8,
+    "fit": {"variant": "original", "effort": {"pixels": 120, "spp": 32}},
+}
+"""What a minute buys: the numbers that all hair shares; variant "spatial" takes several."""
+
 FILES = ("strands.npz", "strands.hair", "strands.usdc", "appearance.json", "report.json")
 
 
@@ -121,8 +131,14 @@ def _capture(
         f"devices, {cost['seconds']:.0f} s; a simulated rig renders each frame"
     )
     truth = (args.out / "truth").resolve()
-    options = {**held_out, "environment": args.environment, "seed": args.seed, "truth": str(truth)}
-    body: dict[str, Any] = {"plan": {}, "pipeline": {"name": "light_planes", "options": options}}
+    options = {
+        **held_out,
+        "environment": args.environment,
+        "seed": args.seed,
+        "truth": str(truth),
+        "inverse_rendering": INVERSE_RENDERING,
+    }
+    body: dict[str, Any] = {"plan": {}, "pipeline": {"name": "full", "options": options}}
     if (truth / "head.obj").is_file():
         body["head"] = str(truth / "head.obj")
     capture = service.post("/captures", body)

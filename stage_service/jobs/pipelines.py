@@ -4,6 +4,15 @@ from __future__ import annotations
 
 PIPELINES: dict[str, tuple[str, ...]] = {
     "light_planes": ("reconstruct", "fit", "assess", "evaluate", "results", "compress"),
+    "full": (
+        "reconstruct",
+        "fit",
+        "inverse_rendering",
+        "assess",
+        "evaluate",
+        "results",
+        "compress",
+    ),
     "reconstruct": ("reconstruct", "evaluate", "results"),
     "fit": ("fit", "assess", "results"),
     "appearance": ("fit", "inverse_rendering", "assess", "results"),

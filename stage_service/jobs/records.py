@@ -30,7 +30,7 @@ class JobOptions(Strict):
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
     against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
     file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering` and `assess` go to the step
-    of that name; without `inverse_rendering` (null) Sun's fit is all.
+    of that name.
     """
 
     method: Method = "light_planes"
@@ -42,9 +42,7 @@ class JobOptions(Strict):
     seed: int = Field(default=0, ge=0)
     reconstruct: ReconstructOptions = Field(default_factory=ReconstructOptions)
     fit: FitOptions = Field(default_factory=FitOptions)
-    inverse_rendering: InverseRenderingRequest | None = Field(
-        default_factory=InverseRenderingRequest
-    )
+    inverse_rendering: InverseRenderingRequest = Field(default_factory=InverseRenderingRequest)
     assess: AssessOptions = Field(default_factory=AssessOptions)
 
     @field_validator("reconstruct")

@@ -78,8 +78,6 @@ def inverse_rendering(context: StepContext) -> Figures:
 
     The message of its progress holds the current error. Killed, it goes on from its checkpoint.
     """
-    if context.options.inverse_rendering is None:
-        return {"left_out": "switched off by the option 'inverse_rendering'"}
     from appearance import fit_validated as run
 
     return run(**context.for_appearance(), request=context.options.inverse_rendering)

@@ -154,7 +154,6 @@ class TinyStage:
         quality = {
             "reconstruct": {"roots": 2000, "grid": 4e-3, "within": 0.05},
             "fit": {"iterations": 2},
-            "inverse_rendering": None,
             "assess": {"spp": 4, "relit_size": 48, "relit_spp": 4},
         }
         return {"name": "light_planes", "options": {**quality, **options}}

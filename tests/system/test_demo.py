@@ -51,8 +51,13 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
             for scores in figures[over].values():
                 assert all(0 <= scores[k] <= 1 for k in ("precision", "recall", "f"))
     assert set(results["baselines"]) == {"hull_vertical", "hull_smooth_field"}
-    for group in ("held_out_lights", "held_out_camera"):
-        for method in ("ours", "mean_colour", "diffuse", "three_nearest"):
+    assert results["images"]["rendered"] in ("sun_fit", "inverse_rendering")
+    fits = ("ours", "sun_fit", "inverse_rendering", "mean_colour", "diffuse")
+    for group, of_frames in (
+        ("held_out_lights", ("three_nearest",)),
+        ("held_out_camera", ("nearest_cameras", "three_nearest_own_frames")),
+    ):
+        for method in (*fits, *of_frames):
             assert results["images"][group][method]["psnr"] > 0
             assert -1 <= results["images"][group][method]["ssim"] <= 1
     fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]

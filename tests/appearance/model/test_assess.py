@@ -13,7 +13,7 @@ from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.options import AssessOptions
 from appearance.model.relight import environment_map, three_quarter_view
 from appearance.render.coverage import coverage
-from appearance.render.smoothed import olat_smoothed, smoothed
+from appearance.render.smoothed import olat_smoothed, smoothed, without_rare
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import (
     Camera,
@@ -238,6 +238,19 @@ def test_smoothing_leaves_no_blot_where_a_rare_path_hit():
     out = smoothed(images, share, 1.0)[0, ..., 0]
     assert out.max() < 0.2 * 400 / (2 * np.pi)  # a blot of one Gaussian would peak at 64
     assert out.sum() == pytest.approx(images[0, ..., 0].sum(), rel=0.1)
+
+
+def test_a_rare_path_is_spread_and_a_glint_along_a_strand_stays():
+    rng = np.random.default_rng(0)
+    share = {"hair": np.ones((48, 48), np.float32), "head": np.zeros((48, 48), np.float32)}
+    glint = np.ones((48, 48, 3))
+    glint[8:20, 12] = 5.0  # a strand, one pixel wide
+    one, other = (glint + rng.normal(scale=0.02, size=glint.shape) for _ in range(2))
+    one[32, 32] = 41.0  # a path that the other picture has not met
+    found = without_rare(one.astype(np.float32), other.astype(np.float32), share, 3.0)
+    np.testing.assert_allclose(found[9:19, 12], 5.0, atol=0.15)
+    assert found[32, 32].max() < 1.5  # the mean would be 21
+    assert found.sum() == pytest.approx((0.5 * (one + other)).sum(), rel=0.005)
 
 
 def test_relighting_names_and_views():
