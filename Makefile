@@ -23,7 +23,7 @@ setup: $(BIN)/.installed  ## Make .venv, install everything, find or install lib
 demo: setup  ## Capture, reconstruct, fit and relight; SUBJECT=strands HEAD=mesh OUT=folder
 	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD))
 
-test: setup lint test-peers  ## Run the tests (about 8 minutes on 2 cores)
+test: setup lint test-peers  ## Run the tests (under 12 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-all: setup lint test-peers  ## Run the slow tests too (under 60 minutes)
