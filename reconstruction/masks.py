@@ -41,7 +41,7 @@ STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
 _PLACE = 3e-3  # metres: what is so near looks alike
 _SAME_PLACE = 5e-3  # metres: as far apart may two cameras' depths of one place be
 MOST_DISAGREEMENT = 0.15
-"""Of a camera's pixels, `disagreements` above which its mask is doubted: true masks have up to 0.09
+"""Of a camera's pixels, `disagreements` above which its mask is doubted: true masks have up to 0.11
 (one pixel is 2 mm, hair and skin are seen past each other), one that lacks half its hair 0.5."""
 
 
