@@ -36,7 +36,7 @@ INVERSE_RENDERING = {
     "lights": 12,
     "validation_lights": 4,
     "hair_pixels": 600,
-    "judged_spp": 8,
+    "judged_spp": 24,
     "max_depth": 8,
     "fit": {"variant": "original", "effort": {"pixels": 120, "spp": 32}},
 }
