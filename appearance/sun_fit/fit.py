@@ -59,10 +59,10 @@ ROUGHNESSES = (0.04, 0.12, 0.3, 0.6, 0.95)
 """β_M of the first renderings; nothing outside is found."""
 NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
 """Those that follow, as factors on the answer of the first."""
-DISORDER = 2.0
+DISORDER = 1.6
 """Turn of single strands over the error of a pixel's mean inclination.
 
-√2 for the two ways across, √2 for a mean over two strands or so.
+√2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
 ROUGHNESS_PIXELS = 350
 """Pixels a camera, at most, whose highlights are matched."""
@@ -327,7 +327,10 @@ class SunFit:
             ("skin's albedo", result.skin, LEAST_SKIN, MOST_SKIN),
         ):
             if min(values) <= least or max(values) >= most:
-                stage.warn(f"the {what} is at the end of its range, {least:g} to {most:g}")
+                stage.warn(
+                    f"the {what} is at the end of its range, {least:g} to {most:g}: the roughness, "
+                    "which was matched with it, may be off too"
+                )
         if min(result.errors) > 0.05:
             off = f"the mean colour is off by {min(result.errors):.0%}"
             stage.warn(f"{off}: is the geometry whole?")

@@ -118,23 +118,80 @@ def test_fit_says_how_far_off_it_may_be(fitted):
     assert report["roughness"].figures["error"] == known.beta_m
 
 
-def fit_of(folder, made, change, lights):
-    """What a fit makes of some of `made`'s frames; `change`: a factor, and the full scale."""
+def fit_of(folder, made, change, lights=None, cameras=("cam_0", "cam_1")):
+    """What a fit makes of the frames of `made`'s subject, each of them changed.
+
+    `change` is a `HairAppearance` to render them with, or a factor on them and the sensor's full
+    scale.
+    """
     capture, model = made
+    lights = lights or capture.olat_lights()
     steps = [Step(i, "olat", 0.02, light=x) for i, x in enumerate(lights)]
-    plan = {"steps": [s.to_dict() for s in steps]}
-    writer = CaptureWriter.create(folder / "capture", capture.rig, plan, head=capture.head)
+    head = capture.head
+    writer = CaptureWriter.create(
+        folder / "capture", capture.rig, {"steps": [s.to_dict() for s in steps]}, head=head
+    )
+    scene = None
+    if isinstance(change, HairAppearance):
+        scene = build_scene(model.strands(), head, hair=change, skin=SKIN)
+    of = [capture.rig.light(name) for name in lights]
+    for name in cameras:
+        camera = capture.rig.camera(name)
+        if scene is None:
+            images = [capture.light(x, name)[0] * change[0] for x in lights]
+        else:
+            images = render_olat(scene, camera, of, spp=16, deep_lights=8, seed=11, max_depth=24)
+        for step, image in zip(steps, images, strict=True):
+            full = np.inf if scene is not None else change[1]
+            writer.write_frame(step, name, np.minimum(image, full), full_scale=full)
+    writer.finish("completed", {})
     fresh = Model(folder / "model").create()
     fresh.write_strands(model.strands())
-    factor, full = change
-    for name in ("cam_0", "cam_1"):
-        for step in steps:
-            image = np.minimum(capture.light(step.light, name)[0] * factor, full)
-            writer.write_frame(step, name, image, full_scale=full)
+    for name in cameras:
         for kind in ("hair", "skin"):
             fresh.write_mask(name, kind, model.mask(name, kind, capture))
-    writer.finish("completed", {})
-    fit(Capture(folder / "capture"), fresh, held_out=HeldOut(("cam_2",)), options=OPTIONS)
+    left_out = tuple(c.name for c in capture.rig.cameras if c.name not in cameras)
+    report = fit(Capture(folder / "capture"), fresh, held_out=HeldOut(left_out), options=OPTIONS)
+    return FittedAppearance.load(fresh), report
+
+
+def covers(appearance, report, beta):
+    """β_M is right within a quarter or its stage warns, and the interval holds it."""
+    known = appearance.uncertainty
+    near = abs(np.log(appearance.hair.beta_m / beta)) < np.log(1.25)
+    return (near or report["roughness"].warnings) and (
+        known.beta_m_low / 1.1 <= beta <= known.beta_m_high * 1.1
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beta", [0.05, 0.8])
+def test_smooth_and_rough_fibres_are_found_or_warned_of(made, tmp_path, beta):
+    appearance, report = fit_of(tmp_path, made, HairAppearance(TRUTH.sigma_a, beta, 0.2))
+    assert covers(appearance, report, beta)
+    np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.3)
+
+
+@pytest.mark.slow
+def test_white_hair(made, tmp_path):
+    appearance, report = fit_of(tmp_path, made, HairAppearance((0.002, 0.003, 0.005), 0.25, 0.2))
+    assert covers(appearance, report, 0.25)
+    assert max(appearance.hair.sigma_a) < 0.02
+
+
+@pytest.mark.slow
+def test_black_hair_warns_that_its_absorption_is_unknown(made, tmp_path):
+    appearance, report = fit_of(tmp_path, made, HairAppearance((6.0, 7.0, 8.0), 0.25, 0.2))
+    assert min(appearance.hair.sigma_a) > 0.7
+    said = report["colour"].warnings
+    assert any("end of its range" in w and "roughness" in w for w in said)
+
+
+@pytest.mark.slow
+def test_one_view_is_enough(made, tmp_path):
+    appearance, report = fit_of(tmp_path, made, (1.0, np.inf), cameras=("cam_0",))
+    assert covers(appearance, report, TRUTH.beta_m)
+    np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.3)
 
 
 def test_one_light_is_refused(made, tmp_path):
