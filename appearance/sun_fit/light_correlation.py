@@ -35,8 +35,10 @@ EDGES = np.radians([0, 8, 16, 24, 32, 40, 50, 60, 75, 90, 120])
 """Bins of |θ_i − θ_i'| of two lights."""
 SIDE = 3
 """A view's hair is parted in 3 × 3."""
-FEWEST_PAIRS = 1000
+FEWEST_PAIRS = 200
 """Pairs of lights, over all pixels, without which there is no answer."""
+FEWEST_OF_VIEW = 1000
+"""Pairs of lights that a single view's answer needs to be compared with others."""
 WIDEST = 1.5
 """Ratio of the interval's ends above which a roughness is called uncertain."""
 LARGEST_ERROR = 0.1
@@ -267,7 +269,7 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
     parts = len(captured.pairs)
     left_out = (1 - np.eye(parts))[captured.pairs.sum(axis=1) > 0]
     views = np.kron(np.eye(parts // SIDE**2), np.ones(SIDE**2))
-    views = views[views @ captured.pairs.sum(axis=1) >= FEWEST_PAIRS]
+    views = views[views @ captured.pairs.sum(axis=1) >= FEWEST_OF_VIEW]
     chosen = np.concatenate([np.ones((1, parts)), left_out, views])
     jackknife = slice(1, len(left_out) + 1)
 

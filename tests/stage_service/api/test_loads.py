@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 import threading
 import time
@@ -205,6 +206,8 @@ def test_a_capture_that_is_being_prepared_does_not_begin_after_a_blackout(
 
 
 def test_a_fault_is_answered_and_the_connection_kept(rig_file, world, tmp_path, monkeypatch):
+    # pytest's workers can't hand on a log with half a character
+    monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)
     with serving(rig_file, tmp_path) as http:
 
         def broken() -> None:
