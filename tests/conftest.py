@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from numpy.typing import NDArray
 from waiting import machine_slack, slowed
 
@@ -31,6 +32,9 @@ ensure_backend(threads=1)
 # What runs in the background starts with Ctrl-C ignored, and so would the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# An example takes as long as the machine is busy.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 FIRST = ("system", "faults", "contracts", "appearance", "benchmarks")
 """Folders that begin first: what mostly waits, beside it what mostly computes and takes longest."""
