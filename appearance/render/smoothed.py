@@ -13,11 +13,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from appearance.render.coverage import coverage
 from appearance.render.environment import direct_environment, render_environment
 from appearance.render.olat import render_olat, render_olat_parts, spread_out
+from appearance.render.paths import pixel_indices
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light
@@ -30,28 +32,43 @@ _WIDE = 4.0
 _RARE = 2.0
 """Times the mean over the wide window from which on light counts as a rare path's."""
 _AT_A_TIME = 16
+"""Lights whose whole pictures are in memory at once."""
 SHOWN = Sampling(36, 16)
 
 
 def olat_smoothed(
-    scene: HairScene, camera: Camera, lights: Sequence[Light], sampling: Sampling = SHOWN
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    sampling: Sampling = SHOWN,
+    *,
+    pixels: ArrayLike | None = None,
 ) -> Floats:
-    """`render_olat` with its indirect light smoothed over `SIGMA` pixels: `(L, H, W, 3)`.
+    """`render_olat` with its indirect light smoothed over `SIGMA` pixels.
 
-    `sampling.spp` paths a pixel bring all light, as many again direct light only: these take a
-    third of the time. Where few pixels are wanted, smoothing still needs all.
+    Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`: that saves memory, not time,
+    as smoothing needs all that see the subject. `sampling.spp` paths a pixel bring all light, as
+    many again direct light only: these take a third of the time.
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     share = coverage(scene, camera, max(spp, 16), seed)
-    index = np.flatnonzero((share["hair"] + share["head"]).ravel() > 0)
+    sees = (share["hair"] + share["head"]).ravel() > 0
+    wanted = np.flatnonzero(sees) if pixels is None else pixel_indices(camera, pixels)
+    sees[wanted] = True
+    index = np.flatnonzero(sees)
     first, rest = render_olat_parts(
         scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed
     )
     again = render_olat(
         scene, camera, lights, spp=spp, max_depth=1, seed=seed + (1 << 31), pixels=index
     )
-    direct = spread_out(0.5 * (first + again), index, camera)
-    return direct + smoothed(spread_out(rest, index, camera), share, SIGMA)
+    out = 0.5 * (first + again)
+    for k in range(0, len(lights), _AT_A_TIME):
+        part = slice(k, k + _AT_A_TIME)
+        smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
+        out[part] += smooth.reshape(len(smooth), -1, 3)[:, index]
+    out = out[:, np.searchsorted(index, wanted)]
+    return out if pixels is not None else spread_out(out, wanted, camera)
 
 
 def environment_smoothed(
@@ -104,9 +121,8 @@ def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
             continue
         rows, columns = (np.flatnonzero(weight.any(axis)) for axis in (1, 0))
         box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        for k in range(0, len(images), _AT_A_TIME):
-            part = (slice(k, k + _AT_A_TIME), *box)
-            out[part] += _without_blots(images[part] * mask[box][..., None], weight[box], sigma)
+        part = (slice(None), *box)
+        out[part] += _without_blots(images[part] * mask[box][..., None], weight[box], sigma)
     return out
 
 

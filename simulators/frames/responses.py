@@ -113,8 +113,8 @@ class MitsubaResponder:
 
         seen, pixels = self._view(camera, 0)
         paths = Sampling(self._quality.lights, self._quality.depth, self._seeds(camera, 0, 1))
-        images = olat_smoothed(self._scene, seen, self._rig.lights, paths)
-        return Response(pixels, images.reshape(len(images), -1, 3)[:, pixels])
+        images = olat_smoothed(self._scene, seen, self._rig.lights, paths, pixels=pixels)
+        return Response(pixels, images)
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lights_together`; `power (L,)`. A vertex asks a sample of them."""

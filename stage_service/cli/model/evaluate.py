@@ -138,7 +138,7 @@ def _demo_results(path: Path) -> dict[str, Any]:
     try:
         results = json.loads(path.read_text())
     except ValueError as e:
-        raise BadArgument(f"{path} is not JSON: {e}") from e
+        raise BadArgument(f"{path} is not JSON: {e}; give a demo's results.json") from e
     if not isinstance(results, dict):
         raise BadArgument(f"{path} is not a JSON object: not a demo's results.json")
     if absent := [field for field in _DEMO_FIELDS if field not in results]:

@@ -82,8 +82,8 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     endpoint = Endpoint(args.host, args.port, args.socket, args.tls_cert, args.tls_key)
     if not endpoint.local and (args.no_auth or args.tls_cert is None):
         raise BadArgument(
-            f"--host {args.host}: beyond this machine a service has tokens, and TLS (--tls-cert), "
-            "or they could be overheard"
+            f"--host {args.host}: beyond this machine tokens are asked for and must not be "
+            "overheard: leave out --no-auth, and give --tls-cert and --tls-key"
         )
     access = _access(args, output)
     rig_file = load_rig_file(args.rig, args.devices)

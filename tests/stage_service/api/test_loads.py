@@ -15,57 +15,27 @@ from typing import Any
 
 import httpx
 import pytest
-import uvicorn
+from serving import Client, serving
 from waiting import until
 
 from reconstruction import CaptureWriter
 from stage_service.acquisition import captures as manager_module
-from stage_service.api.app import create_app
-from stage_service.config import RigFile
-from stage_service.service import Service
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
 LONG = {"plan": {"projectors": []}}
 
 
-class Client(httpx.Client):
-    """Asks the application, which runs on a socket of its own; `service` is behind it."""
+def flood(http: Client, *request: Any, count: int = THREADS, **more: Any) -> None:
+    """Send a request so many times at once, and wait for no answer."""
 
-    service: Service
+    def ask() -> None:
+        own = httpx.Client(base_url=http.base_url, timeout=120, trust_env=False)
+        with own, suppress(httpx.HTTPError):
+            own.request(*request, **more)
 
-    def flood(self, *request: Any, count: int = THREADS, **more: Any) -> None:
-        """Send a request so many times at once, and wait for no answer."""
-
-        def ask() -> None:
-            own = httpx.Client(base_url=self.base_url, timeout=120, trust_env=False)
-            with own, suppress(httpx.HTTPError):
-                own.request(*request, **more)
-
-        for _ in range(count):
-            threading.Thread(target=ask, daemon=True).start()
-
-
-@contextmanager
-def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
-    service = Service(rig_file, root)
-    config = uvicorn.Config(
-        create_app(service), log_level="critical", ws="none", timeout_graceful_shutdown=1
-    )
-    server = uvicorn.Server(config)
-    listener = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=server.run, args=([listener],))
-    thread.start()
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    try:
-        with Client(base_url=url, timeout=60, trust_env=False) as client:
-            client.service = service
-            client.get("/health")
-            yield client
-    finally:
-        server.should_exit = True
-        thread.join(60)
-        listener.close()
+    for _ in range(count):
+        threading.Thread(target=ask, daemon=True).start()
 
 
 @contextmanager
@@ -109,7 +79,7 @@ def test_while_every_thread_of_the_framework_waits(rig_file, world, tmp_path, mo
         stuck(monkeypatch, http.service, "validate") as waiting,
     ):
         capture = begun(http, world)
-        http.flood("POST", "/plans:validate", json={})
+        flood(http, "POST", "/plans:validate", json={})
         until(lambda: waiting() == 40)
         assert_it_can_be_darkened(http, world, capture)
 
@@ -121,7 +91,7 @@ def test_while_the_job_database_never_answers(rig_file, world, tmp_path, monkeyp
         monkeypatch.setattr("stage_service.api.lanes.DATABASE_S", 1.0)
         with serving(rig_file, tmp_path) as http:
             capture = begun(http, world)
-            http.flood("GET", "/jobs")
+            flood(http, "GET", "/jobs")
             problem = http.get("/jobs").json()
             assert problem["type"] == "/docs/errors.md#jobs-unavailable"
             assert_it_can_be_darkened(http, world, capture)
@@ -137,7 +107,7 @@ def test_while_cameras_hang_and_everybody_asks_how_the_devices_are(rig_file, wor
         cameras = rig_file.devices.cameras.model_copy(update={"port": port, "timeout_s": 600.0})
         devices = rig_file.devices.model_copy(update={"cameras": cameras})
         with serving(replace(rig_file, devices=devices), tmp_path) as http:
-            http.flood("GET", "/devices")
+            flood(http, "GET", "/devices")
             seen = http.get("/devices").json()
             assert seen["age_s"] is None
             assert seen["cameras"]["cam_0"]["state"] == "not asked yet"
@@ -150,7 +120,7 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(rig_file, w
         assert http.get("/devices").json()["safety"]["state"] == "dark"
         world.show = "ON 65535"
         with stuck_lights(world):
-            http.flood("GET", "/devices", count=5)
+            flood(http, "GET", "/devices", count=5)
             answer = http.post("/devices/blackout").json()
             assert answer["state"] == "unknown, unsafe"
             assert "light bank" in answer["detail"]

@@ -4,56 +4,23 @@ from __future__ import annotations
 
 import json
 import re
-import socket
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-import uvicorn
+from serving import Client, serving
 
 from reconstruction import verify
-from stage_service.api.app import create_app
 from stage_service.cli import main
 from stage_service.config import RigFile, SafetyLimits
 from stage_service.devices.device_set import DeviceSet
-from stage_service.service import Service
 
 SHORT = {"lights": ["light_003", "light_000"], "projectors": []}
 IN_BAND = {**SHORT, "lights": "all", "exposure": {"olat": 0.05}}
 CONSENT = "N. N., 3 May 2026, flashes of 14 Hz for ten seconds"
-
-
-class Client(httpx.Client):
-    """Asks the application, which runs on a socket of its own; `service` is behind it."""
-
-    service: Service
-
-
-@contextmanager
-def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
-    """The application, started and closed as the server does."""
-    service = Service(rig_file, root)
-    config = uvicorn.Config(create_app(service), log_level="error", ws="none")
-    server = uvicorn.Server(config)
-    listener = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=server.run, args=([listener],))
-    thread.start()
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    try:
-        # The socket takes connections before the server does: the first answer comes when it is up.
-        with Client(base_url=url, timeout=30, trust_env=False) as client:
-            client.service = service
-            client.get("/health")
-            yield client
-    finally:
-        server.should_exit = True
-        thread.join(30)
-        listener.close()
 
 
 @pytest.fixture

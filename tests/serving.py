@@ -1,0 +1,46 @@
+"""The application on a socket of its own, as the server runs it, with the service at hand."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import uvicorn
+
+from stage_service.api.app import create_app
+from stage_service.config import RigFile
+from stage_service.service import Service
+
+
+class Client(httpx.Client):
+    """Asks the application; `service` is behind it."""
+
+    service: Service
+
+
+@contextmanager
+def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
+    """The application, started and closed as the server does."""
+    service = Service(rig_file, root)
+    config = uvicorn.Config(
+        create_app(service), log_level="critical", ws="none", timeout_graceful_shutdown=1
+    )
+    server = uvicorn.Server(config)
+    listener = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    try:
+        # The socket takes connections before the server does: the first answer comes when it is up.
+        with Client(base_url=url, timeout=60, trust_env=False) as client:
+            client.service = service
+            client.get("/health")
+            yield client
+    finally:
+        server.should_exit = True
+        thread.join(60)
+        listener.close()
