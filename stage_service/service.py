@@ -273,10 +273,8 @@ class Service:
         try:
             return self._queue.get(job_id)
         except NoSuchJob:  # that of a capture which has just completed may not be there yet
-            job = self._follower.enqueue_now(job_id)
-            if job is None:
-                raise
-            return job
+            # Not owed (any more): it was enqueued meanwhile, or there is none.
+            return self._follower.enqueue_now(job_id) or self._queue.get(job_id)
 
     def cancel_job(self, job_id: str, by: Caller) -> Job:
         """Cancel a job: a queued one at once, a running one at its next progress call."""

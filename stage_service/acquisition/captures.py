@@ -401,25 +401,25 @@ class CaptureManager:
                 with self._talking:
                     run.sequencer.devices.close()
             finally:
-                status = self._ended(run)
-        if status.outcome == "completed" and self._on_complete is not None:
-            try:
-                self._on_complete(status)
-            except Exception as error:  # the capture is whole; what follows it is told apart
-                data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
-                self.events.publish("capture.follow_up_failed", data)
+                self._ended(run)
 
-    def _ended(self, run: CaptureRun) -> CaptureStatus:
+    def _ended(self, run: CaptureRun) -> None:
         """Put the run away; its last blackout is what is known of the stage."""
         if run.sequencer.blackout is not None:
             self._learn(run.sequencer.blackout)
         status = run.status()
         result = status.outcome or status.state
         self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
+        if status.outcome == "completed" and self._on_complete is not None:
+            # Before anybody sees the capture as done: its job is named from then on.
+            try:
+                self._on_complete(status)
+            except Exception as error:  # the capture is whole; what follows it is told apart
+                data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
+                self.events.publish("capture.follow_up_failed", data)
         with self._lock:
             self._done[run.id] = status
             self._running = None
-        return status
 
     def _learn(self, result: Blackout) -> None:
         """Keep what a blackout came to, and latch or unlatch."""
