@@ -25,6 +25,7 @@ from stage_service.jobs.slots import worker_is_alive
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
 from stage_service.plan.resolved import resolve
+from stage_service.queueing import Queueing, then
 from stage_service.records.audit import Action
 from stage_service.records.events import EventLog
 from stage_service.records.lease import Lease
@@ -38,6 +39,7 @@ from stage_service.service_models import (
     LeaseGrant,
     LeaseRequest,
     LeaseView,
+    QueueRequest,
     RenewRequest,
 )
 
@@ -80,6 +82,7 @@ class Service:
         )
         self._has_stage = False
         self._control = Control(self._captures.audit)
+        self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
         self._queue = JobQueue(root)
         self._follower = JobFollower(root, self._queue, self._captures.events)
         self._submitting = threading.Lock()
@@ -100,10 +103,12 @@ class Service:
         if not self._has_stage:
             self.take_stage()
         self._captures.darken()
-        for status in self._captures.list():
+        known = self._captures.list()
+        for status in known:
             if status.outcome == "completed":
                 self._follower.owe(status, fresh=False)
         self._follower.start()
+        self.queue.start(known)
 
     def take_stage(self) -> None:
         """Have the stage for this service alone. Raises `StageInUse`."""
@@ -115,6 +120,7 @@ class Service:
         with self._closing:
             if self._closed.is_set():
                 return
+            self.queue.close()
             try:
                 self._captures.close()
             finally:
@@ -133,6 +139,16 @@ class Service:
             by.require("arm")
         if request.pipeline is not None:
             by.require("jobs")
+        work = self._prepared(request, request.armed_by)
+        capture = self._control.do(by, "capture.start", work, None, detail=then(request))
+        self._control.record_arming(by, capture, request.armed_by, request.plan.consent)
+        return self.capture(capture)
+
+    def _prepared(
+        self, request: CaptureRequest | QueueRequest, armed_by: str | None = None
+    ) -> Callable[..., str]:
+        """What starts the capture, its head and masks read. Raises `BadInput`."""
+        if request.pipeline is not None:
             _check_names(request.pipeline, self.rig_file.rig)
             if "reconstruct" not in PIPELINES[request.pipeline.name]:
                 raise BadInput(
@@ -149,18 +165,20 @@ class Service:
                 head = read_obj(request.head)
             except (OSError, ValueError) as error:
                 raise BadInput(f"head: {error}") from error
-        work = partial(
-            self._captures.start,
-            request.plan,
-            armed_by=request.armed_by,
-            head=head,
-            masks=self._masks(request.masks) if request.masks is not None else None,
-            extra={"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {},
-        )
-        then = "" if request.pipeline is None else f"{request.pipeline.name} is to follow"
-        capture = self._control.do(by, "capture.start", work, None, detail=then)
-        self._control.record_arming(by, capture, request.armed_by, request.plan.consent)
-        return self.capture(capture)
+        masks = self._masks(request.masks) if request.masks is not None else None
+        asked = {"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {}
+
+        def start(unless_dark_since: int | None = None, **more: str) -> str:
+            return self._captures.start(
+                request.plan,
+                armed_by=armed_by,
+                head=head,
+                masks=masks,
+                extra={**asked, **more},
+                unless_dark_since=unless_dark_since,
+            )
+
+        return start
 
     def capture(self, capture_id: str) -> CaptureView:
         """A capture's status. Raises `UnknownCapture`."""
@@ -187,6 +205,7 @@ class Service:
 
     def abort(self, capture_id: str, by: Caller) -> CaptureView:
         """Abort at the next step boundary; anybody may. Raises `UnknownCapture`, `WrongState`."""
+        self.queue.hold(f"capture {capture_id} was aborted by {by}")
         work = partial(self._captures.abort, capture_id)
         return self._view(self._control.do(by, "capture.abort", work, capture_id, steers=False))
 
@@ -299,6 +318,7 @@ class Service:
 
     def blackout(self, by: Caller) -> dict[str, Any]:
         """All lamps and projectors off, verified; aborts a running capture. Anybody may."""
+        self.queue.hold(f"blackout by {by}")
         return self._control.blackout(by, self._captures.blackout)
 
     def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:

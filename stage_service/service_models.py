@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field
 
 from reconstruction.containment import LONGEST_NAME
+from stage_service.acquisition.capture_queue import Entry
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.config import Strict
 from stage_service.jobs.records import PipelineRequest, with_example
@@ -15,10 +16,18 @@ from stage_service.plan.capture_plan import CapturePlan
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
 PersonName = Annotated[str, Field(min_length=1, max_length=100)]
+Place = Annotated[int, Field(ge=0, le=10**6)]
 LeaseSeconds = Annotated[float, Field(ge=1.0, le=86400.0)]
 
 
-class CaptureRequest(Strict):
+class _Wanted(Strict):
+    plan: CapturePlan = CapturePlan()
+    head: Path | None = None
+    masks: Path | None = None
+    pipeline: PipelineRequest | None = None
+
+
+class CaptureRequest(_Wanted):
     """A capture to make, and the job that follows it by itself when it completes.
 
     `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine.
@@ -31,11 +40,26 @@ class CaptureRequest(Strict):
         pipeline={"name": "light_planes", "options": {"held_out_cameras": ["cam_03"]}},
     )
 
-    plan: CapturePlan = CapturePlan()
-    head: Path | None = None
-    masks: Path | None = None
-    pipeline: PipelineRequest | None = None
     armed_by: PersonName | None = None
+
+
+class QueueRequest(_Wanted):
+    """A capture that is to wait for the stage, at the end of the queue or at `place` from 0.
+
+    A plan that flashes needs its consent here; who answers for it is said when it is started.
+    """
+
+    model_config = with_example(
+        plan={"projectors": [], "exposure": {"olat": 0.01}}, head="/data/subject/head.obj", place=0
+    )
+
+    place: Place | None = None
+
+
+class MoveRequest(Strict):
+    """Where in the queue, from 0."""
+
+    place: Place
 
 
 class ResumeRequest(Strict):
@@ -97,6 +121,18 @@ class CaptureView(CaptureStatus):
     )
 
     job: str | None
+
+
+class QueueView(BaseModel):
+    """What waits for the stage, the next one first.
+
+    `held`: why nothing begins by itself until somebody says that it may go on; `waits_for`: what
+    the first one waits for now.
+    """
+
+    held: str | None
+    waits_for: str | None
+    waiting: list[Entry]
 
 
 class LeaseView(BaseModel):

@@ -18,7 +18,7 @@ from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import RESERVE
 from reconstruction.reading import printable
 from stage_service.acquisition.capture_run import CaptureRun, plan_of
-from stage_service.acquisition.latch import Latch
+from stage_service.acquisition.latch import Latch, Unsafe
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
 from stage_service.acquisition.states import CaptureStatus, WrongState, possible, read_status
 from stage_service.config import RigFile
@@ -99,7 +99,8 @@ class CaptureManager:
         self._running: CaptureRun | None = None
         self._preparing: str | None = None
         self._closed = False
-        self._blackouts = 0  # begun since the start
+        self.blackouts = 0  # begun since the start
+        self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
         self._found: dict[str, CaptureStatus] | None = None
         self._stay_on_exit = off_on_exit(self.close)
@@ -131,17 +132,19 @@ class CaptureManager:
         head: Mesh | None = None,
         extra: dict[str, Any] | None = None,
         armed_by: str | None = None,
+        unless_dark_since: int | None = None,
     ) -> str:
         """Validate, create the folder, begin on a thread; returns the capture's id at once.
 
         `extra` is kept in `plan.json` and shown as `CaptureStatus.request`; `armed_by` says who at
-        the stage answers for flashes that the plan has consent for. Raises `Busy`, `Unsafe`,
-        `FlashRefusal`; `PlanError` and `CaptureError` (masks) before any device is touched.
+        the stage answers for flashes that the plan has consent for; with `unless_dark_since` it
+        begins only if no blackout has begun since `blackouts` was that number. Raises `Busy`,
+        `Unsafe`, `FlashRefusal`; `PlanError`, `CaptureError` (masks) before any device is touched.
         Trouble with devices appears as outcome "failed" with `error`.
         """
         resolved = resolve(plan, self.rig_file)
         cost = resolved.cost
-        _check_flashing(resolved, armed_by)
+        check_flashing(resolved, armed_by)
         free = shutil.disk_usage(self.folder).free
         if cost.bytes + RESERVE > free:
             need, have = f"{cost.bytes / 1e9:.1f} GB", f"{free / 1e9:.1f} GB"
@@ -162,7 +165,7 @@ class CaptureManager:
             writer = CaptureWriter.create(folder, rig, description, masks=masks, head=head)
             return self._run_of(capture_id, resolved, devices, writer, armed_by)
 
-        self._launch(capture_id, make)
+        self._launch(capture_id, make, unless_dark_since)
         return capture_id
 
     def _continue(self, capture_id: str, armed_by: str | None) -> None:
@@ -174,7 +177,7 @@ class CaptureManager:
         def make() -> CaptureRun:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
-            _check_flashing(plan, armed_by)
+            check_flashing(plan, armed_by)
             devices = self._devices
             return self._run_of(capture_id, plan, devices, CaptureWriter.reopen(path), armed_by)
 
@@ -194,17 +197,20 @@ class CaptureManager:
         run.thread = threading.Thread(target=self._run, args=(run,), name=name, daemon=True)
         return run
 
-    def _launch(self, capture_id: str, make: Callable[[], CaptureRun]) -> None:
+    def _launch(
+        self, capture_id: str, make: Callable[[], CaptureRun], since: int | None = None
+    ) -> None:
         """Begin what `make` prepares in the disk's own time, unless a blackout comes meanwhile."""
         with self._lock:
             self._check_free()
-            self._preparing, blackouts = capture_id, self._blackouts
+            blackouts = self.blackouts if since is None else since
+            self._preparing = capture_id
         run = None
         try:
             self.take_stage()  # the bank may have been switched off, and its owner forgotten
             run = make()
             with self._lock:
-                if self._closed or self._blackouts != blackouts:
+                if self._closed or self.blackouts != blackouts:
                     raise Busy("none, but the stage was put dark meanwhile")
                 self._done.pop(capture_id, None)
                 self._running = run
@@ -290,6 +296,17 @@ class CaptureManager:
         seen = {"age_s": None} if self.rig_file.devices is None else self._seen.get()
         return {**seen, "safety": self.safety()}
 
+    def waits_for(self) -> str | None:
+        """What keeps a capture from beginning that nobody stands by; None: nothing does."""
+        with self._lock:
+            try:
+                self._check_free()
+            except (Busy, Unsafe) as error:
+                return str(error)
+            if self._dark is None or self._dark.blocks:
+                return "nobody knows yet whether the stage is dark"
+        return None
+
     def safety(self) -> dict[str, Any]:
         """What is known of the lamps now: {"state", "detail", "latched"}."""
         run = self._running
@@ -343,7 +360,7 @@ class CaptureManager:
         """
         devices = self._devices
         with self._lock:
-            self._blackouts += 1
+            self.blackouts += 1
             self._darkening += 1  # nothing may begin until it is over
             run = self._running
         try:
@@ -418,7 +435,7 @@ class CaptureManager:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
         with self._lock:
-            self._done[run.id] = status
+            self._done[run.id] = self.ended = status
             self._running = None
 
     def _learn(self, result: Blackout) -> None:
@@ -462,7 +479,8 @@ def _not_yet_over(status: CaptureStatus) -> CaptureStatus:
     return status.model_copy(update={"state": "finishing", "outcome": None})
 
 
-def _check_flashing(plan: ResolvedPlan, armed_by: str | None) -> None:
+def check_flashing(plan: ResolvedPlan, armed_by: str | None) -> None:
+    """Raise `FlashRefusal` where flashes lack consent, or somebody who answers for them."""
     cost, consent = plan.cost, plan.plan.consent
     if cost.flash.needs_consent and not (consent and armed_by):
         slow = plan.at_rate(SLOW_HZ).cost

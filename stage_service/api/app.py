@@ -16,7 +16,7 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
-from stage_service.api import event_stream, routes, steering
+from stage_service.api import event_stream, queueing, routes, steering
 from stage_service.api.connections import LOOPBACK, limits, listening
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
@@ -52,9 +52,9 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     )
     app.state.service, app.state.lanes, app.state.streams = service, Lanes(), 0
     install_problems(app)
-    for part in (routes, steering, event_stream):
+    for part in (routes, steering, queueing, event_stream):
         app.include_router(part.reading)
-    for more in (routes, steering):
+    for more in (routes, steering, queueing):
         app.include_router(more.router)
 
     @app.get(PAGE, include_in_schema=False)

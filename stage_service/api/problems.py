@@ -22,6 +22,7 @@ from reconstruction import CaptureError, MissingFrame
 from reconstruction.capture.writer import JournalInUse
 from reconstruction.containment import NotContained
 from reconstruction.reading import printable
+from stage_service.acquisition.capture_queue import QueueFull, UnknownEntry
 from stage_service.acquisition.captures import Busy, UnknownCapture
 from stage_service.acquisition.control import Forbidden
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
@@ -76,6 +77,10 @@ unsafe 409 Nobody knows whether the lamps are off
     /devices/blackout`; where the link cannot read back, `POST /devices/acknowledge`.
 cannot-acknowledge 409 This is not for a person to say
     Nothing is latched, or the light bank can tell by itself: `POST /devices/blackout`.
+unknown-entry 404 Nothing of that name waits
+    `GET /queue` lists what waits, `GET /queue/history` what was started from it.
+queue-full 409 The queue has no room
+    Remove what waits, or name lights by a rule and not one by one.
 leased 409 Somebody else steers the stage
     `holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are open to
     everybody.
@@ -128,6 +133,8 @@ KINDS = {kind.slug: kind for kind in _kinds()}
 BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",
     BadInput: "bad-input",
+    UnknownEntry: "unknown-entry",
+    QueueFull: "queue-full",
     NotContained: "bad-input",
     Busy: "busy",
     JournalInUse: "journal-in-use",

@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
 
 
+PLAN = "plan as JSON; without it, everything"
+
+
 def add(commands: Commands) -> None:
     """Add the commands."""
     capture = add_group(commands, "capture", "make and steer captures on a running service")
     check = add_remote(capture, "check", run_check)
     start = add_remote(capture, "start", run_start)
     check.add_argument("--rig", type=rig_path, help="ask this rig file, not a service")
-    for parser in (check, start):
-        parser.add_argument("--plan", type=Path, help="plan as JSON; without it, everything")
-    start.add_argument("--head", type=Path, help="the digitised head (.obj)")
-    start.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
-    add_pipeline(start, None, "job to enqueue when the capture completes")
+    check.add_argument("--plan", type=Path, help=PLAN)
+    add_wanted(start)
     start.add_argument("--armed-by", help="who answers for flashes that the plan has consent for")
     start.add_argument("--wait", action="store_true", help="wait for capture and job, steer alone")
     add_remote(capture, "list", run_list_captures)
@@ -46,6 +46,25 @@ def add(commands: Commands) -> None:
         parser.add_argument("capture", help="its id")
         if action == "resume":
             parser.add_argument("--armed-by", help="as for start")
+
+
+def add_wanted(parser: argparse.ArgumentParser) -> None:
+    """Add what says which capture is wanted."""
+    parser.add_argument("--plan", type=Path, help=PLAN)
+    parser.add_argument("--head", type=Path, help="the digitised head (.obj)")
+    parser.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
+    add_pipeline(parser, None, "job to enqueue when the capture completes")
+
+
+def wanted(args: argparse.Namespace) -> dict[str, Any]:
+    """The request that `add_wanted`'s options make."""
+    body: dict[str, Any] = {"plan": read_json(args.plan)}
+    for field in ("head", "masks"):
+        if getattr(args, field) is not None:
+            body[field] = str(getattr(args, field).resolve())
+    if args.pipeline is not None:
+        body["pipeline"] = {"name": args.pipeline, "options": read_json(args.options)}
+    return body
 
 
 def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
@@ -85,12 +104,7 @@ def _costed(cost: dict[str, Any]) -> str:
 
 def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
     """Begin a capture."""
-    body: dict[str, Any] = {"plan": read_json(args.plan)}
-    for field in ("head", "masks"):
-        if getattr(args, field) is not None:
-            body[field] = str(getattr(args, field).resolve())
-    if args.pipeline is not None:
-        body["pipeline"] = {"name": args.pipeline, "options": read_json(args.options)}
+    body = wanted(args)
     if args.armed_by is not None:
         body["armed_by"] = args.armed_by
     if not args.wait:

@@ -1,0 +1,306 @@
+"""Captures that wait for the stage: kept on disk, begun one after the other, never against anybody.
+
+Nothing begins by itself that would need somebody to arm it, nor after a blackout, an abort or a
+capture that failed, until a person says that it may go on.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Collection, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from reconstruction.capture.writer import utc_now
+from reconstruction.files.durable import write_json
+from reconstruction.reading import printable, read_json
+from stage_service.acquisition.captures import Busy
+from stage_service.records.events import EventLog
+from stage_service.records.lease import Leased
+
+log = logging.getLogger("hairstage.queue")
+POLL_S = 0.5
+MOST_BYTES = 8 << 20
+"""What all that waits may take on the disk."""
+MOST_HISTORY = 1000
+
+
+class QueueFull(RuntimeError):
+    """What waits already takes all the room that there is."""
+
+
+class UnknownEntry(LookupError):
+    """The queue has no such entry, or not any more."""
+
+
+class Entry(BaseModel):
+    """A capture that waits, was started as `capture`, or was removed; `by` asked for it.
+
+    `needs_arming`: its plan flashes, so that somebody at the stage has to start it. `request` is
+    kept while it waits.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: str
+    by: str
+    added: str
+    needs_arming: bool = False
+    state: Literal["waiting", "started", "removed"] = "waiting"
+    request: dict[str, Any] = {}
+    capture: str | None = None
+    ended: str | None = None
+
+
+class _Kept(BaseModel):
+    """The file."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    held: str | None = None
+    waiting: list[Entry] = []
+    history: list[Entry] = []
+
+
+class CaptureQueue:
+    """What waits, in order, in the file `path`; a thread of its own begins it.
+
+    `begin(entry)` starts a capture and returns its id; `waits_for()` says what keeps the stage from
+    beginning one by itself, or None. What `begin` refuses for another reason than that the stage is
+    not free holds the queue. `hold` waits for no disk. A file that is broken is set aside.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        events: EventLog,
+        begin: Callable[[Entry], str],
+        waits_for: Callable[[], str | None],
+    ) -> None:
+        self._path, self._events = path, events
+        self._begin, self._stage_waits_for = begin, waits_for
+        self._changed = threading.Condition()  # for moments
+        self._beginning = threading.Lock()  # one at a time, by the thread or by a person
+        self._writing = threading.Lock()
+        self._told: str | None = None
+        self._unsaved = self._closed = False
+        self._kept = self._read()
+        self._thread = threading.Thread(target=self._run, name="capture-queue", daemon=True)
+
+    def start(self, begun: Mapping[str, str], unfinished: Collection[str]) -> None:
+        """Begin, with the captures that `begun` has by their entries' ids; hold where the last one
+        of the history is `unfinished`."""
+        with self._changed:
+            for entry in list(self._kept.waiting):
+                if entry.id in begun:  # it died between the capture's first file and the queue's
+                    self._to_history(entry, "started", begun[entry.id])
+            last = self._kept.history[-1].capture if self._kept.history else None
+            if last in unfinished and self._kept.held is None:
+                self._kept.held = f"capture {last}, the last one, did not complete"
+                self._unsaved = True
+        self._thread.start()
+
+    def close(self) -> None:
+        """Begin nothing any more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5)
+
+    @property
+    def held(self) -> str | None:
+        """Why nothing begins by itself until a person says so."""
+        return self._kept.held
+
+    def waits_for(self) -> str | None:
+        """What the first one waits for; None: nothing, or nothing waits."""
+        with self._changed:
+            first = self._kept.waiting[0] if self._kept.waiting else None
+        if first is None:
+            return None
+        reason = self._stage_waits_for()
+        if reason is None and self.held is not None:
+            reason = f"held: {self.held}"
+        if reason is None and first.needs_arming:
+            reason = f"{first.id} flashes: somebody at the stage has to start and arm it"
+        return reason
+
+    def waiting(self) -> list[Entry]:
+        """What waits, the next one first."""
+        with self._changed:
+            return list(self._kept.waiting)
+
+    def history(self, limit: int) -> list[Entry]:
+        """The last ones that were started or removed, the newest first."""
+        with self._changed:
+            return self._kept.history[::-1][:limit]
+
+    def add(
+        self, request: dict[str, Any], by: str, *, needs_arming: bool, place: int | None = None
+    ) -> Entry:
+        """Let a capture wait, at the end or at `place` from 0. Raises `QueueFull`, `OSError`."""
+        name = f"q-{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+        entry = Entry(
+            id=name, by=printable(by), added=utc_now(), needs_arming=needs_arming, request=request
+        )
+        with self._changed:
+            sizes = sum(len(json.dumps(e.request)) for e in (*self._kept.waiting, entry))
+            if sizes > MOST_BYTES:
+                raise QueueFull(f"what waits may take {MOST_BYTES:,} bytes, not {sizes:,}")
+            waiting = self._kept.waiting
+            waiting.insert(len(waiting) if place is None else place, entry)
+        try:
+            self._save()
+        except OSError:
+            with self._changed:
+                self._kept.waiting.remove(entry)
+            raise
+        self._tell("added", entry)
+        return entry
+
+    def move(self, name: str, place: int) -> Entry:
+        """Put it at `place` from 0. Raises `UnknownEntry`."""
+        with self._changed:
+            entry = self._find(name)
+            self._kept.waiting.remove(entry)
+            self._kept.waiting.insert(place, entry)
+        self._save()
+        self._tell("moved", entry)
+        return entry
+
+    def remove(self, name: str) -> Entry:
+        """Take it out. Raises `UnknownEntry`."""
+        with self._beginning, self._changed:
+            entry = self._to_history(self._find(name), "removed")
+        self._save()
+        self._tell("removed", entry)
+        return entry
+
+    def begin(self, name: str, begin: Callable[[Entry], str]) -> Entry:
+        """Start it out of turn, by a person. Raises `UnknownEntry` and what `begin` does."""
+        with self._beginning:
+            with self._changed:
+                entry = self._find(name)
+            return self._begun(entry, begin(entry))
+
+    def hold(self, why: str, *, always: bool = False) -> None:
+        """Begin nothing by itself until `go_on`, where anything waits, or `always`."""
+        with self._changed:
+            if self._kept.held is not None or not (self._kept.waiting or always):
+                return
+            self._kept.held, self._unsaved = printable(why), True
+            self._changed.notify_all()
+        self._events.publish("queue.held", {"why": why})
+
+    def go_on(self) -> None:
+        """Begin what waits again."""
+        with self._changed:
+            was, self._kept.held = self._kept.held, None
+        self._save()
+        if was is not None:
+            self._events.publish("queue.goes_on", {"was": was})
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._unsaved, POLL_S)
+                if self._closed and not self._unsaved:
+                    return
+                closed = self._closed
+            try:
+                if self._unsaved:
+                    self._save()
+                if not closed:
+                    self._begin_the_next()
+            except Exception:  # a full disk, say: what waits stays, and the thread goes on
+                log.exception("%s", self._path)
+                if closed:
+                    return
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closed, POLL_S)
+
+    def _begin_the_next(self) -> None:
+        with self._beginning:
+            # `held` is looked at last: who aborts, or blacks out, holds before the stage is free.
+            reason = self.waits_for()
+            if reason != self._told:
+                self._told = reason
+                self._events.publish("queue.waits", {"for": reason})
+            with self._changed:
+                if reason is not None or not self._kept.waiting or self._closed:
+                    return
+                entry = self._kept.waiting[0]
+            if entry.needs_arming:
+                return
+            try:
+                capture = self._begin(entry)
+            except (Busy, Leased):
+                return
+            except Exception as error:  # it would be refused again: for a person to look at
+                self.hold(f"{entry.id} cannot begin: {error}")
+                return
+            self._begun(entry, capture)
+
+    def _begun(self, entry: Entry, capture: str) -> Entry:
+        with self._changed:
+            started = self._to_history(entry, "started", capture)
+        self._tell("started", started)
+        self._save()
+        return started
+
+    def _find(self, name: str) -> Entry:
+        for entry in self._kept.waiting:
+            if entry.id == name:
+                return entry
+        raise UnknownEntry(f"nothing waits as {name!r}; GET /queue lists what does")
+
+    def _to_history(
+        self, entry: Entry, state: Literal["started", "removed"], capture: str | None = None
+    ) -> Entry:
+        self._kept.waiting.remove(entry)
+        over: dict[str, Any] = {
+            "state": state,
+            "capture": capture,
+            "ended": utc_now(),
+            "request": {},
+        }
+        ended = entry.model_copy(update=over)
+        self._kept.history = [*self._kept.history, ended][-MOST_HISTORY:]
+        self._unsaved = True
+        return ended
+
+    def _tell(self, what: str, entry: Entry) -> None:
+        data = {"id": entry.id, "by": entry.by, "capture": entry.capture}
+        self._events.publish(f"queue.{what}", data)
+
+    def _save(self) -> None:
+        with self._writing:
+            with self._changed:
+                data = self._kept.model_dump(mode="json")
+                self._unsaved = False
+            try:
+                write_json(self._path, data)
+            except OSError:
+                self._unsaved = True
+                raise
+
+    def _read(self) -> _Kept:
+        try:
+            return _Kept.model_validate(read_json(self._path))
+        except FileNotFoundError:
+            return _Kept()
+        except (OSError, ValueError) as error:
+            aside = f"{self._path.name}.broken-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+            try:
+                self._path.rename(self._path.with_name(aside))
+            except OSError:
+                log.exception("%s cannot be set aside", self._path)
+            log.error("%s was broken (%s) and was set aside as %s", self._path, error, aside)
+            return _Kept(held=f"{self._path.name} was broken and was set aside as {aside}")

@@ -1,0 +1,221 @@
+"""The queue of captures: what begins by itself, in which order, and what never does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from serving import Client, serving
+from waiting import until
+
+from stage_service.acquisition import capture_queue
+from stage_service.acquisition.captures import Busy, CaptureManager
+from stage_service.cli import main
+from stage_service.config import RigFile, SafetyLimits
+from stage_service.plan.capture_plan import CapturePlan
+
+LONG = {"projectors": [], "lights": [f"light_{i:03d}" for i in range(60)]}
+IN_BAND = {"projectors": [], "exposure": {"olat": 0.05}}
+CONSENT = "N. N., 3 May 2026, flashes of 14 Hz for ten seconds"
+
+
+def plan(light: int) -> dict[str, Any]:
+    """One that only its light tells from others."""
+    return {"plan": {"lights": [f"light_{light:03d}"], "projectors": []}}
+
+
+@pytest.fixture
+def http(rig_file: RigFile, tmp_path: Path) -> Iterator[Client]:
+    with serving(rig_file, tmp_path / "root") as client:
+        yield client
+
+
+def slug(response: Any) -> str:
+    return response.json()["type"].partition("#")[2]
+
+
+def add(http: Client, body: dict[str, Any]) -> str:
+    answer = http.post("/queue", json=body)
+    assert answer.status_code == 201, answer.text
+    entry: str = answer.json()["id"]
+    return entry
+
+
+def ended(http: Client, number: int) -> list[dict[str, Any]]:
+    """The captures, oldest first, once so many are done."""
+
+    def there() -> list[dict[str, Any]] | None:
+        captures: list[dict[str, Any]] = http.get("/captures").json()
+        done = len(captures) == number and all(c["state"] == "done" for c in captures)
+        return captures if done else None
+
+    found = until(there, pause=0.05)
+    assert found is not None
+    return found
+
+
+def test_what_waits_begins_by_itself_in_the_order_that_it_was_put_in(http):
+    running = http.post("/captures", json={"plan": LONG}).json()["id"]
+    a, b, c = (add(http, plan(i)) for i in range(3))
+    first = add(http, {**plan(3), "place": 0})
+    assert running in http.get("/queue").json()["waits_for"]
+    assert http.patch(f"/queue/{c}", json={"place": 1}).json()["id"] == c
+    assert http.delete(f"/queue/{a}").json()["state"] == "removed"
+    assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [first, c, b]
+    captures = ended(http, 4)
+    assert [x["outcome"] for x in captures] == 4 * ["completed"]
+    by_start = sorted(captures, key=lambda x: x["started"])
+    assert [x["request"].get("queue") for x in by_start] == [None, first, c, b]
+    history = http.get("/queue/history").json()
+    shot = [(e["id"], e["capture"]) for e in history if e["state"] == "started"]
+    assert shot == [(x["request"]["queue"], x["id"]) for x in by_start[:0:-1]]
+    assert [e["id"] for e in history if e["state"] == "removed"] == [a]
+    assert http.get("/queue").json() == {"held": None, "waits_for": None, "waiting": []}
+    audit = [(x["who"], x["subject"]) for x in http.get("/audit").json()]
+    assert len([who for who, subject in audit if "queue, for 127.0.0.1" in who]) == 3
+    assert slug(http.patch(f"/queue/{a}", json={"place": 0})) == "unknown-entry"
+    assert slug(http.delete(f"/queue/{a}")) == "unknown-entry"
+
+
+@pytest.mark.parametrize("how", ["abort", "blackout", "failure"])
+def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(http, world, how):
+    running = http.post("/captures", json={"plan": LONG}).json()["id"]
+    entry = add(http, plan(1))
+    if how == "failure":
+        world.dead_lamps = True
+    else:
+        http.post({"abort": f"/captures/{running}/abort", "blackout": "/devices/blackout"}[how])
+    until(lambda: http.get(f"/captures/{running}").json()["state"] == "done")
+    world.dead_lamps = False
+    reason = until(lambda: http.get("/queue").json()["held"])
+    assert {"abort": "aborted by", "blackout": "blackout by", "failure": "failed"}[how] in reason
+    pulses = world.pulses
+    # Long enough for the queue's thread to have looked once more.
+    http.service.events.wait(http.service.events.last, 1.2)
+    assert world.pulses == pulses
+    assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [entry]
+    assert http.post("/queue:go-on").json()["held"] is None
+    assert ended(http, 2)[1]["request"] == {"queue": entry}
+
+
+def test_nothing_begins_while_the_stage_is_latched_or_somebody_steers(http, world):
+    lease = http.post("/lease", json={"holder": "Ada", "seconds": 60}).json()["token"]
+    entry = add(http, plan(1))
+    assert "Ada steers" in http.get("/queue").json()["waits_for"]
+    assert slug(http.post(f"/queue/{entry}/start")) == "leased"
+    assert slug(http.post("/queue:go-on")) == "leased"
+    world.stuck_lamps, world.lit = True, {3}
+    assert http.post("/devices/blackout").json()["safe"] is False
+    http.delete("/lease", headers={"Hairstage-Lease": lease})
+    http.post("/queue:go-on")
+    assert "Nothing is lit until" in http.get("/queue").json()["waits_for"]
+    assert slug(http.post(f"/queue/{entry}/start")) == "unsafe"
+    assert http.get("/captures").json() == []
+    world.stuck_lamps = False
+    assert http.post("/devices/blackout").json()["safe"] is True
+    http.post("/queue:go-on")
+    assert ended(http, 1)[0]["outcome"] == "completed"
+
+
+def test_a_plan_that_flashes_is_started_by_somebody_who_answers_for_it(rig_file, world, tmp_path):
+    living = replace(rig_file, safety=SafetyLimits(living_subject=True))
+    with serving(living, tmp_path / "root") as http:
+        assert slug(http.post("/queue", json={"plan": IN_BAND})) == "flash-rate"
+        flashing = add(http, {"plan": {**IN_BAND, "consent": CONSENT}})
+        behind = add(http, {"plan": {**IN_BAND, "rate_hz": 2.5, "lights": ["light_003"]}})
+        http.service.events.wait(http.service.events.last, 1.2)
+        assert "somebody at the stage" in http.get("/queue").json()["waits_for"]
+        assert world.pulses == 0
+        refused = http.post(f"/queue/{flashing}/start", json={})
+        assert slug(refused) == "flash-rate"
+        assert world.pulses == 0
+        begun = http.post(f"/queue/{flashing}/start", json={"armed_by": "Eve"})
+        assert begun.status_code == 202, begun.text
+        http.post(f"/captures/{begun.json()['capture']}/abort")
+        assert any(a["action"] == "flash.armed" for a in http.get("/audit").json())
+        assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [behind]
+
+
+def test_a_restart_keeps_what_waits_and_shoots_nothing_twice(rig_file, tmp_path):
+    root = tmp_path / "root"
+    with serving(rig_file, root) as http:
+        http.post("/queue:hold")
+        a, b = (add(http, plan(i)) for i in range(2))
+        before = tmp_path / "queue.json"
+        shutil.copy(root / "queue.json", before)
+        started = http.post(f"/queue/{b}/start").json()
+        ended(http, 1)
+    # As if it had died before it could write that `b` was started.
+    shutil.copy(before, root / "queue.json")
+    with serving(rig_file, root) as http:
+        queue = http.get("/queue").json()
+        assert [e["id"] for e in queue["waiting"]] == [a]
+        assert "by 127.0.0.1" in queue["held"]
+        (known,) = http.get("/queue/history").json()
+        assert (known["id"], known["capture"]) == (b, started["capture"])
+        http.post("/queue:go-on")
+        assert ended(http, 2)[1]["request"] == {"queue": a}
+    (root / "queue.json").write_text('{"waiting": [')
+    with serving(rig_file, root) as http:
+        assert "broken" in http.get("/queue").json()["held"]
+        assert len(list(root.glob("queue.json.broken-*"))) == 1
+
+
+def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, tmp_path):
+    head = tmp_path / "head.obj"
+    assert slug(http.post("/queue", json={"head": str(head)})) == "bad-input"
+    head.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\ng scalp\nf 1 2 3\n")
+    http.post("/queue:hold")
+    entry = add(http, {**plan(1), "head": str(head)})
+    head.unlink()
+    http.post("/queue:go-on")
+    assert "head.obj" in until(lambda: http.get("/queue").json()["held"])
+    assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [entry]
+    assert world.pulses == 0
+
+
+def test_a_blackout_wins_over_a_capture_that_is_about_to_begin(rig_file, world, tmp_path):
+    manager = CaptureManager(rig_file, tmp_path / "root")
+    try:
+        since = manager.blackouts
+        manager.blackout()
+        with pytest.raises(Busy, match="dark meanwhile"):
+            manager.start(CapturePlan(projectors=()), unless_dark_since=since)
+        assert world.pulses == 0
+    finally:
+        manager.close()
+
+
+def test_the_queue_takes_so_much_and_no_more(http, monkeypatch):
+    http.post("/queue:hold")
+    long = {"plan": {"consent": "x" * 1000, "lights": [f"light_{i:03d}" for i in range(200)]}}
+    assert len(json.dumps(long)) > 3000
+    monkeypatch.setattr(capture_queue, "MOST_BYTES", 10_000)
+    kept = [http.post("/queue", json=long).status_code for _ in range(3)]
+    assert kept == [201, 201, 409]
+    assert slug(http.post("/queue", json=long)) == "queue-full"
+    assert len(http.get("/queue").json()["waiting"]) == 2
+
+
+def test_the_command_line_queues(http, tmp_path, capsys):
+    def run(*words: str) -> dict[str, Any]:
+        assert main(["queue", *words, "--url", str(http.base_url), "--json"]) == 0
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return found
+
+    run("hold")
+    file = tmp_path / "plan.json"
+    file.write_text(json.dumps(plan(2)["plan"]))
+    a, b = (run("add", "--plan", str(file))["id"] for _ in range(2))
+    run("move", b, "0")
+    assert [e["id"] for e in run("list")["waiting"]] == [b, a]
+    run("remove", b)
+    run("start", a)
+    assert [e["state"] for e in run("history")["history"]] == ["started", "removed"]
+    assert run("go-on")["held"] is None
+    ended(http, 1)
