@@ -27,6 +27,7 @@ class WorkerStopping(JobInterrupted):
 class StepProgress:
     """The `Progress` callback of one step: tells readers, and raises when the step must stop.
 
+    The share that is told never goes back, though a step may learn that it has more to do.
     `interrupted` returns the exception to raise, if any.
     """
 
@@ -44,6 +45,7 @@ class StepProgress:
         self._job, self._step, self._steps = job, step, steps
         self._interrupted, self._clock = interrupted, clock
         self._last = float("-inf")
+        self._share = 0.0
 
     def __call__(self, what: str, share: float) -> None:
         now = self._clock()
@@ -54,7 +56,7 @@ class StepProgress:
         if stop is not None:
             raise stop
         done = self._steps.index(self._step)
-        step_share = min(max(share, 0.0), 1.0)
+        self._share = step_share = max(self._share, min(share, 1.0))
         progress = JobProgress(
             step=self._step,
             steps=self._steps,

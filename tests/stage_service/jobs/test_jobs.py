@@ -171,6 +171,11 @@ def test_progress_is_throttled_but_never_late_at_the_end(tmp_path: Path) -> None
     assert told is not None
     assert (told.what, told.step_share, asked[0]) == ("early", 0.1, 1)
     assert told.share == pytest.approx(0.55)
+    now[0] = 1.0
+    progress("more to do than thought", 0.05)
+    told = read_progress(Model(tmp_path), "job-1")
+    assert told is not None
+    assert (told.what, told.step_share) == ("more to do than thought", 0.1)
     progress("end", 1.0)
     told = read_progress(Model(tmp_path), "job-1")
     assert told is not None
