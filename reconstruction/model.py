@@ -29,6 +29,7 @@ from reconstruction.report.report import Report
 MaskKind = Literal["hair", "skin"]
 
 FILES = {
+    "index.html": "one page on all of it: begin here",
     "strands.npz": "the strands, roots first (also .hair and .usdc)",
     "strands.hair": "the strands for cyHair's readers",
     "strands.usdc": "the strands as USD curves",
@@ -54,6 +55,7 @@ FILES = {
 
 
 _OF_APPEARANCE = (
+    "index.html",
     "appearance.json",
     "hair_maps.npz",
     "lights.json",

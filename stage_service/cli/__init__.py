@@ -10,13 +10,14 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from stage_service.cli import bench, calibrate, demo, head, rig, verify
-from stage_service.cli.model import edit, evaluate, export, fit, reconstruct, render
+from stage_service.cli.model import edit, evaluate, export, fit, page, reconstruct, render
 from stage_service.cli.stage import capture, jobs, lease, processes, queue, tokens
 from stage_service.cli.support.commands import EXIT_CODES, run_command
 
 COMMANDS = (
     *(demo, processes, capture, queue, lease, jobs, tokens),
-    *(verify, reconstruct, fit, render, edit, export, evaluate, bench, rig, calibrate, head),
+    *(verify, reconstruct, fit, render, edit, export, page),
+    *(evaluate, bench, rig, calibrate, head),
 )
 
 

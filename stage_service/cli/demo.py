@@ -42,7 +42,14 @@ INVERSE_RENDERING = {
 }
 """What a minute buys: the numbers that all hair shares; variant "spatial" takes several."""
 
-FILES = ("strands.npz", "strands.hair", "strands.usdc", "appearance.json", "report.json")
+FILES = (
+    "index.html",
+    "strands.npz",
+    "strands.hair",
+    "strands.usdc",
+    "appearance.json",
+    "report.json",
+)
 
 
 def add(commands: Commands) -> None:

@@ -114,8 +114,9 @@ def evaluate(context: StepContext) -> Figures:
 
 
 def results(context: StepContext) -> Figures:
-    """Gather every figure of the job in `results.json`, and draw the report's plots."""
+    """Gather every figure of the job in `results.json`, draw the report's plots, write the page."""
     from reconstruction.report.plots import plot_geometry, plot_report
+    from stage_service.model_page import write_page
 
     model = context.model
     plots, report = model.file("plots"), model.report()
@@ -134,7 +135,7 @@ def results(context: StepContext) -> Figures:
         plot_geometry({"ours": geometry, **figures["baselines"]}, model.file("plots/geometry.png"))
     figures["warnings"] = [f"{s.name}: {w}" for s in report.stages for w in s.warnings]
     model.write_json("results.json", figures)
-    return {"results": "results.json"}
+    return {"results": "results.json", "page": write_page(model).name}
 
 
 _ALL = (compress, reconstruct, fit, inverse_rendering, assess, evaluate, results)

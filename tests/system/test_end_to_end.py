@@ -72,7 +72,7 @@ def test_a_capture_becomes_relit_hair(running, captured, finished):
     files = {a["path"]: a["bytes"] for a in running.get(f"/jobs/{job['id']}/artifacts")}
     for name in ("strands.npz", "strands.hair", "strands.usdc", "appearance.json"):
         assert files[name] > 100
-    for name in ("comparison.png", "relit.png", "results.json", "report.json"):
+    for name in ("comparison.png", "relit.png", "results.json", "report.json", "index.html"):
         assert files[name] > 100
     assert any(name.startswith("plots/") for name in files)
     report = running.get(f"/jobs/{job['id']}/report")

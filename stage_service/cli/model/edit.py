@@ -69,6 +69,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     from appearance import FittedModel
     from appearance.model.edit import cut, restyled, roughened
     from reconstruction import Capture, Model, read_strands
+    from stage_service.model_page import write_page
 
     names = ("strands", "cut", "recolour", "pigment", "roughen")
     edits = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
@@ -91,6 +92,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         fitted = fitted.with_maps(roughened(fitted.maps, args.roughen))
     model = Model(args.out)
     fitted.save(model)
+    write_page(model)
     if fitted.head is None:
         output.note(
             f"warning: {args.model} holds no head, so {model} has none and is rendered without: "

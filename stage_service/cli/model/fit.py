@@ -44,6 +44,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
+    from stage_service.model_page import write_page
 
     model, inverse = Model(args.model), args.method == "inverse_rendering"
     asked = {
@@ -66,6 +67,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     if options.held_out_cameras or options.held_out_lights:
         with progress_bar("assess") as progress:
             data["images"] = assess(StepContext(args.capture, model, options, progress))
+    write_page(model)
     data["warnings"] = [f"{s.name}: {w}" for s in model.report().stages for w in s.warnings]
     for warning in data["warnings"]:
         output.note(f"warning: {warning}")

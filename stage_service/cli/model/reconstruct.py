@@ -29,11 +29,13 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace, output: Output) -> None:
     """Strands from a capture.
 
-    Write MODEL/strands.npz, .hair and .usdc, and MODEL/report.json.
+    Write MODEL/strands.npz, .hair and .usdc, MODEL/report.json, and a page on them,
+    MODEL/index.html.
     """
     from reconstruction import Capture, Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, reconstruct
+    from stage_service.model_page import write_page
 
     asked = {
         "method": args.method,
@@ -45,6 +47,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     Capture(args.capture)
     with progress_bar("reconstruct") as progress:
         reconstruct(StepContext(args.capture, model, options, progress))
+    write_page(model)
     strands = model.strands()
     seconds = sum(stage.seconds for stage in model.report().stages)
     data = {"model": str(model), "strands": len(strands), "points": len(strands.points)}

@@ -58,6 +58,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from appearance.model.relight import environment_map, three_quarter_view
     from reconstruction import Capture, Model
     from reconstruction.files.durable import writing
+    from stage_service.model_page import write_page
 
     start = time.perf_counter()
     if args.out is not None and args.out.suffix not in (".png", ".exr"):
@@ -81,6 +82,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     out: Path = args.out or model.file("render.png")
     with writing(out) as part:
         _write(part, image)
+    if args.out is None:
+        write_page(model)
     progress("written", 1.0)
     return {
         "image": str(out),

@@ -12,25 +12,10 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
-_THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
-_HEADS = [t.replace("mm_", " mm/").replace("deg", "°") for t in _THRESHOLDS]
-_GROUPS = ("held_out_lights", "held_out_camera")
+from stage_service.model_page.names import GROUPS, PICTURES, STRANDS, THRESHOLDS, threshold
+
+_HEADS = [threshold(t) for t in THRESHOLDS]
 _SCORES = ("psnr", "ssim")
-_STRANDS = {
-    "ours": "ours",
-    "hull_smooth_field": "hull + smooth field",
-    "hull_vertical": "hull + vertical",
-}
-_PICTURES = {
-    "ours": "ours",
-    "inverse_rendering": "inverse rendering",
-    "sun_fit": "Sun's fit",
-    "diffuse": "diffuse",
-    "mean_colour": "mean colour",
-    "three_nearest": "three nearest lights",
-    "nearest_cameras": "three nearest cameras",
-    "three_nearest_own_frames": "three nearest lights in that camera's own frames",
-}
 _APPEARANCE = {
     "beta_m": "longitudinal roughness β_M",
     "v": "longitudinal variance v (Sun's β_l)",
@@ -44,13 +29,13 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     """The tables of the demo's `results.json` in `out`, and where everything is."""
     geometry = geometry_table({"ours": results["geometry"], **results["baselines"]})
     images = Table("pictures (PSNR / SSIM)", "held-out lights", "held-out camera")
-    for name, title in _PICTURES.items():
-        found = [results["images"].get(group, {}).get(name) for group in _GROUPS]
+    for name, title in PICTURES.items():
+        found = [results["images"].get(group, {}).get(name) for group in GROUPS]
         cells = ["" if f is None else f"{f['psnr']:.1f} dB / {f['ssim']:.2f}" for f in found]
         if any(cells):
             images.add_row(title, *cells)
     fits = results["appearance"]
-    hair = Table("appearance", *(_PICTURES.get(name, name) for name in fits))
+    hair = Table("appearance", *(PICTURES.get(name, name) for name in fits))
     for key, what in _APPEARANCE.items():
         hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
     for key, what in _ERRORS.items():
@@ -64,8 +49,8 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
         *(f"warning: {w}" for w in results["warnings"]),
         f"{results['seconds']:.0f} s in all: capture {capture['seconds']:.0f} s, "
         + ", ".join(f"{k} {v:.0f} s" for k, v in results["stages"].items()),
-        f"everything is in {out.resolve()}: results.json, capture/, model/ (strands, appearance, "
-        "pictures, report.json, plots/), truth/, logs/",
+        f"everything is in {out.resolve()}: results.json, capture/, model/, truth/, logs/",
+        f"begin with {out.resolve() / 'model' / 'index.html'}",
     )
 
 
@@ -125,16 +110,16 @@ def _rows() -> dict[str, list[_Part]]:
     """The README's rows by title."""
     rows: dict[str, list[_Part]] = {}
     for over in ("visible", "all"):
-        for name, title in _STRANDS.items():
+        for name, title in STRANDS.items():
             read = partial(_f, over=over, name=name)
             rows[f"F at 1 mm/10°, {over} points: {title}"] = [(read, ".1f", " %")]
-    for group in _GROUPS:
-        for name, title in _PICTURES.items():
+    for group in GROUPS:
+        for name, title in PICTURES.items():
             decibels, ssim = (partial(_score, group=group, name=name, score=s) for s in _SCORES)
             where = group.replace("held_out_", "held-out ")
             rows[f"{where}: {title}"] = [(decibels, ".1f", " dB"), (ssim, ".2f", "")]
     for fit in ("fitted", "sun_fit", "true"):
-        title = {"fitted": "ours", "true": "the truth"}.get(fit, _PICTURES.get(fit, fit))
+        title = {"fitted": "ours", "true": "the truth"}.get(fit, PICTURES.get(fit, fit))
         rows[f"β_M: {title}"] = [(partial(_beta_m, fit=fit), ".2f", "")]
     rows["β_M: standard error that Sun's fit gives"] = [(_beta_m_error, ".2f", "")]
     return rows
@@ -148,7 +133,7 @@ def _cell(figures: Sequence[Mapping[str, float]], parts: Sequence[_Part]) -> Ite
 
 def _f(results: Mapping[str, Any], over: str, name: str) -> float:
     scores = results["geometry"] if name == "ours" else results["baselines"][name]
-    return 100 * float(scores[over][_THRESHOLDS[0]]["f"])
+    return 100 * float(scores[over][THRESHOLDS[0]]["f"])
 
 
 def _score(results: Mapping[str, Any], group: str, name: str, score: str) -> float | None:
@@ -192,7 +177,7 @@ def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
 def _cells(scores: dict[str, dict[str, float]]) -> list[str]:
     return [
         " / ".join(f"{100 * scores[t][k]:.1f}" for k in ("precision", "recall", "f"))
-        for t in _THRESHOLDS
+        for t in THRESHOLDS
     ]
 
 

@@ -1,0 +1,121 @@
+"""HTML as values: whatever is not `Html` already is escaped when it goes into an element."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from html import escape
+from typing import Any
+from urllib.parse import quote
+
+VOID = {"img", "meta"}
+SPREAD = ("p10", "p50", "p90")
+
+
+class Html(str):
+    """Text that is markup and may go into a page as it is."""
+
+    __slots__ = ()
+
+
+def element(name: str, /, *content: str, **attributes: object) -> Html:
+    """`<name attributes>content</name>`; a trailing or inner `_` of an attribute is left out or -.
+
+    Attributes of value None are left out.
+    """
+    given = "".join(
+        f' {key.rstrip("_").replace("_", "-")}="{escape(str(value))}"'
+        for key, value in attributes.items()
+        if value is not None
+    )
+    if name in VOID:
+        return Html(f"<{name}{given}>")
+    return Html(f"<{name}{given}>{joined(content)}</{name}>")
+
+
+def joined(content: Iterable[str]) -> Html:
+    """Pieces one after the other, escaped where they are plain text."""
+    return Html("".join(c if isinstance(c, Html) else escape(c) for c in content))
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> Html:
+    """A table that scrolls by itself where it is too wide; nothing where it has no rows."""
+    body = [element("tr", *(element("td", cell) for cell in row)) for row in rows]
+    if not body:
+        return Html("")
+    top = element("tr", *(element("th", head, scope="col") for head in heads))
+    parts = [element("thead", top)] if any(heads) else []
+    inner = element("table", *parts, element("tbody", *body))
+    return element("div", inner, class_=f"wide {kind}".strip())
+
+
+def link(path: str, *content: str, class_: str | None = None) -> Html:
+    """A link to a file of the folder that the page lies in."""
+    return element("a", *(content or (path,)), href=quote(path), class_=class_)
+
+
+def number(value: object) -> str:
+    """A figure as people read it: four digits are enough."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return "not finite"
+        if value == 0 or 1e-3 <= abs(value) < 1e5:
+            return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+        digits, _, power = f"{value:.3e}".partition("e")
+        times = "" if float(digits) == 1 else f"{float(digits):g} · "
+        return f"{times}10{_raised(int(power))}"
+    return "not known" if value is None else str(value)
+
+
+def words(name: str) -> str:
+    """A field's name as a phrase."""
+    return name.replace("_", " ")
+
+
+def seconds(value: float) -> str:
+    """A time as people say it."""
+    if value >= 5400:
+        return f"{int(value // 3600)} h {int(value % 3600 // 60)} min"
+    if value >= 120:
+        return f"{int(value // 60)} min {int(value % 60)} s"
+    return f"{value:.0f} s" if value >= 10 else f"{value:.2g} s"
+
+
+def size(count: int) -> str:
+    """Bytes as people say them."""
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= scale:
+            return f"{count / scale:.3g} {unit}"
+    return f"{count} B"
+
+
+def flat(figures: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Figures of any depth as rows (name, value): a spread and a list of a few are one value."""
+    for key, value in figures.items():
+        name = f"{above} · {words(str(key))}" if above else words(str(key))
+        if isinstance(value, Mapping) and set(SPREAD) <= set(value):
+            low, middle, high = (number(value[k]) for k in SPREAD)
+            yield name, f"{middle} ({low} to {high}: 10 to 90 %)"
+        elif isinstance(value, Mapping) and value and all(map(_plain, value.values())):
+            yield name, ", ".join(f"{words(str(k))} {number(v)}" for k, v in value.items())
+        elif isinstance(value, Mapping):
+            yield from flat(value, name)
+        elif isinstance(value, list) and all(map(_plain, value)):
+            more = f", … ({len(value)})" if len(value) > 8 else ""
+            yield name, ", ".join(number(v) for v in value[:8]) + more
+        elif isinstance(value, list):
+            yield name, f"{len(value)} entries in report.json"
+        else:
+            yield name, number(value)
+
+
+def _plain(value: object) -> bool:
+    return not isinstance(value, Mapping | list)
+
+
+def _raised(power: int) -> str:
+    return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

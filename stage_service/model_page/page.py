@@ -1,0 +1,352 @@
+"""The page's parts, top to bottom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from reconstruction import Model
+from reconstruction.model import FILES
+from reconstruction.report.report import Report
+from stage_service.model_page.html import (
+    Html,
+    element,
+    flat,
+    joined,
+    link,
+    number,
+    size,
+    table,
+    words,
+)
+from stage_service.model_page.html import seconds as time_text
+from stage_service.model_page.names import GROUPS, PICTURES, STRANDS, threshold
+from stage_service.model_page.plots import error_plots, time_bars
+
+PAGE = "index.html"
+HERO = ("relit.png", "render.png", "comparison.png")
+"""The picture at the top: the first that is there."""
+SHOWN = {
+    "relit.png": "The result under an environment map that no camera saw.",
+    "comparison.png": "Frames that no fit has seen: captured, rendered, and the baselines.",
+    "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
+    "render.png": "What hairstage render drew last.",
+    "plots/geometry.png": "Strands against the true ones, beside baselines that use no method.",
+}
+
+
+def write_page(model: Model) -> Path:
+    """Write `index.html` of what `model` holds now; returns its path."""
+    with model.writing(PAGE) as part:
+        part.write_text(model_page(model), encoding="utf-8")
+    return model.file(PAGE)
+
+
+def model_page(model: Model) -> Html:
+    """The page of `model` as it is now; a folder without strands has one too."""
+    report = model.report()
+    results = model.json("results.json") if model.has("results.json") else {}
+    name = model.path.resolve().name
+    warnings = [(s.name, w) for s in report.stages for w in s.warnings]
+    parts = {
+        "Result": _result(model),
+        f"Warnings ({len(warnings)})": _warnings(report, warnings),
+        "How good it is": _quality(model, results),
+        "Pictures": _pictures(model),
+        "Time": _time(report),
+        "Left out": _left_out(report),
+        "Every figure": _figures(report),
+        "Files": _files(model),
+    }
+    shown = {title: content for title, content in parts.items() if content}
+    marks = {title: title.split(" (")[0].lower().replace(" ", "-") for title in shown}
+    menu = [element("a", title, href=f"#{marks[title]}") for title in shown]
+    sections = [
+        element("section", element("h2", title), content, id=marks[title])
+        for title, content in shown.items()
+    ]
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="referrer", content="no-referrer"),
+        element("title", f"{name} · hairstage"),
+        element("style", Html(Path(__file__).with_name("style.css").read_text(encoding="utf-8"))),
+    )
+    top = element(
+        "header",
+        element("p", "hairstage model", class_="kind"),
+        element("h1", name),
+        element("nav", *menu, aria_label="parts of this page"),
+    )
+    foot = element("footer", f"Written by hairstage {version('hairstage')}.")
+    body = element("body", top, element("main", *sections), foot)
+    return joined([Html("<!doctype html>\n"), element("html", head, body, lang="en"), Html("\n")])
+
+
+def _result(model: Model) -> Html:
+    """What to take away: strands and material, with the files that hold them."""
+    if not model.has("strands.npz"):
+        return element("p", "There are no strands yet: the reconstruction has not come to its end.")
+    strands = model.strands()
+    lengths = strands.lengths()
+    facts = [
+        ("strands", [element("b", f"{len(strands):,}"), f" of {len(strands.points):,} points"])
+    ]
+    if len(strands):
+        facts.append(
+            (
+                "length",
+                [
+                    element("b", f"{lengths.sum():,.0f} m"),
+                    f" in all; a strand {1e3 * _middle(lengths):.0f} mm, median",
+                ],
+            )
+        )
+        radius = 1e6 * _middle(strands.radius)
+        facts.append(("radius", [element("b", f"{radius:.0f} µm"), _coverage_note(radius)]))
+    facts += _material(model)
+    rows = [joined([element("dt", what), element("dd", *said)]) for what, said in facts]
+    text = joined(
+        [
+            element(
+                "p",
+                "The result is ",
+                link("strands.usdc" if model.has("strands.usdc") else "strands.npz"),
+                " with ",
+                *_material_files(model),
+                ". Everything else here says how they came about and how good they are.",
+                class_="lead",
+            ),
+            element("dl", *rows),
+            element(
+                "p",
+                "For other programs: ",
+                element("code", f"hairstage export {model.path.name} --to blender --out FOLDER"),
+                class_="quiet",
+            ),
+        ]
+    )
+    hero = next((p for p in HERO if model.has(p)), None)
+    if hero is None:
+        return text
+    picture = element("img", src=hero, alt=FILES[hero])
+    return element("div", link(hero, picture), element("div", text), class_="hero")
+
+
+def _material_files(model: Model) -> list[str]:
+    if not model.has("appearance.json"):
+        return ["no material: no appearance was fitted"]
+    if not model.has("hair_maps.npz"):
+        return ["the material in ", link("appearance.json"), " (Sun's fit)"]
+    more = [" and the lights as found in ", link("lights.json")] if model.has("lights.json") else []
+    return ["the material in ", link("hair_maps.npz"), " (inverse rendering)", *more]
+
+
+def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
+    """Roughness and colour of Sun's fit with their errors; which fit is rendered."""
+    if not model.has("appearance.json"):
+        return
+    fit = model.json("appearance.json")
+    hair, known = fit["hair"], fit.get("uncertainty")
+    said: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}")]
+    if known:
+        low, high = known["beta_m_low"], known["beta_m_high"]
+        said.append(f", {low:.2f} to {high:.2f} at about 95 %")
+    else:
+        said.append(", no error known")
+    yield "roughness", said
+    errors = known["sigma_a"] if known else [None] * 3
+    said = [_swatch(fit["colour"]), "σ_a "]
+    for k, (value, error) in enumerate(zip(hair["sigma_a"], errors, strict=True)):
+        said += [", " if k else "", element("b", f"{value:.2g}")]
+        said.append("" if error is None else f" ± {error:.0%}")
+    yield "colour", [*said, "" if known else ", no error known"]
+    yield "skin", [_swatch(fit["skin"]), ", ".join(f"{x:.2f}" for x in fit["skin"])]
+    if model.has("rejected"):
+        yield (
+            "not used",
+            [
+                "inverse rendering: Sun's fit is better on validation frames; "
+                "the maps are in rejected"
+            ],
+        )
+    elif model.has("hair_maps.npz"):
+        yield "rendered", ["inverse rendering; the roughness and colour above are its start"]
+
+
+def _swatch(linear: Sequence[float]) -> Html:
+    """A patch of a linear RGB colour."""
+    shown = [12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055 for x in linear]
+    red, green, blue = (round(255 * min(max(x, 0), 1)) for x in shown)
+    return element("span", class_="swatch", style=f"background:rgb({red},{green},{blue})")
+
+
+def _coverage_note(radius: float) -> str:
+    if radius > 60:
+        return ", thicker than hair (20 to 60 µm), because fewer strands cover the same head"
+    return ""
+
+
+def _middle(values: Any) -> float:
+    ordered = sorted(values.tolist()) if getattr(values, "ndim", 0) else [float(values)]
+    return float(ordered[len(ordered) // 2])
+
+
+def _warnings(report: Report, warnings: Sequence[tuple[str, str]]) -> Html:
+    if not report.stages:
+        return Html("")
+    if not warnings:
+        return element("p", "No stage warned of anything.")
+    rows = [element("li", element("b", words(stage)), " ", text) for stage, text in warnings]
+    return element("ul", *rows, class_="warnings")
+
+
+def _quality(model: Model, results: Mapping[str, Any]) -> Html:
+    """Against truth, baselines and held-out frames, where there are any."""
+    parts = []
+    if "geometry" in results:
+        found = {"ours": results["geometry"], **results.get("baselines", {})}
+        parts += [
+            element("h3", "Strands against the true ones: precision / recall / F, %"),
+            _strand_table(found),
+        ]
+    if any(group in results.get("images", {}) for group in GROUPS):
+        parts += [
+            element("h3", "Pictures: PSNR, SSIM and relative error on the hair"),
+            _picture_table(results["images"]),
+            element("p", "Means over the images of each group.", class_="quiet"),
+        ]
+    if "appearance" in results:
+        parts += [element("h3", "Appearance"), _appearance_table(results["appearance"])]
+    if not parts:
+        return Html("")
+    note = (
+        "One run: how much these figures vary from seed to seed is not known. "
+        "Several runs side by side: hairstage evaluate table."
+    )
+    return joined([*parts, element("p", note, class_="quiet")])
+
+
+def _strand_table(found: Mapping[str, Any]) -> Html:
+    first = next(iter(found.values()))
+    heads = [threshold(t) for t in next(iter(first[p] for p in ("visible", "all") if p in first))]
+    rows = []
+    for over in ("visible", "all"):
+        for name, figures in found.items():
+            if over in figures:
+                cells = [
+                    " / ".join(f"{100 * s[k]:.1f}" for k in ("precision", "recall", "f"))
+                    for s in figures[over].values()
+                ]
+                rows.append([f"{over} points", _ours(name, STRANDS), *cells])
+    return table(["", "", *heads], rows, "figures")
+
+
+def _picture_table(images: Mapping[str, Any]) -> Html:
+    heads, rows = [words(g) for g in GROUPS if g in images], []
+    for name in PICTURES:
+        cells = []
+        for found in (images[g].get(name) for g in GROUPS if g in images):
+            text = "–"
+            if found is not None:
+                text = f"{found['psnr']:.1f} dB / {found['ssim']:.2f}"
+                if "relative_error" in found:
+                    text += f" / {found['relative_error']:.2f}"
+            cells.append(text)
+        if set(cells) != {"–"}:
+            rows.append([_ours(name, PICTURES), *cells])
+    return table(["", *heads], rows, "figures")
+
+
+def _appearance_table(fits: Mapping[str, Mapping[str, Any]]) -> Html:
+    names = {key: None for figures in fits.values() for key in figures}
+    rows = []
+    for key in names:
+        rows.append([words(key), *(_numbers(figures.get(key, "–")) for figures in fits.values())])
+    return table(["", *(PICTURES.get(n, words(n)) for n in fits)], rows, "figures")
+
+
+def _ours(name: str, titles: Mapping[str, str]) -> str:
+    title = titles.get(name, words(name))
+    return element("b", title) if name == "ours" else title
+
+
+def _numbers(value: Any) -> str:
+    values = value if isinstance(value, list) else [value]
+    return ", ".join(f"{x:.3g}" if isinstance(x, float) else number(x) for x in values)
+
+
+def _pictures(model: Model) -> Html:
+    figures = [
+        element(
+            "figure",
+            link(path, element("img", src=path, alt=text, loading="lazy")),
+            element("figcaption", element("b", path), " ", text),
+        )
+        for path, text in SHOWN.items()
+        if model.has(path)
+    ]
+    return element("div", *figures, class_="pictures") if figures else Html("")
+
+
+def _time(report: Report) -> Html:
+    if not report.stages:
+        return Html("")
+    total = sum(s.seconds for s in report.stages)
+    plots = [plot for stage in report.stages for plot in error_plots(stage)]
+    return joined(
+        [
+            element("p", f"{time_text(total)} in the stages of this model, by the clock."),
+            time_bars(report.stages),
+            element("div", *plots, class_="plots") if plots else "",
+        ]
+    )
+
+
+def _left_out(report: Report) -> Html:
+    rows = [
+        [words(stage.name), item.what, item.why, item.saved]
+        for stage in report.stages
+        for item in stage.left_out
+    ]
+    intro = "Work that was not done because this subject did not need it, and what that saved."
+    ledger = table(["stage", "left out", "why", "saved"], rows)
+    return joined([element("p", intro), ledger]) if rows else Html("")
+
+
+def _figures(report: Report) -> Html:
+    parts = [
+        element(
+            "details",
+            element("summary", words(stage.name)),
+            table(["", ""], flat(stage.figures), "figures"),
+        )
+        for stage in report.stages
+        if stage.figures
+    ]
+    return joined(parts)
+
+
+def _files(model: Model) -> Html:
+    """Every file by the name under which `FILES` knows it; those of folders one by one."""
+    found = model.artifacts()
+    found.pop(PAGE, None)
+    rows: list[list[str]] = []
+    for name, what in FILES.items():
+        inside = {p: f for p, f in found.items() if p == name or p.startswith(f"{name}/")}
+        if not inside:
+            continue
+        total = size(sum(f.stat().st_size for f in inside.values()))
+        if name in inside:
+            rows.append([link(name), what, total])
+            continue
+        each = [element("li", link(p, p.removeprefix(f"{name}/"))) for p in inside]
+        summary = element("summary", f"{name}/: {len(inside)} files")
+        rows.append([element("details", summary, element("ul", *each)), what, total])
+    known = tuple(FILES)
+    others = [p for p in found if p.split("/")[0] not in known]
+    rows += [[link(p), "", size(found[p].stat().st_size)] for p in others]
+    return table(["file", "what it is", "size"], rows, "files")
