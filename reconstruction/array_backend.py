@@ -55,3 +55,14 @@ def for_kernels(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any
     copy = memory[start : start + size].view(dtype).reshape(values.shape)
     copy[...] = values
     return copy
+
+
+def rows_of(value: Any) -> NDArray[Any]:
+    """The lanes of a Dr.Jit variable as rows: `(N,)` of a number, `(N, c)` of a vector.
+
+    NumPy's own way to a vector, by `np.array`, compiles a kernel for each number of lanes.
+    """
+    drjit.eval(value)
+    if drjit.depth_v(value) < 2:
+        return np.array(value)
+    return np.stack([np.array(component) for component in value], axis=-1)

@@ -19,7 +19,7 @@ from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene.hair_scene import SCALE
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera
-from reconstruction.array_backend import for_kernels
+from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import Floats, Ints
 from reconstruction.files.durable import writing
 from reconstruction.options import options
@@ -137,9 +137,10 @@ def _trace(
         across = hit.tangent
         tangent = si.to_world(mi.Vector3f(across[0], across[1], 0))
         normal = dr.normalize(hit.normal - tangent * dr.dot(hit.normal, tangent))
+        dr.eval(si, hair, tangent, normal)  # one tracing for all
         rows = out[start : start + len(part)]
         for name, value in (("point", si.p / SCALE), ("tangent", tangent), ("normal", normal)):
-            rows[name] = np.array(dr.select(hair, value, 0)).T.reshape(*rows.shape, 3)
+            rows[name] = rows_of(dr.select(hair, value, 0)).reshape(*rows.shape, 3)
         rows["along"] = np.array(dr.select(hair, hit.along, 0)).reshape(rows.shape)
         on_hair = np.array(hair).reshape(rows.shape)
         strand = np.array(hit.strand).reshape(rows.shape).astype(np.int64)

@@ -15,7 +15,7 @@ from appearance.bsdf.lobes import Fibre, evaluate
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
 from appearance.render.kept_paths import KeptPaths, Scattering
-from reconstruction.array_backend import for_kernels
+from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 SCALARS = ("beta_m", "beta_n", "eta")
@@ -144,12 +144,11 @@ class LinearisedPictures:
             changes[name] = dr.forward_to(moved)
         dr.eval(value, changes)
         hair = self._paths.hair[at][:, None]
-        values = np.where(hair, np.array(value).T, which.value)
+        values = np.where(hair, rows_of(value), which.value)
         bright = hair & (values > _DARK)
         whole = np.where(bright, values, 1)
         return values, {
-            name: np.where(bright, np.array(change).T / whole, 0)
-            for name, change in changes.items()
+            name: np.where(bright, rows_of(change) / whole, 0) for name, change in changes.items()
         }
 
 

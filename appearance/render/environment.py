@@ -21,7 +21,7 @@ from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, foll
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
-from reconstruction.array_backend import for_kernels
+from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import AnyFloats, Floats, Ints
 
 _GOLDEN = 0.6180339887498949
@@ -47,7 +47,7 @@ def render_environment(
     if background:
         row, column = np.divmod(np.arange(len(image)), camera.width)
         rays = camera_rays(camera, mi.Float(column + 0.5), mi.Float(row + 0.5))
-        image[:] = np.array(sky.radiance(rays.d)).T
+        image[:] = rows_of(sky.radiance(rays.d))
     index = covered_pixels(scene, camera)
     if len(index):
         film = dr.zeros(mi.Float, 3 * len(index))

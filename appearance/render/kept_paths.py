@@ -24,7 +24,7 @@ from appearance.render.paths import Surface, jittered, stream
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera, Light
-from reconstruction.array_backend import for_kernels
+from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.options import Count, options
 
@@ -193,14 +193,14 @@ class _Drawing:
             number[keep] = starts[-1] + np.arange(len(keep))
             if links is not None:
                 onward.append([x[keep] for x in links])
-            vertices.append([_rows(x)[keep] for x in met])
+            vertices.append([rows_of(x)[keep] for x in met])
             lit.append(self._lit(_Vertices(si, valid, frame, throughput, path, number), depth))
             starts.append(starts[-1] + len(keep))
             going: Any = dr.compress(alive)  # untyped
             if depth + 1 == self.sampling.max_depth or dr.width(going) == 0:
                 break
             at = np.array(going)
-            links = [number[at], *(_rows(x)[at] for x in step)]
+            links = [number[at], *(rows_of(x)[at] for x in step)]
             ray = dr.gather(mi.Ray3f, following, going)
             throughput = dr.gather(mi.Color3f, after, going)
             path = dr.gather(mi.UInt32, path, going)
@@ -300,12 +300,6 @@ class _Found:
             dr.scatter(self.ints, value, 2 * row + i, active)
         for i, value in enumerate(floats):
             dr.scatter(self.floats, value, 7 * row + i, active)
-
-
-def _rows(value: Any) -> Any:
-    """A Dr.Jit variable as an array whose rows are its lanes."""
-    array = np.array(value)
-    return array.T if array.ndim == 2 else array
 
 
 def _joined(parts: Sequence[Sequence[Any]]) -> list[Any]:

@@ -64,6 +64,8 @@ DISORDER = 1.6
 
 √2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
+SKIN_PIXELS = 200
+"""Pixels a camera that tell the skin's colour."""
 ROUGHNESS_PIXELS = 350
 """Pixels a camera, at most, whose highlights are matched."""
 
@@ -149,7 +151,7 @@ def _observed(
         bare = model.mask(name, "skin", training) & ~mask
         seen += int(mask.sum())
         wanted = chosen(mask, options.hair_pixels, rng)
-        beside = chosen(bare if has_head else bare & False, options.skin_pixels, rng)
+        beside = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
         both = observe(training, name, lights, np.concatenate([wanted, beside]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
         if len(wanted):

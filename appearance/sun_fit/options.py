@@ -10,7 +10,6 @@ class FitOptions:
     """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
 
     hair_pixels: Count = 1000
-    skin_pixels: Count = 200
     roughness_cameras: Count = 4
     roughness_spp: Count = 12
     colour_spp: Count = 16

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction import Camera
-from reconstruction.array_backend import for_kernels
+from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import Array, Bools, Floats
 
 
@@ -67,8 +67,9 @@ def visible_fibres(
     tangent = dr.select(hair, si.sh_frame.t, 0)  # Mitsuba's fibres run along y of their frame
     point = dr.select(hair, si.p / SCALE, 0)
     shape = (len(index), samples, 3)
+    dr.eval(point, tangent, hair)  # one tracing for the three
     return VisibleFibres(
-        np.array(point, dtype=np.float32).T.reshape(shape),
-        np.array(tangent, dtype=np.float32).T.reshape(shape),
+        rows_of(point).reshape(shape),
+        rows_of(tangent).reshape(shape),
         np.array(hair, dtype=bool).reshape(shape[:2]),
     )
