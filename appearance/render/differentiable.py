@@ -280,7 +280,7 @@ class _Walk:
 
     def _lights(self, si: Any, beta: Any, total: Any, rng: Any, active: Any) -> Any:
         """The light of all lights at a vertex."""
-        count, slots = self.bank.count, opaque_index(len(self.owner.index))
+        count, slots = opaque_index(self.bank.count), opaque_index(len(self.owner.index))
         resume: Any = dr.resume_grad  # untyped
 
         def more(light: Any, total: Any, rng: Any) -> Any:

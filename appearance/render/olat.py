@@ -209,13 +209,13 @@ class _Gather:
     parted: bool
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        total, active = self.bank.count, paths.active
+        total, active = opaque_index(self.bank.count), paths.active
         slot = paths.slot
         if self.parted:
-            slot = slot + dr.select(paths.depth == 0, 0, 3 * opaque_index(total) * self.slots)
+            slot = slot + dr.select(paths.depth == 0, 0, 3 * total * self.slots)
         count = dr.select(paths.depth == 0, *(opaque_index(n) for n in self.counts))
         stride = mi.Float(total) / mi.Float(count)
-        sampled = min(self.counts) < total
+        sampled = min(self.counts) < self.bank.count
         start = paths.rng.next_float32() * stride if sampled else mi.Float(0)
 
         def more(j: Any, rng: Any) -> Any:
