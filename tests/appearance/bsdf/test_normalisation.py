@@ -59,10 +59,10 @@ def test_shares_add_up_to_one_without_absorption_and_to_less_with_it(eta):
     assert (total[inside] <= 1 + 1e-9).all()
     assert total[inside & (sigma == 0)] == pytest.approx(1, abs=1e-6)
     for number, most in ((dr.llvm.ad.Float64, 1e-12), (dr.llvm.ad.Float, 1e-6)):
-        f, through = lobes.fresnel(number(mu.ravel()), dr.opaque(number, eta))
-        _, length = lobes.refraction(
-            number(flat.ravel()), number(h.ravel()), number(np.cos(gamma).ravel()), dr.opaque(number, eta)
-        )
+        index, cos_gamma = dr.opaque(number, eta), number(np.cos(gamma).ravel())
+        f, through = lobes.fresnel(number(mu.ravel()), index)
+        across = (number(flat.ravel()), number(h.ravel()), cos_gamma)
+        _, length = lobes.refraction(*across, index)
         shares = lobes.attenuations(f, through, number(sigma.ravel()) * length)
         assert all((np.array(a) >= 0).all() for a in shares)
         ours = np.array(sum(shares)).reshape(sigma.shape)
