@@ -35,7 +35,9 @@ from reconstruction.images.silhouettes import NoSilhouette, lit_image, lit_rgb, 
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Stage
 
-Source = Literal["user", "network", "geometry", "light and lines", "lines", "silhouette"]
+Source = Literal[
+    "user", "network", "geometry", "geometry alone", "light and lines", "lines", "silhouette"
+]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
 _PLACE = 3e-3  # metres: what is so near looks alike
@@ -49,8 +51,9 @@ MOST_DISAGREEMENT = 0.15
 class HairMask:
     """One camera's pixels `(H, W) bool`: `subject` is the union of `hair` and `skin`, no overlap.
 
-    `source` says who told hair from skin; `decided` is the share of the subject that it decided,
-    the rest follows its neighbours.
+    `source` says who told hair from skin: "geometry" has learned from it what hair looks like, with
+    "geometry alone" all of the head looks like one thing. `decided` is the share of the subject
+    that it decided, the rest follows its neighbours.
     """
 
     subject: Bools
@@ -122,6 +125,11 @@ def usable_masks(
     out = {name: mask for name, mask in mine.items() if mask.subject.any()}
     if blind := [c.name for c in capture.rig.cameras if c.name not in out]:
         stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
+    if any(mask.source == "geometry alone" for mask in out.values()):
+        stage.warn(
+            "hair and skin on the head look alike: all of it was taken for one of them: look at "
+            "masks/, and give hair masks where it shows both"
+        )
     if not any(mask.hair.any() for mask in out.values()):
         raise CaptureError(
             f"{capture.path}: no pixel of any camera is hair: check the lights, the cameras' poses "
@@ -259,6 +267,8 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
     if classes is None:
         return {}
     source: Source = "light and lines" if geometry.head is None else "geometry"
+    if not classes.weights.any():
+        source = "geometry alone"
     scores = [classes.scores(v.seen) + v.standing for v in views]
     places = [_positions(v.camera, v.subject, geometry) for v in views]
     common = _by_place(places, scores)

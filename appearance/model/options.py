@@ -11,6 +11,6 @@ class AssessOptions:
 
     cameras: Count = 2
     lights: Count = 5
-    spp: Count = 49
+    spp: Count = 24
     relit_size: Count = 640
-    relit_spp: Count = 32
+    relit_spp: Count = 12

@@ -134,16 +134,19 @@ def two_classes(looks: Array, hair: Bools) -> TwoClasses:
     share = float(matte.sum() / max((~hair).sum(), 1))
     if share <= 2 * _LIKE_HAIR:
         return TwoClasses(np.zeros(4), 5.0)
-    return split(looks, hair, matte) or TwoClasses(np.zeros(4), 1.0 if share < 0.5 else -1.0)
+    pure = 1 - _LIKE_HAIR / share  # at least: one in ten of the hair is among them
+    other = TwoClasses(np.zeros(4), 1.0 if share < 0.5 else -1.0)
+    return split(looks, hair, matte, pure) or other
 
 
-def split(looks: Array, hair: Bools, skin: Bools) -> TwoClasses | None:
+def split(looks: Array, hair: Bools, skin: Bools, pure: float = 1.0) -> TwoClasses | None:
     """Hair and skin among pixels with `looks (N, 4)`, learned from examples of both.
 
     Two Gaussians of one covariance, by expectation and maximisation: `hair (N,)` stays hair, `skin
-    (N,)` is where the other class starts. Of colour and albedo, or where these do not tell the
-    examples apart, of gloss, too, which is blurred and rises in hair's shadow. None where they
-    still do not: on its own side must be `_RIGHT` of each.
+    (N,)` is where the other class starts; a share `pure` of it, at least, is no hair. Of colour and
+    albedo, or where these do not tell the examples apart, of gloss, too, which is blurred and rises
+    in hair's shadow. None where they still do not: on its own side must be `_RIGHT` of the hair,
+    and as much of the pure share of the skin.
     """
     few = np.random.default_rng(0).permutation(len(looks))[:_MOST_PIXELS]
     x, hair, skin = looks[few], hair[few], skin[few]
@@ -155,7 +158,7 @@ def split(looks: Array, hair: Bools, skin: Bools) -> TwoClasses | None:
             weights[columns] = found[0]
             classes = TwoClasses(weights, found[1])
             odds = classes.scores(x.T)
-            if min((odds[examples] > 0).mean(), (odds[skin] < 0).mean()) > _RIGHT:
+            if (odds[examples] > 0).mean() > _RIGHT and (odds[skin] < 0).mean() > _RIGHT * pure:
                 return classes
     return None
 

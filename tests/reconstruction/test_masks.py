@@ -302,6 +302,16 @@ def test_hair_that_lies_flat_is_told_by_colour_and_without_it_by_gloss(colour: f
     assert (odds(skin.T) < 0).mean() > 0.95
 
 
+def test_flat_hair_that_is_partly_matte_does_not_blur_the_colours() -> None:
+    sure, flat, skin = (
+        looks_of(*a) for a in ((0.3, 0.5, 500, 0), (0.3, 0.5, 400, 1), (0.04, 0, 100, 2))
+    )
+    known = np.arange(1000) < 500
+    odds = two_classes(np.concatenate([sure, flat, skin]), known).scores
+    assert (odds(flat.T) > 0).mean() > 0.99
+    assert (odds(skin.T) < 0).mean() > 0.99
+
+
 def test_where_one_class_is_seen_it_is_not_split() -> None:
     known = np.arange(1000) < 500
     covered = looks_of(0.25, 0.0, 1000, 0)
