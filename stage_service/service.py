@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -75,7 +77,14 @@ class Service:
     name, recorded, and refused (`Leased`) while somebody else holds the lease.
     """
 
-    def __init__(self, rig_file: RigFile, root: Path, *, take_over: bool = False) -> None:
+    def __init__(
+        self,
+        rig_file: RigFile,
+        root: Path,
+        *,
+        take_over: bool = False,
+        gpu_workers: bool = False,
+    ) -> None:
         self.rig_file, self.root = rig_file, root
         self._captures = CaptureManager(
             rig_file, root, on_complete=self._completed, take_over=take_over
@@ -83,7 +92,7 @@ class Service:
         self._has_stage = False
         self._control = Control(self._captures.audit)
         self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
-        self._queue = JobQueue(root)
+        self._queue = JobQueue(root, gpu_workers=gpu_workers)
         self._follower = JobFollower(root, self._queue, self._captures.events)
         self._submitting = threading.Lock()
         self._closing = threading.Lock()
@@ -250,10 +259,14 @@ class Service:
                 raise
             return path.resolve()
 
-    def submit(self, request: JobRequest, by: Caller) -> Job:
-        """Enqueue a pipeline on a capture. Raises `UnknownCapture`, `NotFinished`, `BadInput`,
-        `ModelInUse`, `JobsUnavailable`."""
+    def submit(self, request: JobRequest, by: Caller, key: str | None = None) -> Job:
+        """Enqueue a pipeline on a capture; where that was done under this `key`, it is that job.
+        Raises `UnknownCapture`, `NotFinished`, `BadInput`, `ModelInUse`, `JobsUnavailable`."""
         job = new_job_id()
+        if key is not None:
+            job = f"job-{sha256(key.encode()).hexdigest()[:16]}"
+            with suppress(NoSuchJob):
+                return self._queue.get(job)
         work = partial(self._submit, job, request)
         what = f"{request.pipeline.name} on {request.capture}"
         return self._control.do(by, "job.submit", work, job, detail=what, steers=False)

@@ -6,7 +6,7 @@ import mimetypes
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Header, Query, Response, status
 from fastapi.responses import FileResponse
 
 from stage_service.api.frames import png_preview
@@ -110,10 +110,16 @@ def get_preview(
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
 async def submit_job(
-    body: JobRequest, service: OnService, lanes: OnLanes, by: Processes, response: Response
+    body: JobRequest,
+    service: OnService,
+    lanes: OnLanes,
+    by: Processes,
+    response: Response,
+    idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> Job:
-    """Enqueue a pipeline on a finished capture."""
-    job = await lanes.jobs(service.submit, body, by)
+    """Enqueue a pipeline on a finished capture. Sent again with the same `Idempotency-Key`, it is
+    the same job."""
+    job = await lanes.jobs(service.submit, body, by, idempotency_key)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job
 

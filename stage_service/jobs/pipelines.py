@@ -20,5 +20,8 @@ PIPELINES: dict[str, tuple[str, ...]] = {
 """Each step is a checkpoint: after a crash the job goes on at the step that was under way. What
 nobody waits for comes last: results and pictures are there before frames are compressed."""
 
-STEPS_VERSION = "3"
+RENDERING = frozenset({"fit", "inverse_rendering", "assess"})
+"""Steps that a GPU makes several times faster, where Dr.Jit has one."""
+
+STEPS_VERSION = "4"
 """Raise it when a pipeline's steps change: a job begun under other steps is not taken up again."""

@@ -8,22 +8,31 @@ import os
 import secrets
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, WorkflowStatus
+from dbos import (
+    DBOS,
+    DBOSClient,
+    DBOSPortableJSONSerializer,
+    EnqueueOptions,
+    WorkflowStatus,
+)
 
 from reconstruction import Model
 from reconstruction.reading import printable
+from stage_service.jobs.pipelines import PIPELINES, RENDERING
 from stage_service.jobs.progress import read_progress
 from stage_service.jobs.records import Job, JobError, JobOutcome, JobState, PipelineRequest
+from stage_service.jobs.slots import Namespace
 
 log = logging.getLogger("hairstage.jobs")
-APP = "hairstage"
-QUEUE = "jobs"
 WORKFLOW = "hairstage_job"
 SQLITE = "jobs.sqlite"
 
@@ -40,6 +49,10 @@ _STATES: dict[str, tuple[JobState, JobOutcome | None]] = {
 
 CONNECT_S = 5
 """A PostgreSQL server that has not taken the connection by then counts as down."""
+SILENT_S = 20
+"""One that has not acknowledged what was sent by then, too."""
+STATEMENT_S = 8
+"""The service waits no longer for an answer; a worker has the time."""
 
 
 class NoSuchJob(LookupError):
@@ -50,14 +63,36 @@ class JobsUnavailable(RuntimeError):
     """The job database does not answer, or not usefully."""
 
 
-def database_url(root: Path) -> str:
-    """Where the queue lives: `HAIRSTAGE_DATABASE_URL` (PostgreSQL), else SQLite in `root`."""
+def database_url(root: Path, statement_s: float | None = None) -> str:
+    """Where the queue lives: `HAIRSTAGE_DATABASE_URL` (PostgreSQL), else SQLite in `root`.
+
+    Of a PostgreSQL server each statement has `statement_s` seconds. What the URL says itself holds.
+    """
     url = os.environ.get("HAIRSTAGE_DATABASE_URL")
     if not url:
         return f"sqlite:///{root.resolve()}/{SQLITE}"
-    if url.startswith("postgres") and "connect_timeout=" not in url:
-        url += f"{'&' if '?' in url else '?'}connect_timeout={CONNECT_S}"
+    if not url.startswith("postgres"):
+        return url
+    limits = {
+        "connect_timeout": f"{CONNECT_S}",
+        "tcp_user_timeout": f"{SILENT_S * 1000}",
+        "keepalives_idle": f"{SILENT_S}",
+    }
+    if statement_s is not None:
+        limits["options"] = f"-c statement_timeout={statement_s * 1000:.0f}"
+    for name, value in limits.items():
+        if f"{name}=" not in url:
+            url += f"{'&' if '?' in url else '?'}{name}={quote(value)}"
     return url
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """How many jobs wait, how many run, and how long the first of those that wait has."""
+
+    queued: int
+    running: int
+    oldest_s: float
 
 
 def new_job_id() -> str:
@@ -73,12 +108,21 @@ class JobQueue:
     that is broken is renamed; a new one takes its place, and `set_aside` says so.
     """
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, root: Path, *, gpu_workers: bool = False) -> None:
+        self._root, self._gpu_workers = root, gpu_workers
         self._lock = threading.Lock()
         self._client: DBOSClient | None = None
+        self._names: Namespace | None = None
         self.problem: str | None = None
         self.set_aside: str | None = None
+
+    @property
+    def names(self) -> Namespace:
+        """What this root's jobs are called in a database that other roots may share."""
+        if self._names is None:
+            self._root.mkdir(parents=True, exist_ok=True)
+            self._names = Namespace(self._root)
+        return self._names
 
     def connect(self) -> None:
         """Open the database, now. Raises `JobsUnavailable`."""
@@ -97,58 +141,95 @@ class JobQueue:
         """Put a job on the queue; where there is a job of this id already, return that one."""
         spec = {
             "pipeline": request.name,
-            "capture": str(capture.resolve()),
-            "model": str(model.path.resolve()),
+            "capture": self._told(capture),
+            "model": self._told(model.path),
             "options": request.options.to_dict(),
+            "retries": request.retries,
         }
+        renders = not RENDERING.isdisjoint(PIPELINES[request.name])
+        options: EnqueueOptions = {
+            "workflow_name": WORKFLOW,
+            "queue_name": self.names.queue(renders and self._gpu_workers),
+            "workflow_id": self.names.workflow(job),
+            "priority": request.priority + 1,
+        }
+        if request.timeout_s is not None:
+            options["workflow_timeout"] = request.timeout_s
         with self._database() as client:
-            client.enqueue(
-                {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job}, spec
-            )
+            client.enqueue(options, spec)
         return self.get(job)
 
     def get(self, job: str) -> Job:
         """The job's present state. Raises `NoSuchJob`."""
         with self._database() as client:
-            found = client.list_workflows(workflow_ids=[job])
+            found = client.list_workflows(workflow_ids=[self.names.workflow(job)])
         if not found:
             raise NoSuchJob(f"there is no job {job!r}")
-        return _job(found[0])
+        return self._job(found[0])
 
     def all(self, *, limit: int = 200, offset: int = 0) -> list[Job]:
         """The latest `limit` jobs after the `offset` newest, newest first."""
         with self._database() as client:
             found = client.list_workflows(name=WORKFLOW, sort_desc=True, limit=limit, offset=offset)
-        return [_job(w) for w in found]
+        return [self._job(w) for w in found]
 
     def ids(self) -> set[str]:
         """Of every job that there is."""
         with self._database() as client:
             found = client.list_workflows(name=WORKFLOW, load_input=False, load_output=False)
-        return {w.workflow_id for w in found}
+        return {self.names.job(w.workflow_id) for w in found}
+
+    def waiting(self) -> Waiting:
+        """How many jobs wait and run, and for how long the first of them has."""
+        going = ["PENDING", "ENQUEUED", "DELAYED"]
+        with self._database() as client:
+            found = client.list_workflows(
+                name=WORKFLOW, status=going, load_input=False, load_output=False
+            )
+        queued = [w.created_at or 0 for w in found if w.status != "PENDING"]
+        oldest = time.time() - min(queued) / 1000 if queued else 0.0
+        return Waiting(len(queued), len(found) - len(queued), max(0.0, oldest))
+
+    def executors(self) -> set[str]:
+        """The names of the workers that have jobs under way, the dead ones' too."""
+        with self._database() as client:
+            found = client.list_workflows(
+                name=WORKFLOW, status="PENDING", load_input=False, load_output=False
+            )
+        return {w.executor_id for w in found if w.executor_id is not None}
 
     def at_work_on(self, model: Model) -> str | None:
         """The id of a job, queued or running, that makes this model."""
-        path = str(model.path.resolve())
+        path = self._told(model.path)
         with self._database() as client:
             for state in ("PENDING", "ENQUEUED", "DELAYED"):
                 for found in client.list_workflows(name=WORKFLOW, status=state):
                     if found.input is not None and found.input["args"][0]["model"] == path:
-                        return found.workflow_id
+                        return self.names.job(found.workflow_id)
         return None
 
     def cancel(self, job: str) -> Job:
         """Cancel a job; a step that runs stops at its next progress call. A done job stays done."""
         if self.get(job).state != "done":
             with self._database() as client:
-                client.cancel_workflow(job)
+                client.cancel_workflow(self.names.workflow(job))
         return self.get(job)
 
     def cancelled(self, job: str) -> bool:
         """Whether the job was cancelled: what a running step asks."""
+        ids = [self.names.workflow(job)]
         with self._database() as client:
-            found = client.list_workflows(workflow_ids=[job], load_input=False, load_output=False)
+            found = client.list_workflows(workflow_ids=ids, load_input=False, load_output=False)
         return bool(found) and found[0].status == "CANCELLED"
+
+    def path(self, told: str) -> Path:
+        """Where a capture or model of a job lies on this machine."""
+        return self._root.resolve() / told
+
+    def _told(self, path: Path) -> str:
+        """A path as jobs keep it: inside the root, relative to it, wherever that is mounted."""
+        path, root = path.resolve(), self._root.resolve()
+        return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
     @contextmanager
     def _database(self) -> Iterator[DBOSClient]:
@@ -166,22 +247,57 @@ class JobQueue:
         self.problem = None
 
     def _open(self) -> DBOSClient:
-        self._root.mkdir(parents=True, exist_ok=True)
+        names = self.names
         logging.getLogger("dbos").setLevel(logging.WARNING)
-        url = database_url(self._root)
+        url = database_url(self._root, STATEMENT_S)
         if url.startswith("sqlite:///"):
+            file = Path(url.removeprefix("sqlite:///"))
             # Service and worker may find the same broken file at the same time.
-            with (self._root / "jobs.lock").open("a") as lock:
+            with file.with_suffix(".lock").open("a") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-                self.set_aside = _set_aside_if_broken(Path(url.removeprefix("sqlite:///")))
+                self.set_aside = _set_aside_if_broken(file)
                 DBOS.migrate(url)
         else:
-            DBOS.migrate(url)
+            DBOS.migrate(database_url(self._root))
         return DBOSClient(
             system_database_url=url,
             serializer=DBOSPortableJSONSerializer(),
-            application_name=APP,
+            application_name=names.application,
             retry_connection_errors=False,
+        )
+
+    def _job(self, status: WorkflowStatus) -> Job:
+        assert status.input is not None
+        spec: dict[str, Any] = status.input["args"][0]
+        state, outcome = _STATES[status.status]
+        error, job = None, self.names.job(status.workflow_id)
+        # In milliseconds, of which SQLite's clock tells whole seconds.
+        deadline, end = status.workflow_deadline_epoch_ms, status.completed_at
+        if status.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
+            error = JobError(
+                type="WorkerDied", detail="the worker died on this job again and again"
+            )
+        elif status.status == "CANCELLED" and deadline and end and end > deadline - 1000:
+            limit = (status.workflow_timeout_ms or 0) / 1000
+            outcome, detail = "failed", f"it took longer than its timeout_s of {limit:g} s"
+            error = JobError(type="JobTimeout", detail=detail)
+        elif status.error is not None:
+            name = getattr(status.error, "name", type(status.error).__name__)
+            error = JobError(type=name, detail=printable(str(status.error)))
+        model = self.path(spec["model"])
+        return Job(
+            id=job,
+            pipeline=spec["pipeline"],
+            state=state,
+            outcome=outcome,
+            capture=str(self.path(spec["capture"])),
+            model=str(model),
+            options=spec["options"],
+            progress=read_progress(Model(model), job),
+            error=error,
+            created=_time(status.created_at) or "",
+            started=_time(status.dequeued_at),
+            finished=_time(status.completed_at),
         )
 
 
@@ -218,32 +334,6 @@ def _broken(file: Path) -> str | None:
     if found != "ok":
         return str(found)
     return None if not tables or "dbos_migrations" in tables else "it is another program's"
-
-
-def _job(status: WorkflowStatus) -> Job:
-    assert status.input is not None
-    spec: dict[str, Any] = status.input["args"][0]
-    state, outcome = _STATES[status.status]
-    error = None
-    if status.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
-        error = JobError(type="WorkerDied", detail="the worker died on this job again and again")
-    elif status.error is not None:
-        name = getattr(status.error, "name", type(status.error).__name__)
-        error = JobError(type=name, detail=printable(str(status.error)))
-    return Job(
-        id=status.workflow_id,
-        pipeline=spec["pipeline"],
-        state=state,
-        outcome=outcome,
-        capture=spec["capture"],
-        model=spec["model"],
-        options=spec["options"],
-        progress=read_progress(Model(spec["model"]), status.workflow_id),
-        error=error,
-        created=_time(status.created_at) or "",
-        started=_time(status.dequeued_at),
-        finished=_time(status.completed_at),
-    )
 
 
 def _time(milliseconds: int | None) -> str | None:

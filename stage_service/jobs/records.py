@@ -58,14 +58,22 @@ class JobOptions(Strict):
 
 
 class PipelineRequest(Strict):
-    """Which pipeline to run, and with which options."""
+    """Which pipeline to run, and with which options.
+
+    Of the jobs that wait, the one of the lowest `priority` goes first. A step that fails is tried
+    again `retries` times; a job that has run for `timeout_s` seconds, waiting not counted, fails.
+    """
 
     name: str
     options: JobOptions = JobOptions()
+    priority: int = Field(default=5, ge=0, le=9)
+    retries: int = Field(default=0, ge=0, le=5)
+    timeout_s: float | None = Field(default=None, ge=0.1, le=30 * 86400.0)
 
     def to_dict(self) -> dict[str, Any]:
         """The request as JSON that makes it again."""
-        return {"name": self.name, "options": self.options.to_dict()}
+        rest = self.model_dump(mode="json", exclude_defaults=True, exclude={"options"})
+        return {"name": self.name, "options": self.options.to_dict(), **rest}
 
     @field_validator("name")
     @classmethod

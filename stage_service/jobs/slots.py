@@ -1,47 +1,140 @@
-"""Names for the workers of one root folder, held for as long as their process lives."""
+"""Names: of a root folder in a job database that others may share, and of its workers."""
 
 from __future__ import annotations
 
 import fcntl
+import os
+import re
+import secrets
+import socket
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from reconstruction.files.durable import write_whole
+from reconstruction.reading import printable
+
+HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:60] or "host"
+BEAT_S = 1.0
+"""How often a worker says that it is there."""
+SILENT_S = 30.0
+"""A worker of another machine that has said nothing for so long counts as gone."""
+
+
+class Namespace:
+    """What belongs to one root folder, named so that no other root means the same by it.
+
+    The root's own name lies in it (`jobs.id`), and so is the same on every machine that mounts it.
+    """
+
+    def __init__(self, root: Path) -> None:
+        file = root / "jobs.id"
+        with (root / "jobs.lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not file.exists():
+                write_whole(file, f"{secrets.token_hex(6)}\n".encode())
+        self._id = printable(file.read_text(errors="replace").strip())
+        if re.fullmatch("[0-9a-f]{12}", self._id) is None:
+            raise ValueError(f"{file}: expected 12 hexadecimal digits, got {self._id[:40]!r}")
+        self.application = f"hairstage-{self._id}"
+
+    def version(self, steps: str) -> str:
+        """What the database calls a version of the pipelines' steps."""
+        return f"{self.application}-{steps}"
+
+    def queue(self, gpu: bool) -> str:
+        """The queue of the workers with, or without, a GPU of their own."""
+        return f"{self.application}-{'gpu' if gpu else 'jobs'}"
+
+    def workflow(self, job: str) -> str:
+        """A job's id as the database has it."""
+        return f"{self._id}:{job}"
+
+    def job(self, workflow: str) -> str:
+        """The job's own id."""
+        return workflow.removeprefix(f"{self._id}:")
+
+    def executor(self, worker: WorkerSlot) -> str:
+        """A worker's name as the database has it; no other process has the same."""
+        return f"{self._id}/{worker.host}/{worker.name}"
+
 
 class WorkerSlot:
-    """A worker's name among the workers of one root: the first whose lock file is free.
+    """A worker's name among those of one root on one machine: the first whose lock file is free.
 
     The kernel frees the lock when the process dies, however it dies. The next worker then gets the
     dead one's name, and with it the jobs that it left.
     """
 
+    host = HOST
+
     def __init__(self, root: Path) -> None:
         number = 0
-        while True:
-            file = (root / f"worker-{number}.lock").open("a")
-            if _lock(file):
-                break
-            file.close()
+        while (file := _hold(_file(root, HOST, f"worker-{number}"))) is None:
             number += 1
         self._file = file
         self.name = f"worker-{number}"
+        self.beat()
+
+    def beat(self) -> None:
+        """Say that it is there."""
+        os.utime(self._file.fileno())
 
     def release(self) -> None:
         """Give the name up before the process ends."""
         self._file.close()
 
 
+@dataclass(frozen=True)
+class WorkerSeen:
+    """A worker of this root: `age_s` since it last said that it is there."""
+
+    host: str
+    name: str
+    alive: bool
+    age_s: float
+
+
+def workers_seen(root: Path) -> list[WorkerSeen]:
+    """Every worker that this root has had, on whatever machine."""
+    found = []
+    for path in sorted(root.glob("worker-*.lock")):
+        name, _, host = path.stem.partition("@")
+        age = max(0.0, time.time() - path.stat().st_mtime)
+        if host == HOST:
+            # Shared, so that several may look at once.
+            file = _hold(path, fcntl.LOCK_SH)
+            alive = file is None
+            if file is not None:
+                file.close()
+        else:
+            alive = age < SILENT_S
+        found.append(WorkerSeen(host, name, alive, age))
+    return found
+
+
 def worker_is_alive(root: Path) -> bool:
     """Whether any worker of this root runs."""
-    for path in root.glob("worker-*.lock"):
-        with path.open("a") as file:
-            if not _lock(file):
-                return True
-    return False
+    return any(worker.alive for worker in workers_seen(root))
 
 
-def _lock(file: IO[str]) -> bool:
+def hold_dead(root: Path, executor: str) -> IO[str] | None:
+    """The lock of a dead worker of this machine, by its name in the database; None where it lives
+    or is of another machine. Nobody gets its name until the file is closed."""
+    _, host, name = executor.split("/") if executor.count("/") == 2 else ("", "", "")
+    return _hold(_file(root, host, name)) if host == HOST else None
+
+
+def _file(root: Path, host: str, name: str) -> Path:
+    return root / f"{name}@{host}.lock"
+
+
+def _hold(path: Path, how: int = fcntl.LOCK_EX) -> IO[str] | None:
+    file = path.open("a")
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, how | fcntl.LOCK_NB)
     except BlockingIOError:
-        return False
-    return True
+        file.close()
+        return None
+    return file

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,9 @@ from dbos import error as dbos_error
 from reconstruction import Model, parse_options
 from stage_service.jobs.pipelines import PIPELINES, STEPS_VERSION
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, WorkerStopping
-from stage_service.jobs.queue import (
-    APP,
-    QUEUE,
-    WORKFLOW,
-    JobQueue,
-    JobsUnavailable,
-    database_url,
-)
+from stage_service.jobs.queue import WORKFLOW, JobQueue, JobsUnavailable, database_url
 from stage_service.jobs.records import JobOptions
-from stage_service.jobs.slots import WorkerSlot
+from stage_service.jobs.slots import BEAT_S, WorkerSlot, hold_dead
 from stage_service.jobs.steps import STEPS, StepContext
 from stage_service.signals import taken
 
@@ -41,6 +35,10 @@ CANCEL_S = 10.0
 """A cancelled step that has not stopped by then, deep in native code, ends with its process."""
 MOST_ATTEMPTS = 20
 """A job whose worker died, or was stopped, this often is given up."""
+LOOK_S = 5.0
+"""How often a worker looks whether another has died on a job."""
+RETRY_S = 5.0
+"""How long a step that failed waits before it is tried again."""
 
 
 class Worker:
@@ -49,6 +47,8 @@ class Worker:
     def __init__(self, root: Path, concurrency: int) -> None:
         self.queue = JobQueue(root)
         self.queue.connect()
+        self.slot = WorkerSlot(root)
+        self._root = root
         self._stopping = threading.Event()
         # A cancelled job leaves DBOS's count at once, but its thread only at its next progress
         # call: this keeps the next job from running beside it.
@@ -68,22 +68,21 @@ class Worker:
         return {step: result["seconds"] for step, result in done.items()}
 
     def _run_step(self, spec: dict[str, Any], step: str, previous: dict[str, Any]) -> Any:
-        job = DBOS.workflow_id
-        assert job is not None
-        model = Model(spec["model"]).create()
+        assert DBOS.workflow_id is not None
+        job = self.queue.names.job(DBOS.workflow_id)
+        model = Model(self.queue.path(spec["model"])).create()
         progress = StepProgress(
             model, job, step, PIPELINES[spec["pipeline"]], lambda: self._interrupted(job)
         )
         options = parse_options(JobOptions, spec["options"])
-        context = StepContext(Path(spec["capture"]), model, options, progress, previous)
+        capture = self.queue.path(spec["capture"])
+        context = StepContext(capture, model, options, progress, previous)
         with self._slots:
             log.info("%s: %s begins", job, step)
             start = time.perf_counter()
             self._under_way.add(job)
             try:
-                progress(step, 0.0)
-                figures = STEPS[step](context)
-                progress(step, 1.0)
+                figures = self._tried(context, step, job, spec["retries"])
             except JobCancelled as cancelled:
                 log.info("%s: %s stopped, the job was cancelled", job, step)
                 raise dbos_error.DBOSWorkflowCancelledError(
@@ -97,6 +96,49 @@ class Worker:
             seconds = time.perf_counter() - start
         log.info("%s: %s took %.1f s", job, step, seconds)
         return {"seconds": seconds, "figures": figures}
+
+    def _tried(self, context: StepContext, step: str, job: str, retries: int) -> Any:
+        """What the step returns, of the first of `1 + retries` tries that does not fail."""
+        while True:
+            try:
+                context.progress(step, 0.0)
+                figures = STEPS[step](context)
+                context.progress(step, 1.0)
+                return figures
+            except Exception:
+                if retries == 0:
+                    raise
+                retries -= 1
+                log.exception("%s: %s failed, and is tried again", job, step)
+            until = time.monotonic() + RETRY_S
+            while time.monotonic() < until:
+                context.progress(f"{step} failed, and is tried again", 0.0)
+                time.sleep(RETRY_S / 20)
+
+    def look_after(self, take_over: str | None = None) -> None:
+        """Say that this worker is there, and take up the jobs of others of this root that are not:
+        those of this machine, and all of the machine `take_over`, which is known to be dead."""
+        looked = 0.0
+        while not self._stopping.wait(BEAT_S):
+            try:
+                self.slot.beat()
+                if time.monotonic() - looked > LOOK_S:
+                    looked = time.monotonic()
+                    self._take_up(take_over)
+            except (OSError, JobsUnavailable) as error:  # for a while
+                log.warning("%s", error)
+
+    def _take_up(self, take_over: str | None) -> None:
+        for executor in self.queue.executors() - {self.queue.names.executor(self.slot)}:
+            dead = hold_dead(self._root, executor)
+            if dead is None and executor.split("/")[1:2] != [take_over]:
+                continue
+            try:
+                log.warning("%s is dead: its jobs are taken up", executor)
+                DBOS._recover_pending_workflows([executor])
+            finally:
+                if dead is not None:
+                    dead.close()
 
     def watch(self) -> None:
         """Start the process anew, in its place, once a cancelled step has not stopped in time.
@@ -126,22 +168,29 @@ class Worker:
 
 
 def run_worker(
-    root: Path, *, concurrency: int = 1, ready: Callable[[str], None] = lambda _name: None
+    root: Path,
+    *,
+    concurrency: int = 1,
+    gpu: bool = False,
+    take_over: str | None = None,
+    ready: Callable[[str], None] = lambda _name: None,
 ) -> None:
-    """Serve the queue of `root` until SIGTERM or SIGINT; `ready` is told this worker's name.
+    """Serve a queue of `root` until SIGTERM or SIGINT; `ready` is told this worker's name.
 
-    Ends the process: a step under way is left to the next worker.
+    With `gpu` it is that of jobs which render, for a service that knows of such workers.
+    `take_over` is a machine of this root that is dead: what its workers left is taken up. Ends the
+    process: a step under way is left to the next worker.
     """
     worker = Worker(root, concurrency)
-    slot = WorkerSlot(root)
+    names = worker.queue.names
     logging.getLogger("dbos").addFilter(_not_told_twice)
     DBOS(
         config={
-            "name": APP,
+            "name": names.application,
             "system_database_url": database_url(root),
             "serializer": DBOSPortableJSONSerializer(),
-            "application_version": STEPS_VERSION,
-            "executor_id": slot.name,
+            "application_version": names.version(STEPS_VERSION),
+            "executor_id": names.executor(worker.slot),
             "log_level": "WARNING",
         }
     )
@@ -151,10 +200,13 @@ def run_worker(
         return worker.run_job(spec)
 
     stop = taken(signal.SIGTERM, signal.SIGINT)
+    queue = names.queue(gpu)
+    DBOS.listen_queues([queue])
     DBOS.launch()
-    threading.Thread(target=worker.watch, name="cancelled-steps", daemon=True).start()
-    DBOS.register_queue(QUEUE, worker_concurrency=concurrency, polling_interval_sec=0.2)
-    ready(slot.name)
+    for work in (worker.watch, partial(worker.look_after, take_over)):
+        threading.Thread(target=work, daemon=True).start()
+    DBOS.register_queue(queue, worker_concurrency=concurrency, polling_interval_sec=0.2)
+    ready(worker.slot.name)
     stop()
     worker.stop()
     DBOS.destroy()

@@ -48,10 +48,17 @@ def add(commands: Commands) -> None:
     serve.add_argument(
         "--no-auth", action="store_true", help="everybody on this machine may do everything"
     )
+    serve.add_argument(
+        "--gpu-workers", action="store_true", help="what renders waits for a 'worker --gpu'"
+    )
 
     worker = add_command(commands, "worker", run_worker)
     worker.add_argument("--root", type=Path, default=Path("runs/stage"), help="as the service's")
     worker.add_argument("--concurrency", type=int, default=1, help="jobs at the same time")
+    worker.add_argument(
+        "--gpu", action="store_true", help="the jobs that 'serve --gpu-workers' keeps for a GPU"
+    )
+    worker.add_argument("--take-over", metavar="HOST", help="that machine's workers are dead")
 
     simulate = add_command(commands, "simulate", run_simulate)
     add_subject(simulate)
@@ -88,7 +95,9 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     access = _access(args, output)
     rig_file = load_rig_file(args.rig, args.devices)
     try:
-        service = Service(rig_file, args.root, take_over=args.take_over)
+        service = Service(
+            rig_file, args.root, take_over=args.take_over, gpu_workers=args.gpu_workers
+        )
         service.take_stage()
     except StageInUse as error:
         raise CommandError(str(error), UNREACHABLE, "StageInUse") from error
@@ -120,8 +129,9 @@ def _access(args: argparse.Namespace, output: Output) -> Access:
 def run_worker(args: argparse.Namespace, output: Output) -> None:
     """Run a worker: takes jobs off the queue.
 
-    Run the jobs of one root folder. A worker that dies leaves its job to the next worker, which
-    goes on at the step that was under way.
+    Run the jobs of one root folder. A worker that dies leaves its job to the next, or another, of
+    this machine, which goes on at the step that was under way. Workers of several machines mount
+    the root and share a PostgreSQL database, $HAIRSTAGE_DATABASE_URL.
     """
     log_to_stderr()
     from stage_service.jobs.worker import run_worker as work
@@ -131,6 +141,8 @@ def run_worker(args: argparse.Namespace, output: Output) -> None:
     work(
         args.root,
         concurrency=args.concurrency,
+        gpu=args.gpu,
+        take_over=args.take_over,
         ready=lambda name: output.result(
             {"worker": name, "root": str(args.root)}, f"{name} works on the jobs of {args.root}"
         ),

@@ -12,11 +12,13 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from reconstruction import Model
 from stage_service.api import event_stream, gate
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.cli import main
 from stage_service.config import RigFile
+from stage_service.jobs.records import PipelineRequest
 from stage_service.records.tokens import SCOPES, TokenError, Tokens
 from stage_service.service import Service
 
@@ -209,3 +211,22 @@ def test_a_request_is_no_larger_than_it_need_be(ask, tokens):
     plan = {"lights": [*names[1:4000], "x1"]}
     told = refused(ask("POST /plans:validate", token, json=plan), "invalid-plan", 422)["problems"]
     assert (len(told), told[-1]) == (21, "lights: 3981 more such names")
+
+
+def test_a_job_submitted_twice_under_one_key_is_one_job(ask, tokens, service, monkeypatch):
+    submitted = []
+
+    def submit(job: str, _request: Any) -> Any:
+        submitted.append(job)
+        asked, model = PipelineRequest(name="fit"), Model(service.root / "models" / job)
+        return service._queue.submit(asked, service.root / "captures" / "x", model, job=job)
+
+    monkeypatch.setattr(service, "_submit", submit)
+    app = create_app(service)
+    body = {"capture": "x", "pipeline": {"name": "fit"}}
+    sent = [
+        send(app, "POST /jobs", {"Idempotency-Key": key}, json=body).json()["id"]
+        for key in ("a", "a", "b")
+    ]
+    assert sent[0] == sent[1] != sent[2]
+    assert submitted == [sent[0], sent[2]]

@@ -1,5 +1,6 @@
 """A worker whose steps are quick stand-ins: `python job_worker.py ROOT`. Run by test_jobs."""
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -40,10 +41,29 @@ def last(context: steps.StepContext) -> steps.Figures:
 
 
 def bad(context: steps.StepContext) -> steps.Figures:
+    """Fails, as often as the file `fails` says or always."""
+    fails = context.model.path / "fails"
+    left = int(fails.read_text()) if fails.exists() else 1
+    if left == 0:
+        return {}
+    if fails.exists():
+        fails.write_text(str(left - 1))
     raise ValueError("this capture has no frames")
+
+
+def light(context: steps.StepContext) -> steps.Figures:
+    """Says which process began and ended it, of which root."""
+    who = f"{os.getpid()} {sys.argv[1]}"
+    _log(context, f"begins {who}")
+    time.sleep(0.05)
+    _log(context, f"ends {who}")
+    return {}
 
 
 if __name__ == "__main__":
     worker.CANCEL_S = 1.0
-    steps.STEPS.update(reconstruct=first, evaluate=slow, results=last, fit=bad)
-    run_worker(Path(sys.argv[1]), ready=lambda name: print(name, flush=True))
+    worker.LOOK_S = worker.RETRY_S = 0.2
+    steps.STEPS.update(reconstruct=first, evaluate=slow, results=last, fit=bad, assess=last)
+    if "light" in sys.argv:
+        steps.STEPS.update(fit=light, assess=light)
+    run_worker(Path(sys.argv[1]), gpu="gpu" in sys.argv, ready=lambda name: print(name, flush=True))

@@ -72,7 +72,8 @@ def test_a_broken_database_is_set_aside_and_said(damage, sound, tmp_path):
 
 @pytest.mark.parametrize("sizes", ["whole", "empty"])
 def test_a_sound_or_empty_database_stays_where_it_is(sizes, sound, tmp_path):
-    shutil.copy(sound, tmp_path / "jobs.sqlite")
+    for name in ("jobs.sqlite", "jobs.id"):
+        shutil.copy(sound.with_name(name), tmp_path / name)
     if sizes == "empty":
         (tmp_path / "jobs.sqlite").write_bytes(b"")
     queue = JobQueue(tmp_path)
@@ -82,7 +83,8 @@ def test_a_sound_or_empty_database_stays_where_it_is(sizes, sound, tmp_path):
 
 
 def test_jobs_are_listed_page_by_page(sound, tmp_path):
-    shutil.copy(sound, tmp_path / "jobs.sqlite")
+    for name in ("jobs.sqlite", "jobs.id"):
+        shutil.copy(sound.with_name(name), tmp_path / name)
     queue = JobQueue(tmp_path)
     pages = [[j.id for j in queue.all(limit=2, offset=o)] for o in (0, 2, 4)]
     assert sorted(job for page in pages for job in page) == ["job-0", "job-1", "job-2"]
