@@ -13,7 +13,7 @@ import json
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import FileIO
 from pathlib import Path
@@ -29,6 +29,7 @@ from reconstruction.containment import inside
 from reconstruction.files.durable import (
     PART,
     RESERVE,
+    FileSystem,
     append_whole,
     flush,
     part,
@@ -48,6 +49,15 @@ class JournalInUse(CaptureError):
     """Somebody else is writing the capture."""
 
 
+@dataclass
+class _Stored:
+    """A frame's file that is not committed; `direct`: it went past the page cache."""
+
+    path: Path
+    temporary: Path
+    direct: bool = False
+
+
 class CaptureWriter:
     """Writes one capture folder; `write_frame` and `record_missing` may be called from any thread.
 
@@ -64,7 +74,9 @@ class CaptureWriter:
         self._known = {s.index: s for s in capture.steps}
         self._lock = threading.Lock()
         self._journal = journal
-        self._stored: set[Path] = set()
+        self._stored: dict[str, _Stored] = {}  # by the names that their records have
+        self._folders: set[str] = set()  # that are there
+        self._disk = FileSystem(capture.path)
         self._of_thread = threading.local()
 
     @classmethod
@@ -184,14 +196,19 @@ class CaptureWriter:
             attributes["fullScale"] = float(full_scale)
         if count_scale > 0:
             attributes["countScale"] = float(count_scale)
-        file = self.path / "frames" / f"{step.index:05d}" / f"{camera}.exr"
         whole = self._buffer(radiance.shape).fill(radiance, attributes)
         require_free(self.path, len(whole), self.reserve)
-        file.parent.mkdir(exist_ok=True)
-        write_pages(part(file), whole)
+        folder = f"frames/{step.index:05d}"
+        if folder not in self._folders:
+            (self.path / folder).mkdir(exist_ok=True)
+            self._folders.add(folder)
+        name = f"{folder}/{camera}.exr"
+        file = self.path / name
+        stored = _Stored(file, part(file))
+        stored.direct = write_pages(stored.temporary, whole)
         with self._lock:
-            self._stored.add(part(file))
-        name, checksum = str(file.relative_to(self.path)), hashlib.sha256(whole).hexdigest()
+            self._stored[name] = stored
+        checksum = hashlib.sha256(whole).hexdigest()
         return FrameRecord(step.index, camera, name, checksum, recorded=utc_now())
 
     def commit(self, records: Sequence[FrameRecord]) -> None:
@@ -199,16 +216,24 @@ class CaptureWriter:
 
         A disk flushes many files together as fast as one: commit what has gathered.
         """
-        files = [self.path / r.file for r in records if r.file is not None]
-        for file in files:
-            replace_durably(part(file), file)
-        folders = {file.parent for file in files}
-        for folder in folders | {folder.parent for folder in folders}:
-            flush(folder)
+        names = [r.file for r in records if r.file is not None]
+        files = [self._stored[name] for name in names]
+        if len(files) > 1 and self._disk.supported and all(f.direct for f in files):
+            self._disk.flush()
+            for file in files:
+                file.temporary.replace(file.path)
+            self._disk.flush()
+        else:
+            for file in files:
+                replace_durably(file.temporary, file.path)
+            folders = {file.path.parent for file in files}
+            for folder in folders | {folder.parent for folder in folders}:
+                flush(folder)
         with self._lock:
             append_lines(self._journal, records)
             self.records.update({(r.step, r.camera): r for r in records})
-            self._stored.difference_update(part(file) for file in files)
+            for name in names:
+                del self._stored[name]
 
     def _buffer(self, shape: tuple[int, ...]) -> UncompressedExr:
         """A file in memory of this thread's own, made once."""
@@ -264,9 +289,10 @@ class CaptureWriter:
         """Close the journal without a manifest: the folder stays an interrupted capture."""
         with self._lock:
             self._journal.close()
-            for file in self._stored:
-                file.unlink(missing_ok=True)
+            for file in self._stored.values():
+                file.temporary.unlink(missing_ok=True)
             self._stored.clear()
+            self._disk.close()
 
     def _has(self, step: Step, camera: Any) -> bool:
         record = self.records.get((step.index, camera.name))
@@ -301,7 +327,7 @@ def append_lines(journal: FileIO, records: Sequence[FrameRecord]) -> None:
     """Append records to an open journal and flush it to disk; all of them or none."""
     lines = []
     for record in records:
-        line = {k: v for k, v in asdict(record).items() if v is not None}
+        line = {k: v for k, v in vars(record).items() if v is not None}
         line.setdefault("file", None)
         lines.append(json.dumps(line, allow_nan=False) + "\n")
     append_whole(journal, "".join(lines).encode())

@@ -79,6 +79,7 @@ class UncompressedExr:
         lines["y"] = np.arange(height)
         lines["bytes"] = 12 * width
         self._pixels = lines["bgr"]
+        self._attributes: Attributes | None = None  # that the header has
         self._offsets = self._header_room + line.itemsize * np.arange(height, dtype="<u8")
 
     def fill(self, image: AnyFloats, attributes: Attributes) -> memoryview:
@@ -86,10 +87,12 @@ class UncompressedExr:
 
         Raises `ValueError` for attributes that do not fit the header.
         """
-        head = _header(self.shape[0], self.shape[1], attributes) + self._offsets.tobytes()
-        if len(head) > self._header_room:
-            raise ValueError(f"the attributes do not fit into {HEADER_ROOM} bytes: {attributes}")
-        self._memory[: self._header_room] = head.ljust(self._header_room, b"\0")
+        if attributes != self._attributes:
+            head = _header(self.shape[0], self.shape[1], attributes) + self._offsets.tobytes()
+            if len(head) > self._header_room:
+                raise ValueError(f"the attributes do not fit into {HEADER_ROOM}: {attributes}")
+            self._memory[: self._header_room] = head.ljust(self._header_room, b"\0")
+            self._attributes = dict(attributes)
         self._pixels[:] = image.transpose(0, 2, 1)[:, ::-1]
         return memoryview(self._memory)
 

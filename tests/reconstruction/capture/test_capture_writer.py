@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import subprocess
 import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +27,9 @@ from reconstruction import (
     Step,
     verify,
 )
+from reconstruction.capture import writer as capture_writer
 from reconstruction.capture.compression import compress
+from reconstruction.files import durable
 from reconstruction.files.durable import DiskFull
 
 RIG = Rig(
@@ -311,6 +315,53 @@ def test_stored_frames_count_only_once_they_are_committed(tmp_path):
     ]
     writer.close()
     assert len(list((tmp_path / "c").glob("frames/*/*"))) == 3
+
+
+@pytest.mark.parametrize("direct", [True, False], ids=["past the cache", "through the cache"])
+def test_what_is_journalled_was_flushed_before_however_many_frames_share_a_flush(
+    tmp_path, monkeypatch, direct
+):
+    """Two flushes of the whole disk for six files, or one a file where pages may be in a cache."""
+    writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
+    wrote: Any = durable.write_pages
+    told: list[str] = []
+    # As a file system says that has direct input and output, or has none.
+    monkeypatch.setattr(capture_writer, "write_pages", lambda p, d: (wrote(p, d), direct)[1])
+    records = [writer.store_frame(STEPS[i], c, image(STEPS[i], c)) for i, c in EVERY]
+    whole, each = durable.FileSystem.flush, os.fsync
+    rename, append = Path.replace, durable.append_whole
+
+    def fsync(handle: int) -> None:
+        told.append(Path(f"/proc/self/fd/{handle}").resolve().name)
+        each(handle)
+
+    def all_of_it(disk: durable.FileSystem) -> None:
+        told.append("disk")
+        whole(disk)
+
+    def renamed(old: Path, new: Path) -> Path:
+        told.append(new.name)
+        return rename(old, new)
+
+    def appended(file: Any, data: bytes) -> None:
+        told.append("line")
+        append(file, data)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(durable.FileSystem, "flush", all_of_it)
+    monkeypatch.setattr(Path, "replace", renamed)
+    monkeypatch.setattr(capture_writer, "append_whole", appended)
+    writer.commit(records)
+    names = [f"{camera}.exr" for _, camera in EVERY]
+    if direct:
+        assert told == ["disk", *names, "disk", "line", "journal.jsonl"]
+    else:
+        files = [x for name in names for x in (f".part-{name}", name)]
+        assert told[:12] == files
+        assert sorted(told[12:-2]) == ["00000", "00001", "00002", "frames"]
+        assert told[-2:] == ["line", "journal.jsonl"]
+    writer.finish("completed")
+    assert verify(tmp_path / "c") == []
 
 
 KILLED = """
