@@ -44,6 +44,8 @@ from stage_service.service_models import (
     QueueRequest,
     RenewRequest,
 )
+from stage_service.storage import Removed, Storage
+from stage_service.verification import Verification, Verifier
 
 T = TypeVar("T")
 
@@ -84,6 +86,7 @@ class Service:
         *,
         take_over: bool = False,
         gpu_workers: bool = False,
+        verify_days: float | None = None,
     ) -> None:
         self.rig_file, self.root = rig_file, root
         self._captures = CaptureManager(
@@ -94,6 +97,14 @@ class Service:
         self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
         self._queue = JobQueue(root, gpu_workers=gpu_workers)
         self._follower = JobFollower(root, self._queue, self._captures.events)
+        self.storage = Storage(root, self._captures, self._control, self._queue)
+        self._verifier = Verifier(
+            root / "verified.json",
+            self._captures.events,
+            lambda: self._captures.running is not None,
+            lambda: [c for c in self._captures.list() if c.outcome == "completed"],
+            verify_days,
+        )
         self._submitting = threading.Lock()
         self._closing = threading.Lock()
         self._closed = threading.Event()
@@ -118,6 +129,7 @@ class Service:
                 self._follower.owe(status, fresh=False)
         self._follower.start()
         self.queue.start(known)
+        self._verifier.start()
 
     def take_stage(self) -> None:
         """Have the stage for this service alone. Raises `StageInUse`."""
@@ -130,6 +142,7 @@ class Service:
             if self._closed.is_set():
                 return
             self.queue.close()
+            self._verifier.close()
             try:
                 self._captures.close()
             finally:
@@ -156,7 +169,12 @@ class Service:
     def _prepared(
         self, request: CaptureRequest | QueueRequest, armed_by: str | None = None
     ) -> Callable[..., str]:
-        """What starts the capture, its head and masks read. Raises `BadInput`."""
+        """What starts the capture, its head and masks read. Raises `BadInput`, `NotThere`."""
+        given, folder = request.head, request.masks
+        if request.upload is not None:
+            if given is not None or folder is not None:
+                raise BadInput("upload: give this, or head and masks; not both")
+            given, folder = self.storage.uploaded(request.upload)
         if request.pipeline is not None:
             _check_names(request.pipeline, self.rig_file.rig)
             if "reconstruct" not in PIPELINES[request.pipeline.name]:
@@ -164,17 +182,17 @@ class Service:
                     f"pipeline: {request.pipeline.name!r} works on strands that are there already; "
                     "a new capture has none"
                 )
-            if request.head is None:
+            if given is None:
                 raise BadInput(
                     f"pipeline: {request.pipeline.name!r} roots strands on a scalp: give the head"
                 )
         head = None
-        if request.head is not None:
+        if given is not None:
             try:
-                head = read_obj(request.head)
+                head = read_obj(given)
             except (OSError, ValueError) as error:
                 raise BadInput(f"head: {error}") from error
-        masks = self._masks(request.masks) if request.masks is not None else None
+        masks = self._masks(folder) if folder is not None else None
         asked = {"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {}
 
         def start(unless_dark_since: int | None = None, **more: str) -> str:
@@ -246,6 +264,28 @@ class Service:
             raise
         except (OSError, ValueError) as error:
             raise CaptureError(str(error)) from error
+
+    def done_capture(self, capture_id: str) -> Path:
+        """The folder of a capture that nobody shoots. Raises `UnknownCapture`, `NotFinished`."""
+        path = self.capture_path(capture_id)
+        if self._captures.running == capture_id:
+            raise NotFinished(f"capture {capture_id} is being shot")
+        return path
+
+    def remove_capture(self, capture_id: str, by: Caller, *, dry_run: bool) -> Removed:
+        """Put a capture into the trash. Raises as `Storage.remove_capture`."""
+        with self._submitting:
+            return self.storage.remove_capture(capture_id, self._follower.owes, by, dry_run=dry_run)
+
+    def verify(self, capture_id: str, by: Caller) -> Verification:
+        """Have every file of a capture read again. Raises as `done_capture`."""
+        work = partial(self._verifier.ask, capture_id, self.done_capture(capture_id))
+        return self._control.do(by, "capture.verify", work, capture_id, steers=False)
+
+    def verification(self, capture_id: str) -> Verification:
+        """What was found when a capture was last read again. Raises `UnknownCapture`."""
+        self.capture_path(capture_id)
+        return self._verifier.get(capture_id)
 
     def capture_path(self, capture_id: str) -> Path:
         """The capture's folder; one that was put there by hand or by `import` counts too."""
@@ -383,6 +423,8 @@ class Service:
         """How service, lamps and jobs are; asks no device and no database."""
         lamps = self._captures.safety()
         problems = [p for p in (self._queue.set_aside, self._queue.problem) if p is not None]
+        if damaged := self._verifier.damaged:
+            problems.append(f"damaged when they were last read again: {', '.join(damaged[:5])}")
         if lamps["latched"] is not None:
             problems.insert(0, lamps["detail"])
         return Health(

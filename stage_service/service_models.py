@@ -14,7 +14,8 @@ from stage_service.config import Strict
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 
-FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
+FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$"
+FileName = Annotated[str, Field(pattern=FILE_NAME)]
 PersonName = Annotated[str, Field(min_length=1, max_length=100)]
 Place = Annotated[int, Field(ge=0, le=10**6)]
 LeaseSeconds = Annotated[float, Field(ge=1.0, le=86400.0)]
@@ -24,14 +25,16 @@ class _Wanted(Strict):
     plan: CapturePlan = CapturePlan()
     head: Path | None = None
     masks: Path | None = None
+    upload: FileName | None = None
     pipeline: PipelineRequest | None = None
 
 
 class CaptureRequest(_Wanted):
     """A capture to make, and the job that follows it by itself when it completes.
 
-    `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine.
-    `armed_by` says who at the stage answers for flashes that the plan has consent for.
+    `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine;
+    `upload` names a subject whose head and masks were uploaded instead. `armed_by` says who at the
+    stage answers for flashes that the plan has consent for.
     """
 
     model_config = with_example(

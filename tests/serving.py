@@ -12,6 +12,7 @@ import httpx
 import uvicorn
 
 from stage_service.api.app import create_app
+from stage_service.api.gate import Access
 from stage_service.config import RigFile
 from stage_service.service import Service
 
@@ -23,11 +24,11 @@ class Client(httpx.Client):
 
 
 @contextmanager
-def serving(rig_file: RigFile, root: Path) -> Iterator[Client]:
+def serving(rig_file: RigFile, root: Path, access: Access | None = None) -> Iterator[Client]:
     """The application, started and closed as the server does."""
     service = Service(rig_file, root)
     config = uvicorn.Config(
-        create_app(service), log_level="critical", ws="none", timeout_graceful_shutdown=1
+        create_app(service, access), log_level="critical", ws="none", timeout_graceful_shutdown=1
     )
     server = uvicorn.Server(config)
     listener = socket.create_server(("127.0.0.1", 0))

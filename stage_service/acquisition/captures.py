@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
@@ -33,6 +33,7 @@ from stage_service.records.events import EventLog
 from stage_service.records.lease import RootLock
 
 log = logging.getLogger("hairstage.captures")
+T = TypeVar("T")
 STOP_WITHIN_S = 30.0
 """A capture that is stopped at once is out of its last device call within this time."""
 TIDY_S = 1.0
@@ -261,6 +262,31 @@ class CaptureManager:
     def path(self, capture_id: str) -> Path:
         """The capture's folder. Raises `UnknownCapture`."""
         return Path(self.get(capture_id).path)
+
+    def check_idle(self, capture_id: str) -> None:
+        """Raise `WrongState` while it is shot, `UnknownCapture` where there is none."""
+        with self._lock:
+            going = self._preparing if self._running is None else self._running.id
+            if capture_id == going:
+                raise WrongState("remove", self.get(capture_id).state)
+            self.get(capture_id)
+
+    def set_aside(self, capture_id: str, move: Callable[[Path], T]) -> T:
+        """`move(folder)`, after which there is no such capture. Raises as `check_idle`."""
+        with self._lock:
+            self.check_idle(capture_id)
+            status = self._done.pop(capture_id)
+        try:
+            return move(Path(status.path))
+        except BaseException:
+            with self._lock:
+                self._done[capture_id] = status
+            raise
+
+    def adopt(self, capture_id: str) -> None:
+        """List a capture whose folder has come back."""
+        with self._lock:
+            self._done[capture_id] = read_status(self.folder / capture_id)
 
     def wait(self, capture_id: str, timeout: float) -> CaptureStatus:
         """Wait until it is done, at most `timeout` seconds; returns the status either way."""

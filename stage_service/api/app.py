@@ -16,8 +16,9 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
-from stage_service.api import event_stream, queueing, routes, steering
+from stage_service.api import event_stream, queueing, routes, steering, store
 from stage_service.api.connections import LOOPBACK, limits, listening
+from stage_service.api.downloads import Heads
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
@@ -52,9 +53,9 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     )
     app.state.service, app.state.lanes, app.state.streams = service, Lanes(), 0
     install_problems(app)
-    for part in (routes, steering, queueing, event_stream):
+    for part in (routes, steering, queueing, store, event_stream):
         app.include_router(part.reading)
-    for more in (routes, steering, queueing):
+    for more in (routes, steering, queueing, store):
         app.include_router(more.router)
 
     @app.get(PAGE, include_in_schema=False)
@@ -62,6 +63,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
         return PlainTextResponse(errors_page(), media_type="text/markdown")
 
     app.add_middleware(Faults)
+    app.add_middleware(Heads)
     app.add_middleware(Gate, access=access or Access())
     return app
 

@@ -6,6 +6,7 @@ All of it on the event loop, so that a blackout waits for no thread here.
 from __future__ import annotations
 
 import asyncio
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,8 @@ ANYBODY = Identity(name="", scopes=SCOPES)
 MOST_BODY = 1 << 20
 BODY_S = 20.0
 """A request's body is there within this time."""
+UPLOADS, MOST_UPLOAD, UPLOAD_S = "/uploads/", 32 << 20, 120.0
+"""Where a `PUT` may be larger, and take longer: two at a time, each of them in memory."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Gate:
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
+        self._uploads = asyncio.Semaphore(2)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
@@ -75,22 +79,11 @@ class Gate:
                 detail = "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown"
                 refusal = "unauthorized", detail, None
         if refusal is None:
-            try:
-                async with asyncio.timeout(BODY_S):
-                    body = await _body(headers, receive)
-            except TimeoutError:
-                refusal = "http", f"the request was not there within {BODY_S:g} s", 408
-            except OverflowError:
-                refusal = "too-large", f"a request has at most {MOST_BODY:,} bytes", None
-            else:
-                wrong = _not_json(headers, body)
-                if wrong is None:
-                    await self._app(scope, _again(body, receive), send)
-                else:
-                    told = [{"loc": "", "msg": wrong}]
-                    answer = problem_response(scope["path"], "invalid-request", wrong, errors=told)
-                    await answer(scope, receive, send)
-                return
+            upload = scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
+            async with self._uploads if upload else nullcontext():
+                refusal = await self._with_body(scope, receive, send, upload)
+        if refusal is None:
+            return
         slug, detail, status = refusal
         response = problem_response(scope["path"], slug, detail, status=status)
         response.headers["connection"] = "close"  # what it still sends is not read
@@ -98,11 +91,33 @@ class Gate:
             response.headers["www-authenticate"] = "Bearer"
         await response(scope, receive, send)
 
+    async def _with_body(
+        self, scope: Scope, receive: Receive, send: Send, upload: bool
+    ) -> tuple[str, str, int | None] | None:
+        """Read the body and pass the request on; returns why that was not done."""
+        headers = Headers(scope=scope)
+        most, within_s = (MOST_UPLOAD, UPLOAD_S) if upload else (MOST_BODY, BODY_S)
+        try:
+            async with asyncio.timeout(within_s):
+                body = await _body(headers, receive, most)
+        except TimeoutError:
+            return "http", f"the request was not there within {within_s:g} s", 408
+        except OverflowError:
+            return "too-large", f"a request has at most {most:,} bytes", None
+        wrong = None if upload else _not_json(headers, body)
+        if wrong is None:
+            await self._app(scope, _again(body, receive), send)
+        else:
+            told = [{"loc": "", "msg": wrong}]
+            answer = problem_response(scope["path"], "invalid-request", wrong, errors=told)
+            await answer(scope, receive, send)
+        return None
 
-async def _body(headers: Headers, receive: Receive) -> Message:
+
+async def _body(headers: Headers, receive: Receive, most: int) -> Message:
     """The whole body as one message. Raises `OverflowError`; a client that has gone is one, too."""
     length = headers.get("content-length", "")
-    if length.isdigit() and int(length) > MOST_BODY:
+    if length.isdigit() and int(length) > most:
         raise OverflowError
     body = bytearray()
     while True:
@@ -110,7 +125,7 @@ async def _body(headers: Headers, receive: Receive) -> Message:
         if message["type"] != "http.request":
             return message
         body += message.get("body", b"")
-        if len(body) > MOST_BODY:
+        if len(body) > most:
             raise OverflowError
         if not message.get("more_body", False):
             return {"type": "http.request", "body": bytes(body), "more_body": False}

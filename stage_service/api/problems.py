@@ -21,6 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from reconstruction import CaptureError, MissingFrame
 from reconstruction.capture.writer import JournalInUse
 from reconstruction.containment import NotContained
+from reconstruction.files.durable import DiskFull
 from reconstruction.reading import printable
 from stage_service.acquisition.capture_queue import QueueFull, UnknownEntry
 from stage_service.acquisition.captures import Busy, UnknownCapture
@@ -33,6 +34,7 @@ from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
 from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
+from stage_service.storage import BadUpload, InUse, NotThere
 
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"
@@ -81,6 +83,12 @@ unknown-entry 404 Nothing of that name waits
     `GET /queue` lists what waits, `GET /queue/history` what was started from it.
 queue-full 409 The queue has no room
     Remove what waits, or name lights by a rule and not one by one.
+in-use 409 A job still needs it
+    `detail` names the job. Wait until it is done, or cancel it.
+not-there 404 No such thing in the store
+    `GET /models`, `/uploads` and `/trash` list what there is.
+disk-full 507 The disk has no room
+    `detail` says how much is needed. `DELETE /trash` makes room.
 leased 409 Somebody else steers the stage
     `holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are open to
     everybody.
@@ -133,6 +141,10 @@ KINDS = {kind.slug: kind for kind in _kinds()}
 BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",
     BadInput: "bad-input",
+    BadUpload: "bad-input",
+    InUse: "in-use",
+    NotThere: "not-there",
+    DiskFull: "disk-full",
     UnknownEntry: "unknown-entry",
     QueueFull: "queue-full",
     NotContained: "bad-input",

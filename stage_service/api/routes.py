@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Response, status
 from fastapi.responses import FileResponse
 
+from stage_service.api.downloads import RANGES, bytes_response, file_response
 from stage_service.api.frames import png_preview
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
@@ -80,14 +81,14 @@ async def abort_capture(
 
 @reading.get(
     "/captures/{capture}/frames/{step}/{camera}.exr",
-    response_class=FileResponse,
-    responses={200: {"content": {"image/x-exr": {}}}},
+    response_class=Response,
+    responses={**RANGES, 200: {"content": {"image/x-exr": {}}}},
     tags=["captures"],
 )
 def get_frame(capture: str, step: int, camera: str, service: OnService) -> Response:
     """A frame as it was written: scene-linear radiance, W/(sr m²)."""
     data = service.frame(capture, step, camera, Path.read_bytes)
-    return Response(data, media_type="image/x-exr")
+    return bytes_response(data, "image/x-exr")
 
 
 @reading.get(
@@ -147,11 +148,11 @@ async def cancel_job(job: str, service: OnService, lanes: OnLanes, by: Processes
     return await lanes.jobs(service.cancel_job, job, by)
 
 
-@reading.get("/jobs/{job}/report", response_class=FileResponse, tags=["jobs"])
+@reading.get("/jobs/{job}/report", response_class=FileResponse, responses=RANGES, tags=["jobs"])
 async def get_report(job: str, service: OnService, lanes: OnLanes) -> Response:
     """The report that the job's stages filled: seconds, error against time, left out, warnings."""
     file = await lanes.jobs(service.artifact, job, "report.json")
-    return FileResponse(file, media_type="application/json")
+    return file_response(file, "application/json")
 
 
 @reading.get("/jobs/{job}/artifacts", tags=["jobs"])
@@ -160,12 +161,17 @@ async def list_artifacts(job: str, service: OnService, lanes: OnLanes) -> list[A
     return await lanes.jobs(service.artifacts, job)
 
 
-@reading.get("/jobs/{job}/artifacts/{path:path}", response_class=FileResponse, tags=["jobs"])
+@reading.get(
+    "/jobs/{job}/artifacts/{path:path}",
+    response_class=FileResponse,
+    responses=RANGES,
+    tags=["jobs"],
+)
 async def get_artifact(job: str, path: str, service: OnService, lanes: OnLanes) -> Response:
     """One file of the model folder."""
     file = await lanes.jobs(service.artifact, job, path)
     kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
-    return FileResponse(file, media_type=kind)
+    return file_response(file, kind)
 
 
 @reading.get("/health", tags=["service"])

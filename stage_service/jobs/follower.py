@@ -67,6 +67,10 @@ class JobFollower:
         self._owed[status.id] = _Wish(pipeline, Path(status.path), fresh)
         self._wake.set()
 
+    def owes(self, capture: str) -> bool:
+        """Whether the capture's job is still to be enqueued."""
+        return capture in self._owed
+
     def job_after(self, capture: str) -> str | None:
         """The id of the job that follows the capture, there already or about to be."""
         there = capture in self._certain or capture in self._owed

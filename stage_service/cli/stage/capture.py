@@ -53,6 +53,7 @@ def add_wanted(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plan", type=Path, help=PLAN)
     parser.add_argument("--head", type=Path, help="the digitised head (.obj)")
     parser.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
+    parser.add_argument("--upload", help="a subject whose head and masks were uploaded")
     add_pipeline(parser, None, "job to enqueue when the capture completes")
 
 
@@ -62,6 +63,8 @@ def wanted(args: argparse.Namespace) -> dict[str, Any]:
     for field in ("head", "masks"):
         if getattr(args, field) is not None:
             body[field] = str(getattr(args, field).resolve())
+    if args.upload is not None:
+        body["upload"] = args.upload
     if args.pipeline is not None:
         body["pipeline"] = {"name": args.pipeline, "options": read_json(args.options)}
     return body

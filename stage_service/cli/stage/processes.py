@@ -43,6 +43,9 @@ def add(commands: Commands) -> None:
     serve.add_argument("--tls-key", type=Path, help="its key, where that file lacks it")
     serve.add_argument("--name", action="append", default=[], help="a host name of this service")
     serve.add_argument(
+        "--verify-days", type=float, help="read each capture again so often, beside all else"
+    )
+    serve.add_argument(
         "--take-over", action="store_true", help="the service that has the stage is dead"
     )
     serve.add_argument(
@@ -96,7 +99,11 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     rig_file = load_rig_file(args.rig, args.devices)
     try:
         service = Service(
-            rig_file, args.root, take_over=args.take_over, gpu_workers=args.gpu_workers
+            rig_file,
+            args.root,
+            take_over=args.take_over,
+            gpu_workers=args.gpu_workers,
+            verify_days=args.verify_days,
         )
         service.take_stage()
     except StageInUse as error:

@@ -39,9 +39,9 @@ def add(commands: Commands) -> None:
 def run_make(args: argparse.Namespace, output: Output) -> None:
     """Make a token; prints it, this once.
 
-    read: see captures, frames, jobs, devices, audit. steer: start, pause and resume captures, hold
-    the lease. arm: answer for flashes and acknowledge dark lamps. jobs: submit and cancel. admin:
-    end somebody else's lease. Abort and blackout need none of them.
+    read: see captures, frames, jobs, devices, audit. steer: start, pause, resume and queue
+    captures, hold the lease. arm: answer for flashes and acknowledge dark lamps. jobs: submit and
+    cancel. admin: remove what completed, end somebody else's lease. Abort and blackout need none.
     """
     from stage_service.records.tokens import SCOPES
 

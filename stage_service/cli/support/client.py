@@ -9,16 +9,20 @@ import ssl
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, Self
 
 import httpx
 
 from reconstruction import Progress
+from reconstruction.files.durable import writing
 from stage_service.cli.support.commands import BAD_INPUT, FAILED, UNREACHABLE, CommandError
 from stage_service.records.tokens import own_file, own_token
 
 DEFAULT_URL = "http://127.0.0.1:8331"
 LEASE = "Hairstage-Lease"
+ATTEMPTS = 5
+"""How often a download is begun, or gone on with."""
 LEASE_S = 120.0
 """A command that dies blocks the stage for no longer."""
 
@@ -72,11 +76,36 @@ class ServiceClient:
             ) from error
         if response.is_success:
             return response.json()
-        problem = response.json()
-        code = BAD_INPUT if response.status_code in (404, 422) else FAILED
-        raise CommandError(
-            f"{problem['title']}: {problem['detail']}", code, "Problem", problem=problem
-        )
+        raise _problem(response)
+
+    def download(self, path: str, out: Path, progress: Progress) -> int:
+        """Write the bytes at `path` to the file `out`, whole or not at all; returns how many.
+
+        Goes on by ranges where the connection breaks. Raises `CommandError`.
+        """
+        etag = None
+        with writing(out) as temporary, temporary.open("wb") as file:
+            for _ in range(ATTEMPTS):
+                more: dict[str, str] = (
+                    {"Range": f"bytes={file.tell()}-", "If-Range": etag} if etag else {}
+                )
+                try:
+                    with self._http.stream("GET", path, headers=more) as answer:
+                        if not answer.is_success:
+                            answer.read()
+                            raise _problem(answer)
+                        if answer.status_code != 206:  # not what was begun, or nothing was
+                            file.seek(0)
+                            file.truncate()
+                        etag = answer.headers["etag"]
+                        size = file.tell() + int(answer.headers["content-length"])
+                        for data in answer.iter_bytes():
+                            file.write(data)
+                            progress(f"{file.tell():,} of {size:,} bytes", file.tell() / size)
+                        return file.tell()
+                except httpx.TransportError as error:
+                    broke = error
+            raise CommandError(f"{self.url}{path} broke off: {broke}", UNREACHABLE, "Unreachable")
 
     @contextmanager
     def leased(self) -> Iterator[Callable[[], None]]:
@@ -145,6 +174,14 @@ class ServiceClient:
                 return status
             check()
             time.sleep(0.3)
+
+
+def _problem(response: httpx.Response) -> CommandError:
+    problem = response.json()
+    code = BAD_INPUT if response.status_code in (404, 422) else FAILED
+    return CommandError(
+        f"{problem['title']}: {problem['detail']}", code, "Problem", problem=problem
+    )
 
 
 def _own() -> str | None:

@@ -1,0 +1,201 @@
+"""Large answers: by ranges, with an ETag; folders as tar files; HEAD.
+
+RFC 9110, 13 and 14: one range a request, `If-Range`, `If-None-Match`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tarfile
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+from anyio import CapacityLimiter, to_thread
+from fastapi.responses import Response
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from stage_service.api.problems import problem_response
+
+CHUNK = 1 << 20
+READERS = 8
+"""Downloads that read the disk at the same time."""
+Read = Callable[[int, int], bytes]
+"""The bytes from one place to (not with) another, or fewer of them."""
+RANGES: dict[int | str, dict[str, Any]] = {
+    206: {"description": "The range that was asked for"},
+    304: {"description": "Not modified: the ETag is that of If-None-Match"},
+    416: {"description": "The range is beyond the end"},
+}
+
+
+class Ranged(Response):
+    """`size` bytes, as `read` gives them, or the range that is asked for."""
+
+    def __init__(self, size: int, read: Read, etag: str, media_type: str, name: str = "") -> None:
+        super().__init__(media_type=media_type)
+        self._size, self._read = size, read
+        del self.headers["content-length"]
+        self.headers["etag"] = f'"{etag}"'
+        self.headers["accept-ranges"] = "bytes"
+        if name:
+            self.headers["content-disposition"] = f'attachment; filename="{name}"'
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer 200, 206, 304 or 416."""
+        asked, etag = Headers(scope=scope), self.headers["etag"]
+        known = [
+            tag.strip().removeprefix("W/") for tag in asked.get("if-none-match", "").split(",")
+        ]
+        first, last = 0, self._size
+        if etag in known or "*" in known:
+            self.status_code, last = 304, 0
+        elif (found := self._range(asked)) is not None:
+            first, last = found
+            if first >= min(last, self._size):
+                detail = f"there are {self._size} bytes"
+                answer = problem_response(scope["path"], "http", detail, status=416)
+                answer.headers["content-range"] = f"bytes */{self._size}"
+                await answer(scope, receive, send)
+                return
+            self.status_code, last = 206, min(last, self._size)
+            self.headers["content-range"] = f"bytes {first}-{last - 1}/{self._size}"
+        if self.status_code != 304:
+            self.headers["content-length"] = str(last - first)
+        headers = {"status": self.status_code, "headers": self.raw_headers}
+        await send({"type": "http.response.start", **headers})
+        while first < last:
+            stop = min(first + CHUNK, last)
+            data = await to_thread.run_sync(self._read, first, stop, limiter=_readers(scope))
+            if not data:
+                raise OSError(f"{scope['path']}: the file has become shorter")
+            first += len(data)
+            await send({"type": "http.response.body", "body": data, "more_body": True})
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+    def _range(self, asked: Headers) -> tuple[int, int] | None:
+        """From where to where; None: everything, also where a range is not understood."""
+        found = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", asked.get("range", "").strip())
+        if found is None or asked.get("if-range", self.headers["etag"]) != self.headers["etag"]:
+            return None
+        first, last = found.groups()
+        if not first:
+            return (max(0, self._size - int(last)), self._size) if last else None
+        if last and int(last) < int(first):
+            return None
+        return int(first), int(last) + 1 if last else self._size
+
+
+def file_response(file: Path, media_type: str) -> Ranged:
+    """A file. Raises `OSError` where it is not there."""
+    found = file.stat()
+    etag = f"{found.st_mtime_ns:x}-{found.st_size:x}-{found.st_ino:x}"
+    return Ranged(found.st_size, _reader(file), etag, media_type)
+
+
+def bytes_response(data: bytes, media_type: str) -> Ranged:
+    """Bytes that are at hand."""
+    etag = hashlib.sha256(data).hexdigest()
+    return Ranged(len(data), lambda first, last: data[first:last], etag, media_type)
+
+
+def tar_response(name: str, files: Mapping[str, Path]) -> Ranged:
+    """The files, by their names in it, as `name`.tar. Raises `OSError` for one that has gone."""
+    tar = _Tar(name, files)
+    return Ranged(tar.size, tar.read, tar.etag, "application/x-tar", f"{name}.tar")
+
+
+class _Tar:
+    """An uncompressed tar file that is nowhere: where each part begins is known beforehand."""
+
+    def __init__(self, name: str, files: Mapping[str, Path]) -> None:
+        digest = hashlib.sha256()
+        self._parts: list[tuple[int, Read]] = []
+        for relative, path in files.items():
+            found = path.stat()
+            entry = tarfile.TarInfo(f"{name}/{relative}")
+            entry.size, entry.mtime, entry.mode = found.st_size, int(found.st_mtime), 0o640
+            head = entry.tobuf(tarfile.GNU_FORMAT)
+            digest.update(head + str(found.st_mtime_ns).encode())
+            self._part(len(head), _fixed(head))
+            self._part(found.st_size, _reader(path))
+            self._part(-found.st_size % tarfile.BLOCKSIZE, _zeros)
+        self._part(2 * tarfile.BLOCKSIZE, _zeros)
+        self._ends = list(accumulate(size for size, _ in self._parts))
+        self.size, self.etag = self._ends[-1], digest.hexdigest()
+
+    def _part(self, size: int, read: Read) -> None:
+        self._parts.append((size, read))
+
+    def read(self, first: int, last: int) -> bytes:
+        """The bytes from `first` to (not with) `last`."""
+        return b"".join(self._pieces(first, last))
+
+    def _pieces(self, first: int, last: int) -> Iterator[bytes]:
+        part = bisect_right(self._ends, first)
+        while first < last:
+            size, read = self._parts[part]
+            begin = self._ends[part] - size
+            stop = min(last, self._ends[part])
+            data = read(first - begin, stop - begin)
+            if len(data) < stop - first:
+                raise OSError("a file has become shorter while it was sent")
+            yield data
+            first, part = stop, part + 1
+
+
+def _fixed(data: bytes) -> Read:
+    return lambda first, last: data[first:last]
+
+
+def _zeros(first: int, last: int) -> bytes:
+    return bytes(last - first)
+
+
+def _reader(file: Path) -> Read:
+    def read(first: int, last: int) -> bytes:
+        with file.open("rb") as opened:
+            opened.seek(first)
+            return opened.read(last - first)
+
+    return read
+
+
+def _readers(scope: Scope) -> CapacityLimiter:
+    state = scope["app"].state
+    if not hasattr(state, "readers"):
+        state.readers = CapacityLimiter(READERS)
+    limiter: CapacityLimiter = state.readers
+    return limiter
+
+
+class _HeadersSent(Exception):
+    """All that a HEAD asked for."""
+
+
+class Heads:
+    """Answers HEAD with the headers that GET would have."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, a HEAD as a GET that ends after its headers."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        async def without_body(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+            raise _HeadersSent
+
+        try:
+            await self._app({**scope, "method": "GET"}, receive, without_body)
+        except* _HeadersSent:
+            pass

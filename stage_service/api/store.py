@@ -1,0 +1,125 @@
+"""Routes of what lies under the root folder: downloads, uploads, removal, verification."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request, Response, status
+from starlette.concurrency import run_in_threadpool
+
+from reconstruction.containment import LONGEST_NAME
+from stage_service.api.downloads import RANGES, tar_response
+from stage_service.api.lanes import OnLanes
+from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
+from stage_service.service_models import FILE_NAME
+from stage_service.storage import KEPT_DAYS, Folder, Removed, files_of
+from stage_service.verification import Verification
+
+router = APIRouter(tags=["storage"])
+reading = APIRouter(dependencies=READS, tags=["storage"])
+DryRun = Annotated[bool, Query(description="only say what would be removed")]
+Subject = Annotated[str, Path(pattern=FILE_NAME, max_length=LONGEST_NAME)]
+TAR = {
+    **RANGES,
+    200: {"content": {"application/x-tar": {}}},
+    206: {"content": {"application/x-tar": {}}, **RANGES[206]},
+}
+OBJ = {"requestBody": {"required": True, "content": {"model/obj": {}}}}
+PNG = {"requestBody": {"required": True, "content": {"image/png": {}}}}
+
+
+@router.delete("/captures/{capture}")
+async def remove_capture(
+    capture: str, service: OnService, lanes: OnLanes, by: Steers, dry_run: DryRun = False
+) -> Removed:
+    """Put a capture into the trash; one that completed needs the scope admin."""
+    return await lanes.jobs(service.remove_capture, capture, by, dry_run=dry_run)
+
+
+@reading.get("/captures/{capture}/archive.tar", response_class=Response, responses=TAR)
+def get_capture_archive(capture: str, service: OnService) -> Response:
+    """All files of a capture that is done, as a tar file; goes on by ranges where it broke off."""
+    return tar_response(capture, files_of(service.done_capture(capture)))
+
+
+@router.post("/captures/{capture}/verify", status_code=status.HTTP_202_ACCEPTED)
+def verify_capture(capture: str, service: OnService, by: Processes) -> Verification:
+    """Read every file of a capture again, beside all else and not while the stage shoots."""
+    return service.verify(capture, by)
+
+
+@reading.get("/captures/{capture}/verification")
+def get_verification(capture: str, service: OnService) -> Verification:
+    """When a capture was last read again, and what was wrong with it."""
+    return service.verification(capture)
+
+
+@reading.get("/models")
+def list_models(service: OnService) -> list[Folder]:
+    """The models, by name."""
+    return service.storage.models()
+
+
+@router.delete("/models/{model}")
+async def remove_model(
+    model: str, service: OnService, lanes: OnLanes, by: Anybody, dry_run: DryRun = False
+) -> Removed:
+    """Put a model into the trash; needs the scope admin."""
+    return await lanes.jobs(service.storage.remove_model, model, by, dry_run=dry_run)
+
+
+@reading.get("/models/{model}/archive.tar", response_class=Response, responses=TAR)
+def get_model_archive(model: str, service: OnService) -> Response:
+    """All whole files of a model as a tar file."""
+    return tar_response(model, files_of(service.storage.model(model).path))
+
+
+@reading.get("/trash")
+def list_trash(service: OnService) -> list[Removed]:
+    """What was removed and can be had again, oldest first."""
+    return service.storage.trash()
+
+
+@router.post("/trash/{name}/restore")
+def restore(name: str, service: OnService, by: Anybody) -> Removed:
+    """Put it back where it was; needs the scope admin."""
+    return service.storage.restore(name, by)
+
+
+@router.delete("/trash")
+def empty_trash(
+    service: OnService,
+    by: Anybody,
+    older_than_days: Annotated[float, Query(ge=0, le=10_000)] = KEPT_DAYS,
+    dry_run: DryRun = False,
+) -> list[Removed]:
+    """Delete for good what was removed so many days ago; needs the scope admin."""
+    return service.storage.empty(older_than_days, by, dry_run=dry_run)
+
+
+@reading.get("/uploads")
+def list_uploads(service: OnService) -> list[Folder]:
+    """What was uploaded, by subject."""
+    return service.storage.uploads()
+
+
+@router.put("/uploads/{subject}/head.obj", openapi_extra=OBJ)
+async def upload_head(subject: Subject, request: Request, service: OnService, by: Steers) -> Folder:
+    """Keep a subject's digitised head, a Wavefront OBJ, for captures that name it as `upload`."""
+    data = await request.body()
+    return await run_in_threadpool(service.storage.upload_head, subject, data, by)
+
+
+@router.put("/uploads/{subject}/masks/{camera}.png", openapi_extra=PNG)
+async def upload_mask(
+    subject: Subject, camera: str, request: Request, service: OnService, by: Steers
+) -> Folder:
+    """Keep a subject's hair mask of a camera, as large as its frames."""
+    data, rig = await request.body(), service.rig_file.rig
+    return await run_in_threadpool(service.storage.upload_mask, subject, camera, data, rig, by)
+
+
+@router.delete("/uploads/{subject}")
+def remove_upload(subject: Subject, service: OnService, by: Steers) -> Folder:
+    """Delete what was uploaded of a subject; captures have copies of their own."""
+    return service.storage.remove_upload(subject, by)

@@ -1,0 +1,113 @@
+"""`hairstage store`: what lies under the root folder of a running service."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stage_service.cli.support.commands import (
+    BadArgument,
+    Commands,
+    Output,
+    add_group,
+    add_remote,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from stage_service.cli.support.client import ServiceClient
+
+KINDS = ("capture", "model")
+
+
+def add(commands: Commands) -> None:
+    """Add the commands."""
+    store = add_group(commands, "store", "captures and models on a running service's disk")
+    download = add_remote(store, "download", run_download)
+    remove = add_remote(store, "remove", run_remove)
+    for parser in (download, remove):
+        parser.add_argument("kind", choices=KINDS)
+        parser.add_argument("name", help="its id, or name")
+    download.add_argument("--out", type=Path, help="file; without it, NAME.tar")
+    add_remote(store, "trash", run_trash)
+    add_remote(store, "restore", run_restore).add_argument("name", help="as 'trash' lists it")
+    empty = add_remote(store, "empty", run_empty)
+    empty.add_argument("--older-than-days", type=float, default=30.0)
+    for parser in (remove, empty):
+        parser.add_argument("--dry-run", action="store_true", help="only say what would go")
+    verify = add_remote(store, "verify", run_verify)
+    verify.add_argument("capture", help="its id")
+    verify.add_argument("--show", action="store_true", help="ask for nothing, show what was found")
+    upload = add_remote(store, "upload", run_upload)
+    upload.add_argument("subject", help="a name; captures name it with --upload")
+    upload.add_argument("--head", type=Path, help="the digitised head (.obj)")
+    upload.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
+
+
+def run_download(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Fetch all files of a capture or a model as a tar file.
+
+    Goes on where it broke off, as long as nothing there has changed.
+    """
+    out = args.out or Path(f"{args.name}.tar")
+    with progress_bar("download") as progress:
+        size = service.download(f"/{args.kind}s/{args.name}/archive.tar", out, progress)
+    output.result({"file": str(out), "bytes": size}, f"{out}: {size:,} bytes")
+
+
+def run_remove(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Put a capture or a model into the trash."""
+    path = f"/{args.kind}s/{args.name}?dry_run={args.dry_run}"
+    found = service.ask("DELETE", path)
+    told = "would go into the trash" if args.dry_run else f"is in the trash as {found['name']}"
+    stay = f"; its models stay: {', '.join(found['models'])}" if found["models"] else ""
+    output.result(found, f"{args.kind} {args.name}, {found['bytes']:,} bytes, {told}{stay}")
+
+
+def run_trash(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """List what was removed and can be had again."""
+    _list(service.get("/trash"), output, "the trash is empty")
+
+
+def run_restore(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Put something back from the trash, as admin."""
+    found = service.post(f"/trash/{args.name}/restore")
+    output.result(found, f"{found['kind']} {found['id']} is back")
+
+
+def run_empty(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Delete for good what was removed long ago, as admin."""
+    query = f"older_than_days={args.older_than_days}&dry_run={args.dry_run}"
+    _list(service.ask("DELETE", f"/trash?{query}"), output, "nothing is that old")
+
+
+def run_verify(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Have the service read every file of a capture again, beside all else."""
+    if args.show:
+        found = service.get(f"/captures/{args.capture}/verification")
+    else:
+        found = service.post(f"/captures/{args.capture}/verify")
+    last = f"{found['wrong']} wrong at {found['finished']}" if found["finished"] else "never read"
+    output.result(found, "\n".join([f"{found['state']}; {last}", *found["problems"]]))
+
+
+def run_upload(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
+    """Upload a subject's head and masks, for captures that name it."""
+    files = {} if args.head is None else {"head.obj": args.head}
+    for mask in sorted(args.masks.glob("*.png")) if args.masks is not None else ():
+        files[f"masks/{mask.name}"] = mask
+    if not files:
+        raise BadArgument("nothing to upload: give --head, or --masks with <camera>.png in it")
+    kept: dict[str, Any] = {}
+    for name, file in files.items():
+        kept = service.ask("PUT", f"/uploads/{args.subject}/{name}", content=file.read_bytes())
+    output.result(kept, f"{args.subject}: {', '.join(kept['files'])}")
+
+
+def _list(found: list[dict[str, Any]], output: Output, nothing: str) -> None:
+    lines = [
+        f"{r['name']}  {r['kind']} {r['id']}  {r['bytes']:,} bytes  {r['removed']}  by {r['by']}"
+        for r in found
+    ]
+    output.result({"trash": found}, "\n".join(lines) or nothing)

@@ -1,0 +1,197 @@
+"""Captures read again: when somebody asks, and each so many days, never while the stage shoots."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+
+from reconstruction.capture.writer import utc_now
+from reconstruction.files.durable import write_json
+from reconstruction.reading import printable, read_json
+from stage_service.acquisition.states import CaptureStatus
+from stage_service.records.events import EventLog
+
+log = logging.getLogger("hairstage.verification")
+POLL_S = 0.3
+LOOK_EVERY_S = 60.0
+MOST_PROBLEMS = 100
+NICE = 10
+
+
+class Verification(BaseModel):
+    """A capture that is read again: `finished` (UTC) is when it last was, `problems` the first of
+    what was wrong then, `wrong` how many."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    capture: str
+    state: Literal["never", "waiting", "running", "done"] = "never"
+    finished: str | None = None
+    wrong: int = 0
+    problems: list[str] = []
+
+
+class Verifier:
+    """Reads captures again, one at a time, in a process of its own that stands still while
+    `busy()`; results are kept in `path`. With `days`, each of `due()` is read again so often.
+
+    What is wrong is told by the event "capture.damaged".
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        events: EventLog,
+        busy: Callable[[], bool],
+        due: Callable[[], Sequence[CaptureStatus]],
+        days: float | None,
+    ) -> None:
+        self._path, self._events, self._busy, self._due, self._days = path, events, busy, due, days
+        self._changed = threading.Condition()
+        self._closed = False
+        self._waiting: dict[str, Path] = {}
+        self._running: str | None = None
+        self._known = self._read()
+        self._thread = threading.Thread(target=self._run, name="verifier", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End what runs."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5)
+
+    def ask(self, capture: str, folder: Path) -> Verification:
+        """Read it again, soon."""
+        with self._changed:
+            if capture != self._running:
+                self._waiting[capture] = folder
+            self._changed.notify_all()
+        return self.get(capture)
+
+    def get(self, capture: str) -> Verification:
+        """What is known of it."""
+        with self._changed:
+            last = self._known.get(capture, Verification(capture=capture))
+            if capture == self._running:
+                return last.model_copy(update={"state": "running"})
+            if capture in self._waiting:
+                return last.model_copy(update={"state": "waiting"})
+            return last
+
+    @property
+    def damaged(self) -> list[str]:
+        """The captures with which something was wrong when they were last read."""
+        with self._changed:
+            return [v.capture for v in self._known.values() if v.wrong]
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._waiting, LOOK_EVERY_S)
+                if self._closed:
+                    return
+                if not self._waiting:
+                    self._waiting = self._overdue()
+                if not self._waiting:
+                    continue
+                self._running = next(iter(self._waiting))
+                folder = self._waiting.pop(self._running)
+            try:
+                found = self._verify(self._running, folder)
+            except Exception as error:  # the thread goes on with the next one
+                log.exception("%s", folder)
+                found = [f"it could not be read again: {printable(str(error))}"]
+            self._learn(self._running, found)
+
+    def _overdue(self) -> dict[str, Path]:
+        """The one that was read longest ago, where that is too long."""
+        if self._days is None:
+            return {}
+        before = (datetime.now(UTC) - timedelta(days=self._days)).isoformat()
+        last = {c.id: (self._known.get(c.id) or Verification(capture=c.id)) for c in self._due()}
+        old = sorted((v.finished or "", i) for i, v in last.items() if (v.finished or "") < before)
+        paths = {c.id: Path(c.path) for c in self._due()}
+        return {old[0][1]: paths[old[0][1]]} if old else {}
+
+    def _verify(self, capture: str, folder: Path) -> list[str] | None:
+        """What is wrong; None where the service ends first."""
+        command = [sys.executable, "-m", "stage_service.cli", "verify", str(folder), "--json"]
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
+        stopped = False
+        try:
+            while True:
+                try:
+                    out, _ = child.communicate(timeout=POLL_S)
+                    break
+                except subprocess.TimeoutExpired:
+                    pass
+                if self._closed:
+                    return None
+                if (busy := self._busy()) != stopped:
+                    child.send_signal(signal.SIGSTOP if busy else signal.SIGCONT)
+                    stopped = busy
+        finally:
+            if child.poll() is None:
+                child.kill()
+                child.communicate()
+        try:
+            answer = json.loads(out)
+            told = answer["problems"] if "problems" in answer else [answer["error"]["detail"]]
+            return [str(problem) for problem in told]
+        except (ValueError, KeyError):
+            return [f"reading it ended with exit code {child.returncode}"]
+
+    def _learn(self, capture: str, problems: list[str] | None) -> None:
+        with self._changed:
+            self._running = None
+            if problems is None:
+                return
+            found = Verification(
+                capture=capture,
+                state="done",
+                finished=utc_now(),
+                wrong=len(problems),
+                problems=[printable(p) for p in problems[:MOST_PROBLEMS]],
+            )
+            self._known[capture] = found
+            kept = [v.model_dump(mode="json") for v in self._known.values()]
+        kind = "capture.damaged" if problems else "capture.verified"
+        self._events.publish(kind, {"id": capture, "wrong": len(problems)})
+        try:
+            write_json(self._path, kept)
+        except OSError:
+            log.exception("%s cannot be written", self._path)
+
+    def _read(self) -> dict[str, Verification]:
+        try:
+            kept = TypeAdapter(list[Verification]).validate_python(read_json(self._path))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, ValidationError) as error:
+            log.warning("%s cannot be read: %s", self._path, error)
+            return {}
+        return {v.capture: v for v in kept}

@@ -1,0 +1,89 @@
+"""The live service under requests made from its own schema: no fault, and no answer beside it."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from serving import serving
+
+from stage_service.api.gate import Access
+from stage_service.config import RigFile
+from stage_service.records.tokens import Tokens
+
+schemathesis = pytest.importorskip("schemathesis", reason="pip install 'hairstage[dev]'")
+openapi_checks = pytest.importorskip("schemathesis.specs.openapi.checks")
+
+OWN = "own token of the tests"
+CHECKS = [
+    schemathesis.checks.not_a_server_error,
+    openapi_checks.status_code_conformance,
+    openapi_checks.content_type_conformance,
+    openapi_checks.response_headers_conformance,
+    openapi_checks.response_schema_conformance,
+]
+"""What fits the schema may still be refused: it does not know the rig."""
+ENDLESS = {"/events"}
+"""Streams that end when the client does."""
+LARGE = int(os.environ.get("HAIRSTAGE_FUZZ_CASES", "10000"))
+
+
+@pytest.fixture
+def live(rig_file: RigFile, tmp_path: Path) -> Iterator[str]:
+    """The URL of a service that asks for tokens, whose captures are short."""
+    access = Access(Tokens(tmp_path / "tokens.json", OWN))
+    with serving(rig_file, tmp_path / "root", access) as http:
+        yield str(http.base_url).rstrip("/")
+
+
+def fuzz(url: str, cases: int, headers: dict[str, str], number: int) -> Counter[int]:
+    """How often each status was answered to so many cases, spread over all operations."""
+    schema = schemathesis.openapi.from_url(f"{url}/openapi.json")
+    answers: Counter[int] = Counter()
+    operations = [
+        found.ok() for found in schema.get_all_operations() if found.ok().path not in ENDLESS
+    ]
+    assert len(operations) > 25
+    for operation in operations:
+
+        @seed(number)
+        @settings(
+            max_examples=-(-cases // len(operations)),
+            phases=[Phase.explicit, Phase.generate],
+            suppress_health_check=list(HealthCheck),
+            database=None,
+            deadline=None,
+        )
+        @given(case=operation.as_strategy())
+        def check(case: Any) -> None:
+            answer = case.call(base_url=url, headers=headers, timeout=60)
+            answers[answer.status_code] += 1
+            case.validate_response(answer, checks=CHECKS)
+
+        check()
+    return answers
+
+
+@pytest.mark.parametrize("who", ["token", "nobody"])
+def test_a_few_requests_of_every_kind(live, who):
+    headers = {"Authorization": f"Bearer {OWN}"} if who == "token" else {}
+    answers = fuzz(live, 70, headers, 1)
+    assert sum(answers.values()) >= 70
+    if who == "nobody":
+        assert set(answers) == {401}
+    else:
+        assert 401 not in answers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("who", ["token", "nobody"])
+def test_ten_thousand_requests(live, who, capsys):
+    headers = {"Authorization": f"Bearer {OWN}"} if who == "token" else {}
+    answers = fuzz(live, LARGE if who == "token" else LARGE // 10, headers, 2)
+    with capsys.disabled():
+        print(f"\n{who}: {sum(answers.values())} requests: {dict(sorted(answers.items()))}")

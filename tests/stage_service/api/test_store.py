@@ -1,0 +1,278 @@
+"""What lies on the service's disk: fetched, removed and restored, read again, uploaded."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import json
+import tarfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from serving import Client, serving
+from waiting import until
+
+from reconstruction import Capture, Model, verify
+from stage_service.api import gate
+from stage_service.api.gate import Access
+from stage_service.cli import main
+from stage_service.config import RigFile
+from stage_service.records.tokens import Tokens
+
+SHORT = {"lights": ["light_003"], "projectors": []}
+HEAD = b"v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\ng scalp\nf 1 2 3\n"
+
+
+@pytest.fixture
+def http(rig_file: RigFile, tmp_path: Path) -> Iterator[Client]:
+    with serving(rig_file, tmp_path / "root") as client:
+        yield client
+
+
+def slug(response: Any) -> str:
+    return response.json()["type"].partition("#")[2]
+
+
+def shot(http: Client, **more: Any) -> dict[str, Any]:
+    capture = http.post("/captures", json={"plan": SHORT, **more}).json()
+    http.service._captures.wait(capture["id"], 30)
+    status: dict[str, Any] = http.get(f"/captures/{capture['id']}").json()
+    return status
+
+
+def test_a_folder_comes_as_a_tar_whose_ranges_are_parts_of_the_whole(http, tmp_path):
+    capture = shot(http)
+    path = f"/captures/{capture['id']}/archive.tar"
+    whole = http.get(path)
+    assert whole.headers["accept-ranges"] == "bytes"
+    with tarfile.open(fileobj=io.BytesIO(whole.content)) as tar:
+        tar.extractall(tmp_path / "out", filter="data")
+    copy = tmp_path / "out" / capture["id"]
+    assert verify(copy) == []
+    names = [p.relative_to(copy) for p in copy.rglob("*")]
+    assert sorted(names) == sorted(
+        p.relative_to(capture["path"]) for p in Path(capture["path"]).rglob("*")
+    )
+    tag, size = whole.headers["etag"], len(whole.content)
+    for first, last in ((0, 0), (500, 1600), (size - 3, size + 9), (4095, 4097)):
+        part = http.get(path, headers={"Range": f"bytes={first}-{last}", "If-Range": tag})
+        assert part.status_code == 206
+        assert part.content == whole.content[first : last + 1]
+        assert part.headers["content-range"] == f"bytes {first}-{min(last, size - 1)}/{size}"
+    assert http.get(path, headers={"Range": "bytes=-700"}).content == whole.content[-700:]
+    beyond = http.get(path, headers={"Range": f"bytes={size}-"})
+    assert (beyond.status_code, beyond.headers["content-range"]) == (416, f"bytes */{size}")
+    assert http.get(path, headers={"Range": "bytes=0-1", "If-Range": '"old"'}).status_code == 200
+    assert http.get(path, headers={"Range": "lines=1"}).status_code == 200
+    same = http.get(path, headers={"If-None-Match": tag})
+    assert (same.status_code, same.content) == (304, b"")
+
+
+def test_files_have_tags_and_ranges_and_head_is_get_without_its_body(http):
+    capture = shot(http)
+    frame = f"/captures/{capture['id']}/frames/2/cam_0.exr"
+    whole = http.get(frame)
+    part = http.get(frame, headers={"Range": "bytes=10-19"})
+    assert (part.status_code, part.content) == (206, whole.content[10:20])
+    for path in (frame, "/health", f"/captures/{capture['id']}/archive.tar", "/nowhere"):
+        got, asked = http.get(path), http.head(path)
+        assert (asked.status_code, asked.content) == (got.status_code, b"")
+        for name in ("content-length", "content-type", "etag"):
+            assert asked.headers.get(name) == got.headers.get(name)
+    begin = time.monotonic()
+    assert http.head("/events", timeout=10).status_code == 200
+    assert time.monotonic() - begin < 10, "an endless stream would run into the time-out"
+
+
+def test_what_is_removed_is_in_the_trash_and_comes_back(http):
+    capture = shot(http)
+    name, path = capture["id"], Path(capture["path"])
+    before = {p.name: p.stat().st_size for p in path.rglob("*") if p.is_file()}
+    dry = http.delete(f"/captures/{name}", params={"dry_run": True}).json()
+    assert (dry["name"], dry["bytes"]) == (None, sum(p.stat().st_size for p in _files(path)))
+    assert path.is_dir()
+    assert http.get("/trash").json() == []
+    removed = http.delete(f"/captures/{name}").json()
+    assert http.get("/captures").json() == []
+    assert slug(http.get(f"/captures/{name}")) == "unknown-capture"
+    assert slug(http.delete(f"/captures/{name}")) == "unknown-capture"
+    assert http.get("/trash").json() == [removed]
+    assert http.delete("/trash").json() == [], "it is kept for 30 days"
+    assert http.post(f"/trash/{removed['name']}/restore").json()["id"] == name
+    assert {p.name: p.stat().st_size for p in path.rglob("*") if p.is_file()} == before
+    assert verify(path) == []
+    assert [c["outcome"] for c in http.get("/captures").json()] == ["completed"]
+    http.delete(f"/captures/{name}")
+    gone = http.delete("/trash", params={"older_than_days": 0, "dry_run": True}).json()
+    assert http.delete("/trash", params={"older_than_days": 0}).json() == gone
+    assert http.get("/trash").json() == []
+    actions = [a["action"] for a in http.get("/audit").json() if a["subject"] == name]
+    assert [a for a in actions if a != "capture.end"][1:] == [
+        *("capture.remove", "capture.restore", "capture.remove", "capture.delete")
+    ]
+
+
+def _files(path: Path) -> list[Path]:
+    return [p for p in path.rglob("*") if p.is_file()]
+
+
+def test_what_is_in_use_stays(http, world):
+    world.busy = {"cam_1": 10**9}
+    running = http.post("/captures", json={"plan": SHORT}).json()["id"]
+    for ask in (http.delete, http.get):
+        path = f"/captures/{running}" + ("/archive.tar" if ask == http.get else "")
+        assert ask(path).status_code == 409
+    assert slug(http.delete(f"/captures/{running}")) == "wrong-state"
+    http.post("/devices/blackout")
+    until(lambda: http.get(f"/captures/{running}").json()["state"] == "done")
+    world.busy = {}
+    capture = shot(http)
+    asked = {"capture": capture["id"], "pipeline": {"name": "reconstruct"}, "model": "mine"}
+    job = http.post("/jobs", json=asked).json()["id"]
+    Model(http.service.root / "models" / "mine").create().write_json("results.json", {"a": 1})
+    assert job in http.delete(f"/captures/{capture['id']}").json()["detail"]
+    assert slug(http.delete("/models/mine")) == "in-use"
+    http.delete(f"/jobs/{job}")
+    with (Path(capture["path"]) / "journal.jsonl").open("ab") as journal:
+        fcntl.flock(journal, fcntl.LOCK_EX)  # as a compression has it
+        assert slug(http.delete(f"/captures/{capture['id']}")) == "journal-in-use"
+    assert [m["name"] for m in http.get("/models").json()] == ["mine"]
+    archive = http.get("/models/mine/archive.tar").content
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        results = tar.extractfile("mine/results.json")
+        assert results is not None
+        assert json.load(results) == {"a": 1}
+    assert http.delete(f"/captures/{capture['id']}").json()["models"] == ["mine"]
+    assert http.delete("/models/mine").json()["kind"] == "model"
+    assert slug(http.get("/models/mine/archive.tar")) == "not-there"
+    assert slug(http.delete("/models/..")) in ("http", "not-there")
+
+
+def test_who_may_remove(rig_file, tmp_path):
+    tokens = Tokens(tmp_path / "tokens.json", "own")
+    steers = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'steer'))}"}
+    with serving(rig_file, tmp_path / "root", Access(tokens)) as http:
+        http.headers["Authorization"] = "Bearer own"
+        whole = shot(http)["id"]
+        stopped = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+        http.post(f"/captures/{stopped}/abort")
+        until(lambda: http.get(f"/captures/{stopped}").json()["state"] == "done")
+        for ask in (
+            lambda: http.delete(f"/captures/{whole}", headers=steers),
+            lambda: http.delete("/trash", headers=steers),
+            lambda: http.delete("/models/any", headers=steers),
+            lambda: http.post("/trash/any/restore", headers=steers),
+        ):
+            assert slug(ask()) == "forbidden"
+        assert http.delete(f"/captures/{stopped}", headers=steers).status_code == 200
+        assert http.delete(f"/captures/{whole}").status_code == 200
+
+
+def test_a_capture_is_read_again_beside_the_service_and_damage_is_told(http):
+    capture = shot(http)
+    path = f"/captures/{capture['id']}"
+    assert http.get(f"{path}/verification").json()["state"] == "never"
+    assert http.post(f"{path}/verify").status_code == 202
+    found = until(lambda: _done(http, path), pause=0.1)
+    assert (found["wrong"], found["problems"]) == (0, [])
+    frame = next(Path(capture["path"]).glob("frames/*1/cam_0.exr"))
+    data = bytearray(frame.read_bytes())
+    data[-1] ^= 1
+    frame.write_bytes(data)
+    http.post(f"{path}/verify")
+    found = until(lambda: _done(http, path, after=found["finished"]), pause=0.1)
+    assert found["wrong"] == 1
+    assert "does not match its checksum" in found["problems"][0]
+    events = http.service.events.wait(0, 0)
+    assert [e.kind for e in events if e.data.get("wrong") is not None] == [
+        *("capture.verified", "capture.damaged")
+    ]
+    assert capture["id"] in http.get("/health").json()["problems"][0]
+    assert http.get("/health").json()["status"] == "degraded"
+
+
+def _done(http: Client, path: str, after: str = "") -> Any:
+    found = http.get(f"{path}/verification").json()
+    return found if found["state"] == "done" and found["finished"] > after else None
+
+
+def test_what_was_not_read_for_long_is_read_again_by_itself(rig_file, tmp_path):
+    root = tmp_path / "root"
+    with serving(rig_file, root) as http:
+        capture = shot(http)["id"]
+        verifier = http.service._verifier
+        assert verifier._overdue() == {}
+        verifier._days = 1.0
+        assert list(verifier._overdue()) == [capture]
+        http.post(f"/captures/{capture}/verify")
+        until(lambda: _done(http, f"/captures/{capture}"), pause=0.1)
+        assert verifier._overdue() == {}
+    with serving(rig_file, root) as http:  # it is kept
+        assert http.get(f"/captures/{capture}/verification").json()["state"] == "done"
+
+
+def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
+    masks = {f"cam_{i}": np.eye(6, 8, dtype=np.uint8) * 255 for i in range(3)}
+    png = {name: cv2.imencode(".png", mask)[1].tobytes() for name, mask in masks.items()}
+    assert http.put("/uploads/anna/head.obj", content=HEAD).json()["files"] == ["head.obj"]
+    assert http.put("/uploads/anna/masks/cam_1.png", content=png["cam_1"]).status_code == 200
+    capture = Capture(shot(http, upload="anna")["path"])
+    assert capture.head is not None
+    np.testing.assert_array_equal(capture.mask("cam_1"), masks["cam_1"] > 0)
+    assert capture.mask("cam_0") is None
+    small = cv2.imencode(".png", masks["cam_0"][:3])[1].tobytes()
+    for name, data in (
+        ("head.obj", b"v 0 0 0\n"),
+        ("head.obj", b"\xff\xfe\0"),
+        ("masks/cam_9.png", png["cam_0"]),
+        ("masks/cam_0.png", small),
+        ("masks/cam_0.png", png["cam_0"][:40]),
+        ("masks/cam_0.png", b"GIF89a"),
+    ):
+        assert slug(http.put(f"/uploads/anna/{name}", content=data)) == "bad-input", name
+    for subject in ("..", ".hidden", "%2e%2e", "a" * 200):
+        refused = http.put(f"/uploads/{subject}/head.obj", content=HEAD)
+        assert refused.status_code in (404, 422), subject
+    assert sorted(p.name for p in (http.service.root / "uploads").iterdir()) == ["anna"]
+    assert slug(http.post("/captures", json={"upload": "bert"})) == "not-there"
+    both = {"upload": "anna", "head": "/x.obj"}
+    assert slug(http.post("/captures", json=both)) == "bad-input"
+    monkeypatch.setattr(gate, "MOST_UPLOAD", 3 << 20)
+    large = HEAD + b"# " + b"x" * (2 << 20)
+    assert http.put("/uploads/anna/head.obj", content=large).status_code == 200
+    assert slug(http.put("/uploads/anna/head.obj", content=2 * large)) == "too-large"
+    assert slug(http.post("/plans:validate", content=large)) == "too-large"
+    assert http.delete("/uploads/anna").json()["files"] == ["head.obj", "masks/cam_1.png"]
+    assert http.get("/uploads").json() == []
+
+
+def test_the_command_line_of_the_store(http, tmp_path, capsys):
+    def run(*words: str) -> dict[str, Any]:
+        assert main([*words, "--url", str(http.base_url), "--json"]) == 0
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return found
+
+    (tmp_path / "head.obj").write_bytes(HEAD)
+    run("store", "upload", "anna", "--head", str(tmp_path / "head.obj"))
+    plan = json.dumps(SHORT)
+    (tmp_path / "plan.json").write_text(plan)
+    begun = run(
+        *("capture", "start", "--plan", str(tmp_path / "plan.json"), "--upload", "anna"), "--wait"
+    )
+    name = begun["capture"]["id"]
+    out = tmp_path / "capture.tar"
+    run("store", "download", "capture", name, "--out", str(out))
+    assert out.read_bytes() == http.get(f"/captures/{name}/archive.tar").content
+    assert run("store", "remove", "capture", name, "--dry-run")["name"] is None
+    trashed = run("store", "remove", "capture", name)["name"]
+    assert [t["name"] for t in run("store", "trash")["trash"]] == [trashed]
+    run("store", "restore", trashed)
+    assert run("store", "verify", name)["capture"] == name
+    until(lambda: _done(http, f"/captures/{name}"), pause=0.1)
+    run("store", "remove", "capture", name)
+    assert len(run("store", "empty", "--older-than-days", "0")["trash"]) == 1
