@@ -1,3 +1,5 @@
+from .fields.options import FieldOptions as FieldOptions
+from .fields.options import FieldRequest as FieldRequest
 from .inverse_rendering.options import InverseRenderingOptions as InverseRenderingOptions
 from .inverse_rendering.options import InverseRenderingRequest as InverseRenderingRequest
 from .inverse_rendering.pipeline import fit_maps as fit_maps
@@ -8,6 +10,7 @@ from .metrics.scores import ssim as ssim
 from .model.assess import assess as assess
 from .model.fitted_model import FittedModel as FittedModel
 from .model.relight import relight as relight
+from .model.validated import fit_field_validated as fit_field_validated
 from .model.validated import fit_validated as fit_validated
 from .observations import HeldOut as HeldOut
 from .render.differentiable import DifferentiableOlat as DifferentiableOlat

@@ -40,7 +40,8 @@ FILES = {
     "appearance.json": "the hair as one material, the skin, the exposure (Sun's fit)",
     "hair_maps.npz": "the hair's material over the scalp (inverse rendering)",
     "lights.json": "the lights as inverse rendering found them",
-    "rejected": "the same two files, where validation frames prefer Sun's fit",
+    "field.npz": "what the hair reflects beyond its material (hairstage fit --field)",
+    "rejected": "the same three files, where validation frames prefer going without",
     "comparison.png": "held-out frames, captured and rendered",
     "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",
     "relit.png": "the hair under an environment map",
@@ -59,6 +60,7 @@ _OF_APPEARANCE = (
     "appearance.json",
     "hair_maps.npz",
     "lights.json",
+    "field.npz",
     "rejected",
     "comparison.png",
     "inverse_rendering.png",
@@ -116,10 +118,10 @@ class Model:
         """Where hair maps and lights lie that are not to be rendered: a folder like a model's."""
         return Model(self.file("rejected"))
 
-    def reject_maps(self) -> None:
-        """Put hair maps and lights where nothing renders them: into `rejected`."""
+    def reject(self, *names: str) -> None:
+        """Put files where nothing renders them: into `rejected`."""
         folder = self.rejected().create()
-        for name in ("hair_maps.npz", "lights.json"):
+        for name in names:
             self.file(name).replace(folder.file(name))
 
     @contextmanager
@@ -238,6 +240,10 @@ class Model:
     def checkpoint(self, variant: str) -> Path:
         """Where a fit of this variant keeps its state while it runs."""
         return self.path / f"inverse_rendering-{variant}.checkpoint.npz"
+
+    def work(self, name: str) -> Path:
+        """Where a step of this name keeps what it can make again while it runs."""
+        return self.path / "work" / name
 
     def _needed(self, name: str, command: str) -> Path:
         path = self.file(name)

@@ -31,7 +31,7 @@ from appearance.sun_fit.roughness_and_colour import fit_diffuse
 from reconstruction import Camera, Capture, Light, Model, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Array, Bools
 
-FITS = ("ours", "sun_fit", "inverse_rendering")
+FITS = ("ours", "sun_fit", "inverse_rendering", "without_field")
 """Names in the results that are no baselines."""
 OWN_FRAMES = "three_nearest_own_frames"
 """What has the held-out camera's own frames, which nothing else has: beaten or not, no warning."""
@@ -71,7 +71,8 @@ def assess(
     are any. Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}},
     "held_out_camera": …}`, means over images, each over the captured hair mask. The methods are
     "ours"; where inverse rendering was run, also "sun_fit" and "inverse_rendering" by themselves
-    ("rendered", beside the groups, names the one that is ours); and the baselines
+    ("rendered", beside the groups, names the one that is ours, where a field is, the one below it);
+    where a field is on Sun's fit, that "without_field"; and the baselines
 
     - "mean_colour": one colour, the mean over training frames and hair pixels
     - "diffuse": Lambertian fibres on our strands, with the albedo that reproduces that mean
@@ -130,7 +131,11 @@ class _Comparison:
         albedo = fit_diffuse(scene, training, seed=self.seed)
         both = FittedModel.alternatives(self.model, self.capture)
         lit = {name: (fit.scene(), fit) for name, fit in both.items()}
-        lit = lit or {"ours": (scene, self.fitted)}
+        if self.fitted.field is not None and not both:
+            bare = self.fitted.without_field()
+            lit["without_field"] = bare.scene(), bare
+        if self.fitted.field is not None or not both:
+            lit["ours"] = scene, self.fitted
         lit["diffuse"] = scene.with_hair(DiffuseHair(albedo)), self.fitted
         rendered = "inverse_rendering" if self.model.has("hair_maps.npz") else "sun_fit"
         groups: dict[str, list[_Compared]] = {}
@@ -139,7 +144,7 @@ class _Comparison:
             for i, (camera, lights) in enumerate(views):
                 progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
                 for image in self._rendered(camera, lights, lit):
-                    if both:
+                    if "ours" not in lit:
                         image.frames["ours"] = image.frames[rendered]
                     image.frames["mean_colour"] = np.broadcast_to(colour, (*image.mask.shape, 3))
                     groups[group].append(image)
@@ -153,7 +158,8 @@ class _Comparison:
         if both:
             result["rendered"] = rendered
         stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
-        others = [name for name in both if name != rendered]
+        shown = "ours" in lit  # by itself, beside what it is made of
+        others = [name for name in lit if name in FITS[1:] and (shown or name != rendered)]
         columns = ["captured", "ours", *others, "diffuse", "interpolated"]
         rows = [r for g, images in groups.items() for r in self._rows(g, images, exposure)]
         with self.model.writing("comparison.png") as part:

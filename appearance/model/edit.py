@@ -86,7 +86,8 @@ def cut(fitted: FittedModel, length: float) -> FittedModel:
             sigma_a=_root_part(maps.sigma_a, kept),
             rotation=_root_part(maps.rotation, kept),
         )
-    return replace(fitted, strands=_cut(strands, length), maps=maps)
+    field = None if fitted.field is None else fitted.field.on_cut(share)
+    return replace(fitted, strands=_cut(strands, length), maps=maps, field=field)
 
 
 def restyled(fitted: FittedModel, strands: Strands) -> FittedModel:
@@ -97,7 +98,8 @@ def restyled(fitted: FittedModel, strands: Strands) -> FittedModel:
     if not len(strands) or not len(fitted.strands):
         raise ValueError("restyling needs strands, in the model and in the file")
     _, nearest = cKDTree(fitted.strands.roots).query(strands.roots)
-    return replace(fitted, strands=strands, placed=fitted.root_uv[nearest])
+    field = None if fitted.field is None else fitted.field.on_others(nearest)
+    return replace(fitted, strands=strands, placed=fitted.root_uv[nearest], field=field)
 
 
 def _cell_of(root_uv: Array, cells: tuple[int, int]) -> Ints:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
+from appearance.fields.field import FIELD_FILE, Field, FieldOnStrands
 from appearance.inverse_rendering.found_lights import LIGHTS_FILE, lights_as_found
 from appearance.render.mixed import Environment, render_mixed
 from appearance.render.tracing import SAMPLING, Sampling
@@ -25,6 +26,7 @@ from reconstruction.arrays import Array, Floats
 class FittedModel:
     """Strands on a head, the hair's material, skin, exposure, and the lights it was seen under.
 
+    `field` is what the hair reflects beyond that material, None where nothing is known of it.
     `maps` are of one cell where the hair is one material. `placed (S, 2)` are the roots' places on
     the scalp's map where they are known; they stay with the strands when they move. `rig` is the
     capture's, its lights as inverse rendering found them; `found_lights` says how, row by row of
@@ -38,6 +40,7 @@ class FittedModel:
     placed: Array | None = None
     rig: Rig | None = None
     found_lights: Sequence[Mapping[str, Any]] = ()
+    field: Field | None = None
 
     @classmethod
     def load(cls, model: Model, capture: Capture | None = None) -> FittedModel:
@@ -58,15 +61,22 @@ class FittedModel:
         if capture is not None:
             rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
         found = model.json(LIGHTS_FILE) if model.has(LIGHTS_FILE) else ()
-        return cls(strands, model.head(capture), appearance, maps, placed, rig, found)
+        field = Field.load(model) if model.has(FIELD_FILE) else None
+        if field is not None and len(field.places.kept) != len(strands):
+            raise ModelError(
+                f"{model.file(FIELD_FILE)} is of {len(field.places.kept)} strands and strands.npz "
+                f"holds {len(strands)}: fit again"
+            )
+        return cls(strands, model.head(capture), appearance, maps, placed, rig, found, field)
 
     @classmethod
     def alternatives(cls, model: Model, capture: Capture) -> dict[str, FittedModel]:
         """Both fits, where inverse rendering was run: "sun_fit" and "inverse_rendering".
 
+        Without a field.
         One of them is what `load` gives; see `fit_validated`.
         """
-        ours = cls.load(model, capture)
+        ours = cls.load(model, capture).without_field()
         for folder in (model, model.rejected()):
             if folder.has("hair_maps.npz"):
                 maps, placed = HairMaps.load(folder)
@@ -94,6 +104,8 @@ class FittedModel:
             self.maps.save(model, self.root_uv)
         if self.found_lights:
             model.write_json(LIGHTS_FILE, list(self.found_lights))
+        if self.field is not None:
+            self.field.save(model)
 
     @cached_property
     def root_uv(self) -> Array:
@@ -103,6 +115,28 @@ class FittedModel:
     def with_maps(self, maps: HairMaps) -> FittedModel:
         """The same with another material."""
         return replace(self, maps=maps)
+
+    def with_field_of(self, model: Model, kind: str | None) -> FittedModel:
+        """The same with the model's field of this `kind`, also one that was rejected.
+
+        "none" is without; None leaves it as it is. Raises `ModelError` where there is no such one.
+        """
+        if kind is None or (self.field is not None and self.field.kind == kind):
+            return self
+        if kind == "none":
+            return self.without_field()
+        if model.rejected().has(FIELD_FILE):
+            field = Field.load(model.rejected())
+            if field.kind == kind:
+                return replace(self, field=field)
+        raise ModelError(
+            f"{model} has no field of the kind {kind}: run 'hairstage fit CAPTURE {model} --field "
+            f"{kind}' first"
+        )
+
+    def without_field(self) -> FittedModel:
+        """The same as its material alone shows it."""
+        return replace(self, field=None)
 
     def lights(self, names: Sequence[str]) -> list[Light]:
         """Lights of the rig: as found where they were fitted, else as calibrated."""
@@ -129,9 +163,18 @@ class FittedModel:
             hair=self.maps.mean(),
             skin=self.appearance.skin,
         )
-        if self.maps.uniform or not len(moved):
+        if not len(moved) or (self.maps.uniform and self.field is None):
             return base
-        return MappedStrands.of(base, moved, self.root_uv).with_maps(self.maps)
+        mapped = MappedStrands.of(base, moved, self.root_uv)
+        shown = base if self.maps.uniform else mapped.with_maps(self.maps)
+        if self.field is None:
+            return shown
+        return replace(shown, field=FieldOnStrands(self.field, mapped))
+
+    def mapped(self) -> MappedStrands:
+        """The strands with their places, and the scene of their material without a field."""
+        scene = self.without_field().scene()
+        return MappedStrands.of(scene, self.strands, self.root_uv)
 
     def render(
         self,

@@ -1,13 +1,19 @@
-"""Inverse rendering that has to prove itself: some training frames decide what is rendered."""
+"""Fits that have to prove themselves: some training frames decide what is rendered."""
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from appearance.fields.field import FIELD_FILE
+from appearance.fields.options import FieldRequest
+from appearance.fields.pipeline import Rendered, fit_field
 from appearance.inverse_rendering.options import InverseRenderingRequest
 from appearance.inverse_rendering.pipeline import fit_maps
+from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from reconstruction import Capture, Model, Progress, silent
 from reconstruction.arrays import Array
@@ -39,6 +45,7 @@ def fit_validated(
     order = far_apart(directions, request.lights + judges)
     used = [names[k] for k in order]
     model.remove("rejected")
+    model.remove(FIELD_FILE)  # it belonged to other maps
     result = fit_maps(
         training.view(lights=used),
         model,
@@ -55,7 +62,7 @@ def fit_validated(
         sun, found = (validation[name]["psnr"] for name in ("start", "inverse_rendering"))
         if found <= sun:
             rendered = "sun_fit"
-            model.reject_maps()
+            model.reject("hair_maps.npz", "lights.json")
             stage.warn(
                 f"on frames that neither was fitted to Sun's fit is better, {sun:.2f} dB against "
                 f"{found:.2f}: it is what is rendered"
@@ -65,6 +72,72 @@ def fit_validated(
     result |= {"validation": validation, "rendered": rendered, "lights": len(used) - judges}
     stage.figures |= result
     model.write_report(report)
+    return result
+
+
+def fit_field_validated(
+    capture: Capture,
+    model: Model,
+    *,
+    held_out: HeldOut | None = None,
+    request: FieldRequest | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Fit a field on top of what the model renders, kept only where it makes pictures better.
+
+    Of the lights that are not `held_out`, `request.lights` are used: directions far apart. A camera
+    and every fourth light are left out, and the field is rendered later where its pictures under
+    new lights, of the new view, and of both are each no worse than without it; otherwise it goes to
+    the model's folder "rejected", with a warning in the report. What is kept is fitted to all of
+    the frames. Writes `field.npz` and the stage "field" of the report. Returns `{"validation":
+    {group: {"without", "with"}} in dB, "rendered", "ridge", "clamped", "lights"}`, or "left_out"
+    where no field is asked for; that removes an earlier one.
+    """
+    held_out, request = held_out or HeldOut(), request or FieldRequest()
+    model.remove(FIELD_FILE)
+    if request.field == "none":
+        return {"left_out": "no field was asked for"}
+    training = held_out.training(capture)
+    names = training.olat_lights()
+    directions = np.array([training.rig.light(name).position for name in names])
+    used = [names[k] for k in far_apart(directions, request.lights)]
+    fitted = FittedModel.load(model, capture)
+    report = model.report()
+    with report.stage("field") as stage:
+        mapped = fitted.mapped()
+        base = Rendered(
+            mapped, mapped.scene, tuple(fitted.lights(used)), fitted.appearance.exposure.scale
+        )
+        found = fit_field(training, model, base, request, progress, seed)
+        found.field.save(model)
+        stage.warnings += found.warnings
+        worse = [n for n, f in found.validation.items() if f["with"] < f["without"]]
+        if worse or not found.validation:
+            rejected = model.rejected()
+            rejected.remove(FIELD_FILE)
+            model.reject(FIELD_FILE)
+        for group in worse:
+            scores = found.validation[group]
+            stage.warn(
+                f"{request.field}, {group}: pictures are better without it, "
+                f"{scores['without']:.2f} dB against {scores['with']:.2f}: it is not rendered"
+            )
+        if not found.validation:
+            stage.warn(f"{request.field}: nothing says whether it is better: it is not rendered")
+        result: dict[str, Any] = {
+            "validation": found.validation,
+            "rendered": model.has(FIELD_FILE),
+            "field": request.field,
+            "ridge": found.ridge,
+            "ridges": found.errors,
+            "clamped": found.clamped,
+            "lights": len(used),
+        }
+        stage.figures |= {**result, "options": asdict(request)}
+    model.write_report(report)
+    shutil.rmtree(model.work("field"), ignore_errors=True)
+    progress("field fitted", 1.0)
     return result
 
 

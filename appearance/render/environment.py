@@ -16,7 +16,9 @@ import numpy as np
 
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
+from appearance.render.harmonics import projected
 from appearance.render.paths import Surface, Wave, camera_rays, each_sample, seed_state
+from appearance.render.pixel_field import DeviceField, PixelField, factor_of, field_of
 from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
@@ -51,7 +53,8 @@ def render_environment(
     index = covered_pixels(scene, camera)
     if len(index):
         film = dr.zeros(mi.Float, 3 * len(index))
-        gather = _Gather(Surface(scene), film, sky)
+        field = field_of(scene, camera, index)
+        gather = _Gather(Surface(scene), film, sky, factor_of(field))
 
         def missed(ray: Any, paths: Paths) -> None:
             add_light(film, sky.radiance(ray.d), paths.slot * 3, paths.active & (paths.depth == 0))
@@ -59,6 +62,7 @@ def render_environment(
         escape = missed if background else None
         follow(gather.surface, camera, index, sampling.plan(), gather, escape)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(sampling.spp)
+        image[index] = _with_added(image[index], field, envmap, rotation_deg)
     return image.reshape(camera.height, camera.width, 3)
 
 
@@ -76,7 +80,8 @@ def direct_environment(
     index = covered_pixels(scene, camera)
     if len(index):
         film, surface = dr.zeros(mi.Float, 3 * len(index)), Surface(scene)
-        gather, origin = _Gather(surface, film, sky), seed_state(seed, 1)
+        field = field_of(scene, camera, index)
+        gather, origin = _Gather(surface, film, sky, factor_of(field)), seed_state(seed, 1)
         generator: Any = mi.PCG32  # the stubs call it a plain object
 
         def trace(wave: Wave) -> None:
@@ -89,7 +94,19 @@ def direct_environment(
         pixels = mi.UInt32(for_kernels(index, np.uint32))
         each_sample(camera, pixels, len(index), spp, seed, trace)
         image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
+        image[index] = _with_added(image[index], field, envmap, 0.0)
     return image.reshape(camera.height, camera.width, 3)
+
+
+def _with_added(
+    radiance: Floats, field: PixelField | None, envmap: AnyFloats, rotation_deg: float
+) -> Floats:
+    """`radiance (P, 3)` and what an additive field adds to it."""
+    if field is None or not field.additive:
+        return radiance
+    integrals = projected(envmap, rotation_deg, field.degree)
+    added = field.added((), np.zeros((0, 3)), [integrals])
+    return np.maximum(added if field.alone else radiance + added, 0)
 
 
 def _along_curve(height: int, width: int) -> Ints:
@@ -185,6 +202,7 @@ class _Gather:
     surface: Surface
     film: Any
     sky: Sky
+    factor: DeviceField | None
 
     def __call__(self, si: Any, paths: Paths) -> None:
         self.add(si, paths)
@@ -194,6 +212,8 @@ class _Gather:
         towards, light = self.sky.sample(paths.rng, paths.active, place)
         answer = self.surface.eval(si, si.to_local(towards), paths.active)
         value = paths.throughput * light * answer
+        if self.factor is not None:
+            value = value * self.factor.towards(paths.slot, towards, paths.active)
         lit = paths.active & (dr.max(value) > 0)
         lit &= ~self.surface.scene.mi_scene.ray_test(si.spawn_ray(towards), lit)
         add_light(self.film, value, paths.slot * 3, lit)

@@ -14,9 +14,11 @@ from numpy.typing import ArrayLike
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment import Sky
 from appearance.render.environment_maps import check_environment
+from appearance.render.harmonics import projected
 from appearance.render.lights import PackedLights
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface
+from appearance.render.pixel_field import DeviceField, factor_of, field_of
 from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
@@ -61,6 +63,7 @@ def render_mixed(
     image = np.zeros((camera.height * camera.width, 3), np.float32)
     index = covered_pixels(scene, camera)
     if len(index) and (lights or environments):
+        field = field_of(scene, camera, index)
         choice = _choice(scene, camera, lights, weight, index, sampling)
         gather = _Gather(
             Surface(scene),
@@ -71,9 +74,18 @@ def render_mixed(
                 (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
                 for m, e in zip(maps, environments, strict=True)
             ],
+            factor_of(field),
         )
         follow(gather.surface, camera, index, sampling.plan(), gather)
-        image[index] = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
+        radiance = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
+        if field is not None and field.additive:
+            integrals = [
+                projected(m, e.rotation_deg, field.degree) * np.asarray(e.weight, float)
+                for m, e in zip(maps, environments, strict=True)
+            ]
+            added = field.added(lights, weight, integrals)
+            radiance = np.maximum(added if field.alone else radiance + added, 0)
+        image[index] = radiance
     return image.reshape(camera.height, camera.width, 3)
 
 
@@ -108,6 +120,7 @@ class _Gather:
     bank: PackedLights | None
     choice: Any
     skies: Sequence[tuple[Sky, Array]]
+    factor: DeviceField | None
 
     def __call__(self, si: Any, paths: Paths) -> None:
         throughput, rng, active = paths.throughput, paths.rng, paths.active
@@ -119,11 +132,15 @@ class _Gather:
             squared = dr.squared_norm(towards)
             wo = si.to_local(towards * dr.rsqrt(squared))
             value = throughput * self.surface.eval(si, wo, active) * (intensity / squared)
+            if self.factor is not None:
+                value = value * self.factor.at(paths.slot, target, active)
             self._add(value, si.spawn_ray_to(target), paths)
         for sky, weight in self.skies:
             direction, radiance = sky.sample(rng, active)
             value = throughput * self.surface.eval(si, si.to_local(direction), active)
             value = value * radiance * mi.Color3f(*opaque(weight))
+            if self.factor is not None:
+                value = value * self.factor.towards(paths.slot, direction, active)
             self._add(value, si.spawn_ray(direction), paths)
 
     def _add(self, value: Any, ray: Any, paths: Paths) -> None:

@@ -16,6 +16,7 @@ from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.lights import PackedLights
 from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
+from appearance.render.pixel_field import field_of
 from appearance.render.tracing import (
     PathLimits,
     PathPlan,
@@ -81,6 +82,9 @@ def render_olat(
     """
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
     (out,) = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed, 1)
+    field = field_of(scene, camera, index)
+    if field is not None:
+        out = field.lit(out, lights)
     return out if pixels is not None else spread_out(out, index, camera)
 
 
@@ -96,7 +100,7 @@ def render_olat_parts(
     """`render_olat` of `pixels (P,)` in two parts, `(L, P, 3)` each, of the same paths.
 
     The first is the light that reaches the first hit directly, the second what comes by way of
-    others.
+    others. Both are those of the material alone, without the scene's field.
     """
     index = pixel_indices(camera, pixels)
     out = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed, 2)

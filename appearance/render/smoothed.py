@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from appearance.render.coverage import coverage
+from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.environment import direct_environment, render_environment
+from appearance.render.harmonics import projected
 from appearance.render.olat import render_olat, render_olat_parts, spread_out
 from appearance.render.paths import pixel_indices
+from appearance.render.pixel_field import field_of
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light
@@ -52,6 +54,7 @@ def olat_smoothed(
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     share = coverage(scene, camera, max(spp, 16), seed)
+    field_on, scene = scene, replace(scene, field=None)  # what is smooth is the material's
     sees = (share["hair"] + share["head"]).ravel() > 0
     wanted = np.flatnonzero(sees) if pixels is None else pixel_indices(camera, pixels)
     sees[wanted] = True
@@ -68,6 +71,9 @@ def olat_smoothed(
         smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
         out[part] += smooth.reshape(len(smooth), -1, 3)[:, index]
     out = out[:, np.searchsorted(index, wanted)]
+    field = field_of(field_on, camera, wanted)
+    if field is not None:
+        out = field.lit(out, lights)
     return out if pixels is not None else spread_out(out, wanted, camera)
 
 
@@ -88,8 +94,21 @@ def environment_smoothed(
     )
     one, other = (direct_environment(scene, camera, envmap, 6 * spp, 2 * seed + k) for k in (1, 2))
     sigma = max(SIGMA, camera.width / 160)
-    indirect = smoothed((whole - first)[None], share, sigma)[0]
+    factor = _mean_factor(scene, camera, envmap)
+    # a field has the detail of single strands: what is smooth is the light without it
+    indirect = factor * smoothed(((whole - first) / factor)[None], share, sigma)[0]
     return without_rare(one, other, share, sigma) + indirect
+
+
+def _mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
+    """About what the scene's field multiplies an environment's light by `(H, W, 3)`."""
+    out = np.ones((camera.height, camera.width, 3), np.float32)
+    index = covered_pixels(scene, camera)
+    field = field_of(scene, camera, index)
+    if field is not None and not field.additive:
+        integrals = projected(envmap, 0.0, field.degree)
+        out.reshape(-1, 3)[index] = field.mean_factor(integrals)
+    return out
 
 
 def without_rare(one: Floats, other: Floats, share: dict[str, Floats], sigma: float) -> Floats:

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import mitsuba as mi
 import numpy as np
@@ -21,12 +21,19 @@ from numpy.typing import ArrayLike
 from appearance.scene.backend import ensure_backend
 from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
-from reconstruction import Mesh, Strands
+from reconstruction import Camera, Mesh, Strands
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Floats, Ints
 
 SCALE = 100.0
 """Scene units per metre."""
+
+
+class SceneField(Protocol):
+    """A field of reflectance on hair; what it gives is a `render.pixel_field.PixelField`."""
+
+    def seen_by(self, scene: HairScene, camera: Camera, pixels: Ints) -> Any:
+        """The field at the flat `pixels (P,)` of `camera`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +42,9 @@ class HairScene:
 
     `mi_scene` is a `mitsuba.Scene` without emitters or sensors, in centimetres. `hair_bsdf` is a
     `mitsuba.BSDF`, or None for `DiffuseHair`. The materials are not looked up through the scene's
-    shapes, so `with_hair` and `with_skin` share the geometry and cost nothing.
+    shapes, so `with_hair` and `with_skin` share the geometry and cost nothing. `field` is what the
+    hair sends beyond its material: `render_olat`, `render_environment`, `render_mixed` and the
+    smoothed pictures show it, gradients and scanlines do not.
     """
 
     mi_scene: Any
@@ -44,15 +53,16 @@ class HairScene:
     hair: HairAppearance | DiffuseHair
     skin: tuple[float, float, float]
     hair_bsdf: Any | None
+    field: SceneField | None = None
 
     def with_hair(
         self, hair: HairAppearance | DiffuseHair, *, bsdf: str = "extended_hair"
     ) -> HairScene:
-        """The same geometry with another hair material; nothing is rebuilt.
+        """The same geometry with another hair material and no field; nothing is rebuilt.
 
         `bsdf` is the plugin of a `HairAppearance`: ours, or Mitsuba's `"hair"` for comparisons.
         """
-        return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair, bsdf))
+        return replace(self, hair=hair, hair_bsdf=_hair_bsdf(hair, bsdf), field=None)
 
     def with_skin(self, skin: ArrayLike) -> HairScene:
         """The same geometry with another diffuse albedo `skin (3,)` on the head."""

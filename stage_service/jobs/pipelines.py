@@ -16,12 +16,13 @@ PIPELINES: dict[str, tuple[str, ...]] = {
     "reconstruct": ("reconstruct", "evaluate", "results"),
     "fit": ("fit", "assess", "results"),
     "appearance": ("fit", "inverse_rendering", "assess", "results"),
+    "fields": ("fit", "inverse_rendering", "fields", "assess", "results"),
 }
 """Each step is a checkpoint: after a crash the job goes on at the step that was under way. What
 nobody waits for comes last: results and pictures are there before frames are compressed."""
 
-RENDERING = frozenset({"fit", "inverse_rendering", "assess"})
+RENDERING = frozenset({"fit", "inverse_rendering", "fields", "assess"})
 """Steps that a GPU makes several times faster, where Dr.Jit has one."""
 
-STEPS_VERSION = "4"
+STEPS_VERSION = "5"
 """Raise it when a pipeline's steps change: a job begun under other steps is not taken up again."""

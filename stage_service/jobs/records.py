@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from appearance import InverseRenderingRequest
+from appearance import FieldRequest, InverseRenderingRequest
 from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
 from reconstruction import ReconstructOptions
@@ -29,8 +29,8 @@ class JobOptions(Strict):
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may observe:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
     against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
-    file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering` and `assess` go to the step
-    of that name.
+    file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering`, `fields` and `assess` go to
+    the step of that name.
     """
 
     method: Method = "light_planes"
@@ -43,6 +43,7 @@ class JobOptions(Strict):
     reconstruct: ReconstructOptions = Field(default_factory=ReconstructOptions)
     fit: FitOptions = Field(default_factory=FitOptions)
     inverse_rendering: InverseRenderingRequest = Field(default_factory=InverseRenderingRequest)
+    fields: FieldRequest = Field(default_factory=FieldRequest)
     assess: AssessOptions = Field(default_factory=AssessOptions)
 
     @field_validator("reconstruct")

@@ -83,6 +83,15 @@ def inverse_rendering(context: StepContext) -> Figures:
     return run(**context.for_appearance(), request=context.options.inverse_rendering)
 
 
+def fields(context: StepContext) -> Figures:
+    """What the hair reflects beyond its material: `field.npz`, or in `rejected` where pictures that
+    it was not fitted to are better without it. Killed, it goes on behind the views that were done.
+    """
+    from appearance import fit_field_validated as run
+
+    return run(**context.for_appearance(), request=context.options.fields)
+
+
 def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
     from appearance import assess as run
@@ -123,7 +132,11 @@ def results(context: StepContext) -> Figures:
     plot_report(report, plots)
     done = {step: result["figures"] for step, result in context.previous.items()}
     figures: Figures = {"stages": {k: v["seconds"] for k, v in context.previous.items()}}
-    for step, name in (("assess", "images"), ("inverse_rendering", "inverse_rendering")):
+    for step, name in (
+        ("assess", "images"),
+        ("inverse_rendering", "inverse_rendering"),
+        ("fields", "field"),
+    ):
         if step in done:
             figures[name] = done[step]
     if "visible" in done.get("evaluate", {}):
@@ -138,5 +151,14 @@ def results(context: StepContext) -> Figures:
     return {"results": "results.json", "page": write_page(model).name}
 
 
-_ALL = (compress, reconstruct, fit, inverse_rendering, assess, evaluate, results)
+_ALL = (
+    compress,
+    reconstruct,
+    fit,
+    inverse_rendering,
+    fields,
+    assess,
+    evaluate,
+    results,
+)
 STEPS: dict[str, Callable[[StepContext], Figures]] = {step.__name__: step for step in _ALL}

@@ -16,6 +16,7 @@ from stage_service.cli.support.commands import (
 )
 
 METHODS = ("sun", "inverse_rendering")
+FIELDS = ("none", "modulation", "additive")
 
 
 def add(commands: Commands) -> None:
@@ -25,6 +26,13 @@ def add(commands: Commands) -> None:
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
     fit.add_argument("--method", choices=METHODS, default="sun")
     fit.add_argument("--options", help="the method's options as JSON")
+    fit.add_argument(
+        "--field",
+        choices=FIELDS,
+        help="then fit what the hair reflects beyond its material: a factor on its light "
+        "(modulation), or light that is added (additive); none removes it",
+    )
+    fit.add_argument("--field-options", help="the field's options as JSON")
     add_held_out(fit)
     fit.add_argument("--environment", default="studio", help="studio, sky, or an .hdr or .exr file")
     fit.add_argument("--seed", type=int, default=0)
@@ -36,14 +44,21 @@ def run(args: argparse.Namespace, output: Output) -> None:
     Write MODEL/appearance.json: roughness and colour of hair and skin (method sun).
     inverse_rendering goes on from there, with a sun fit first where there is none that held out the
     same: hair that varies over the scalp and along strands, and the lights as they are found, in
-    MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With held-out cameras or
-    lights, judge the model on them.
+    MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With --field, MODEL/
+    field.npz holds what the hair reflects beyond that, on top of a fit that is there already where
+    it held out the same. With held-out cameras or lights, judge the model on them.
     """
     from appearance import HeldOut
     from appearance.sun_fit.fitted_appearance import FittedAppearance
     from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions
-    from stage_service.jobs.steps import StepContext, assess, fit, inverse_rendering
+    from stage_service.jobs.steps import (
+        StepContext,
+        assess,
+        fields,
+        fit,
+        inverse_rendering,
+    )
     from stage_service.model_page import write_page
 
     model, inverse = Model(args.model), args.method == "inverse_rendering"
@@ -53,16 +68,22 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "environment": args.environment,
         "seed": args.seed,
         "inverse_rendering" if inverse else "fit": read_json(args.options),
+        "fields": {"field": args.field or "none", **read_json(args.field_options)},
     }
     options = parse_options(JobOptions, asked)
     data: dict[str, Any] = {"model": str(model), "method": args.method}
     held_out = HeldOut(options.held_out_cameras, options.held_out_lights)
-    if not (inverse and FittedAppearance.is_of(model, held_out)):
+    there = FittedAppearance.is_of(model, held_out)
+    if not (there and (inverse or args.field)):
         with progress_bar("sun") as progress:
             fit(StepContext(args.capture, model, options, progress))
     if inverse:
         with progress_bar("inverse") as progress:
             data |= inverse_rendering(StepContext(args.capture, model, options, progress))
+    if args.field:
+        with progress_bar("field") as progress:
+            context = StepContext(args.capture, model, options, progress)
+            data["field"] = fields(context)
     data["appearance"] = model.json("appearance.json")
     if options.held_out_cameras or options.held_out_lights:
         with progress_bar("assess") as progress:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from reconstruction import Progress
     from reconstruction.arrays import Floats
 
+FIELDS = ("none", "modulation", "additive")
 SIZE = 512
 """Pixels across, where no camera of a rig says."""
 
@@ -36,6 +37,11 @@ def add(commands: Commands) -> None:
         "--out",
         type=Path,
         help=".png (exposed, sRGB) or .exr (linear), instead of MODEL/render.png",
+    )
+    render.add_argument(
+        "--field",
+        choices=FIELDS,
+        help="show the model with its field of this kind, or without one; default: as it is",
     )
     render.add_argument("--spp", type=int, default=64, help="samples a pixel")
     render.add_argument("--seed", type=int, default=0)
@@ -70,7 +76,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
     progress("building the scene", 0.0)
     model = Model(args.model)
-    fitted = FittedModel.load(model, capture)
+    fitted = FittedModel.load(model, capture).with_field_of(model, args.field)
     camera = three_quarter_view(fitted.strands, SIZE)
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
@@ -90,6 +96,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         "camera": camera.name,
         "lights": args.light,
         "environment": environment,
+        "field": "none" if fitted.field is None else fitted.field.kind,
         "seconds": time.perf_counter() - start,
     }
 

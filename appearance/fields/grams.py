@@ -1,0 +1,93 @@
+"""Pictures reduced to what a fit of harmonics needs of them: lights vanish from its iterations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from appearance.render.harmonics import count_of, harmonics
+from reconstruction import Light
+from reconstruction.arrays import Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Pixels under single lights: `target` is to be `regressor` times harmonics of the light.
+
+    `regressor`, `target` and `weight (L, P, 3)`; `points (P, 3)` are what the lights are seen from.
+    """
+
+    lights: tuple[Light, ...]
+    points: Floats
+    regressor: Floats
+    target: Floats
+    weight: Floats
+
+    def directions(self, degree: int, light: int) -> Floats:
+        """The harmonics `(P, n)` of the directions from the points to a light by its number."""
+        return harmonics(self.lights[light].position - self.points, degree)
+
+    def under(self, lights: list[int]) -> Samples:
+        """The same pixels under some of the lights, by their numbers."""
+        arrays = (x[lights] for x in (self.regressor, self.target, self.weight))
+        return Samples(tuple(self.lights[i] for i in lights), self.points, *arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class Gram:
+    """The weighted squared error of a view as a quadratic of its pixels' harmonics.
+
+    For coefficients g `(P, n, 3)` it is the sum over pixels and channels of
+    g · `matrix` g − 2 `right` · g, and `constant`. `packed (P, 3, n(n + 1)/2)` holds the upper
+    triangles of the symmetric matrices, `right (P, n, 3)`.
+    """
+
+    packed: Floats
+    right: Floats
+    constant: float
+
+    @classmethod
+    def of(cls, samples: Samples, degree: int) -> Gram:
+        """The quadratic of `samples`."""
+        y = np.zeros((len(samples.lights), len(samples.points), count_of(degree)), np.float32)
+        for i in range(len(y)):
+            y[i] = samples.directions(degree, i)
+        upper = np.triu_indices(y.shape[-1])
+        both = (y[..., upper[0]] * y[..., upper[1]]).transpose(1, 0, 2)  # (P, L, pairs)
+        x, w = samples.regressor, samples.weight
+        packed = np.matmul((w * x * x).transpose(1, 2, 0), both)
+        right = np.matmul(y.transpose(1, 2, 0), (w * x * samples.target).transpose(1, 0, 2))
+        constant = float((w * samples.target**2).sum(dtype=np.float64))
+        return cls(packed, right, constant)
+
+    def times(self, g: Floats) -> Floats:
+        """The matrices times `g (P, n, 3)`."""
+        n = g.shape[1]
+        row, column = np.triu_indices(n)
+        full = np.empty((*self.packed.shape[:2], n, n), np.float32)
+        full[..., row, column] = self.packed
+        full[..., column, row] = self.packed
+        return np.asarray(
+            np.matmul(full, g.transpose(0, 2, 1)[..., None])[..., 0].transpose(0, 2, 1)
+        )
+
+    def diagonal(self, degrees: Ints) -> Floats:
+        """The matrices' diagonals `(P, n, 3)`, their mean within each degree."""
+        n = len(degrees)
+        row, column = np.triu_indices(n)
+        out = self.packed[..., row == column].transpose(0, 2, 1).copy()
+        for k in np.unique(degrees):
+            of_degree = degrees == k
+            out[:, of_degree] = out[:, of_degree].mean(axis=1, keepdims=True)
+        return np.asarray(out)
+
+    def __add__(self, other: Gram) -> Gram:
+        """The quadratic of the same pixels under the lights of both."""
+        right, constant = self.right + other.right, self.constant + other.constant
+        return Gram(self.packed + other.packed, right, constant)
+
+    def error(self, g: Floats) -> float:
+        """The weighted squared error at `g (P, n, 3)`."""
+        change = np.sum(g * (self.times(g) - 2 * self.right), dtype=np.float64)
+        return self.constant + float(change)

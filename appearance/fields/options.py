@@ -1,0 +1,58 @@
+"""How a field is fitted; light, so that a service checks options without Mitsuba."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from reconstruction.options import Count, options
+
+Kind = Literal["modulation", "additive", "whole"]
+"""What the harmonics are of: a factor on inverse rendering's light, what is added to it, or all."""
+Degree = Annotated[int, Field(ge=0, le=3)]
+Level = tuple[Count, Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+
+NESTED: tuple[Level, ...] = ((2, 4, 4), (4, 12, 12), (8, 32, 32))
+OF_STRANDS: tuple[Level, ...] = ((8, 0, 0),)
+"""Eight anchors on every strand (GroomLight §3.4)."""
+
+
+@options
+class FieldOptions:
+    """How a field of reflectance is fitted.
+
+    `kind`: "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
+    frames; "additive" (GroomLight §3.3) adds to it, in the world's frame; "whole" is all of the
+    light, without inverse rendering (GaussianHair's appearance, as GroomLight's supplement has it).
+    `degree` of the harmonics of the direction to the camera and to the light. `levels`: grids of
+    anchors (n_c along strands, w, h cells of the scalp's map) whose values add up, from coarse to
+    fine; w = h = 0 are anchors on every strand. `ridges` are tried from the last to the first,
+    and grow with the degrees a and b of a coefficient as (1 + a(a + 1))(1 + b(b + 1)). `iterations`
+    of conjugate gradients at most, fewer once the gradient has fallen to `tolerance`.
+    """
+
+    kind: Kind = "modulation"
+    degree: Degree = 2
+    levels: tuple[Level, ...] = NESTED
+    ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
+    iterations: Count = 40
+    tolerance: Annotated[float, Field(gt=0)] = 1e-3
+
+
+@options
+class FieldRequest:
+    """What a job may ask for.
+
+    Of the training lights `lights` and of each camera's hair `pixels` are used, all where there are
+    fewer. `hits` rays a pixel say which strands it shows; pictures of inverse rendering have `spp`
+    paths a pixel of at most `max_depth` vertices. "none" fits no field.
+    """
+
+    field: Literal["none", "modulation", "additive"] = "modulation"
+    lights: Count = 64
+    pixels: Count = 20_000
+    hits: Annotated[int, Field(ge=1, le=64)] = 8
+    spp: Count = 36
+    max_depth: Count = 16
+    fit: FieldOptions = FieldOptions()

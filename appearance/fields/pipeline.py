@@ -1,0 +1,135 @@
+"""A field fitted to a capture: its frames beside what inverse rendering makes of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from appearance.bsdf.maps import MappedStrands
+from appearance.fields.anchors import Places
+from appearance.fields.fit import FieldFit, Monitor, Pictures, fit_pictures
+from appearance.fields.hits import RECORD, HitOptions, find_hits
+from appearance.fields.options import FieldRequest
+from appearance.observations import chosen, observe
+from appearance.render.harmonics import count_of
+from appearance.render.smoothed import olat_smoothed
+from appearance.render.tracing import Sampling
+from appearance.scene.hair_scene import HairScene
+from reconstruction import Capture, Light, Model, ModelError, Progress
+from reconstruction.arrays import Floats, Ints
+from reconstruction.files.durable import writing
+from reconstruction.report.report import free_memory
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """What inverse rendering has to show of a capture: a scene with its maps and no field.
+
+    `lights` are those of the fit, as they were found; `mapped` the scene's strands; `scale` the
+    capture's exposure.
+    """
+
+    mapped: MappedStrands
+    scene: HairScene
+    lights: tuple[Light, ...]
+    scale: float
+
+
+def fit_field(
+    training: Capture,
+    model: Model,
+    rendered: Rendered,
+    request: FieldRequest,
+    progress: Progress,
+    seed: int = 0,
+) -> FieldFit:
+    """Fit a field to the frames of `training` under the lights of `rendered`.
+
+    Hits and rendered pictures are kept in the model's folder "work" while the fit runs: killed, it
+    goes on behind the last view that was rendered. Raises `ModelError` where no camera sees hair or
+    memory is short.
+    """
+    options = replace(request.fit, kind="additive" if request.field == "additive" else "modulation")
+    rng, folder = np.random.default_rng(seed), model.work("field")
+    pixels = {
+        c.name: chosen(model.mask(c.name, "hair", training), request.pixels, rng)
+        for c in training.rig.cameras
+    }
+    pixels = {name: index for name, index in pixels.items() if len(index)}
+    if not pixels:
+        raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
+    _check_memory([len(p) for p in pixels.values()], len(rendered.lights), request, model)
+    views = []
+    for i, (name, index) in enumerate(pixels.items()):
+        progress(f"{name}: rendering {len(rendered.lights)} lights", 0.7 * i / len(pixels))
+        views.append(_pictures(training, rendered, (name, index), request, folder, seed))
+    monitor = Monitor(
+        lambda what, share: progress(what, 0.7 + 0.3 * share), folder / "fit.checkpoint.npz"
+    )
+    return fit_pictures(views, Places.of(rendered.mapped.root_uv), rendered.scale, options, monitor)
+
+
+def _pictures(
+    training: Capture,
+    rendered: Rendered,
+    view: tuple[str, Ints],
+    request: FieldRequest,
+    folder: Path,
+    seed: int,
+) -> Pictures:
+    """One camera's pictures; the rendered ones from `folder`, where they are made once."""
+    name, index = view
+    camera = training.rig.camera(name)
+    hits = find_hits(rendered.mapped, camera, index, HitOptions(request.hits, seed), folder)
+    sampling = Sampling(request.spp, request.max_depth, seed)
+    key = hashlib.sha256(repr((asdict(sampling), camera.to_dict())).encode())
+    for light in rendered.lights:
+        key.update(repr(light.to_dict()).encode())
+    for array in (index, *_materials(rendered.scene)):
+        key.update(np.ascontiguousarray(array).tobytes())
+    file = folder / f"{name}-{key.hexdigest()[:16]}-rendered.npy"
+    if not file.is_file():
+        # its indirect light smoothed: a noisy regressor would pull what is fitted towards 0
+        made = olat_smoothed(rendered.scene, camera, rendered.lights, sampling, pixels=index)
+        folder.mkdir(parents=True, exist_ok=True)
+        with writing(file) as part, part.open("wb") as out:
+            np.save(out, made)
+    names = [light.name for light in rendered.lights]
+    seen = observe(training, name, names, index)
+    shown: Floats = np.load(file, mmap_mode="r")
+    return Pictures(hits, rendered.lights, shown, seen.radiance, seen.valid)
+
+
+def _materials(scene: HairScene) -> Sequence[Any]:
+    """The arrays that a scene's pictures depend on."""
+    parts: list[Any] = [np.array(scene.skin)]
+    shapes = (scene.hair_shape, scene.head_shape, scene.hair_bsdf)
+    for part in (x for x in shapes if x is not None):
+        values = mi.traverse(part)
+        parts += [np.array(values[k]) for k in sorted(values.keys()) if "face" not in k]
+    return parts
+
+
+def memory_needed(pixels: Sequence[int], lights: int, request: FieldRequest) -> float:
+    """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
+    n = count_of(request.fit.degree)
+    hit = RECORD.itemsize + 2 * n * 8 + 4 * sum((2 * k + 1) ** 2 for k in range(1, 4))
+    pixel = request.hits * hit + 2 * 3 * 4 * (n * (n + 1) // 2 + 3 * n) + 8 * 3 * lights
+    view = max(pixels) * (3 * 8 * 6 * lights + 4 * n * (n + 1) // 2 * lights)
+    return (sum(pixels) * pixel + view) / 1e9
+
+
+def _check_memory(pixels: Sequence[int], lights: int, request: FieldRequest, model: Model) -> None:
+    needed, free = memory_needed(pixels, lights, request), free_memory()
+    if free is not None and needed > free:
+        raise ModelError(
+            f"{model}: a field of {sum(pixels)} pixels under {lights} lights takes about "
+            f"{needed:.1f} GB of memory, and {free:.1f} GB are free: lower the field's pixels, now "
+            f"{request.pixels}, hits, now {request.hits}, or lights, now {request.lights}"
+        )

@@ -1,0 +1,120 @@
+"""What a field of reflectance does to the light that single pixels send to the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance.render.harmonics import harmonics, terms
+from appearance.scene.hair_scene import SCALE, HairScene
+from reconstruction import Camera, Light
+from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class PixelField:
+    """Spherical harmonics of the direction to a light in the world, for each of P pixels.
+
+    `coefficients (P, n, 3)`; with a = Y(ω) · coefficients, what a light sends by way of a pixel is
+
+    - modulation: the path tracer's contribution times max(0, 1 + a), sample by sample
+    - `additive`: the contribution plus a times the light's irradiance at the pixel's point; where
+      `alone`, that without the path tracer's
+
+    `points (P, 3)` in metres are what near lights are seen from. Pixels whose points are 0 are off
+    the hair, and have coefficients of 0.
+    """
+
+    coefficients: Floats
+    points: Floats
+    additive: bool = False
+    alone: bool = False
+
+    @property
+    def degree(self) -> int:
+        """The harmonics' highest degree."""
+        return int(np.sqrt(self.coefficients.shape[1])) - 1
+
+    def lit(self, radiance: Floats, lights: Sequence[Light]) -> Floats:
+        """`radiance (L, P, 3)` under each of `lights` alone, as the field has it."""
+        out = np.empty_like(radiance)
+        for i, light in enumerate(lights):
+            answer = self.answer(light)
+            if not self.additive:
+                out[i] = radiance[i] * np.maximum(1 + answer, 0)
+                continue
+            lit = answer * self.irradiance(light)
+            out[i] = np.maximum(lit if self.alone else radiance[i] + lit, 0)
+        return out
+
+    def answer(self, light: Light) -> Floats:
+        """a `(P, 3)` under one light."""
+        y = harmonics(light.position - self.points, self.degree)
+        return np.asarray(np.einsum("pn,pnc->pc", y, self.coefficients))
+
+    def irradiance(self, light: Light) -> Floats:
+        """W/m² across the light's direction, at the points `(P, 3)`."""
+        squared = np.sum((light.position - self.points) ** 2, axis=-1, keepdims=True)
+        return np.asarray(light.intensity_towards(self.points) / squared, np.float32)
+
+    def added(
+        self, lights: Sequence[Light], weights: Array, integrals: Sequence[AnyFloats]
+    ) -> Floats:
+        """What an additive field adds under `lights` times `weights (L, 3)`, and under environments
+        whose integrals with the harmonics are `(n, 3)` each: `(P, 3)`."""
+        total = np.zeros((len(self.points), 3))
+        for light, weight in zip(lights, weights, strict=True):
+            total += weight * self.answer(light) * self.irradiance(light)
+        for each in integrals:
+            total += np.einsum("nc,pnc->pc", each, self.coefficients)
+        return total.astype(np.float32)
+
+    def mean_factor(self, integrals: AnyFloats) -> Floats:
+        """About what an environment's light is multiplied by, in the mean: `(P, 3)`, at least 0.1.
+
+        `integrals (n, 3)`, of which the first is the map's light.
+        """
+        first = np.maximum(integrals[0], 1e-30)
+        mean = integrals / first * harmonics((0, 0, 1.0), 0)
+        return np.maximum(1 + np.einsum("nc,pnc->pc", mean, self.coefficients), 0.1)
+
+
+class DeviceField:
+    """A modulation on the device: the factor on a light sample of a pixel."""
+
+    def __init__(self, field: PixelField) -> None:
+        # of distant light the direction is the same from all points
+        self._count, self._degree = field.coefficients.shape[1], field.degree
+        self._coefficients = mi.Float(for_kernels(field.coefficients.ravel()))
+        self._points = mi.Float(for_kernels((field.points * SCALE).ravel()))
+
+    def towards(self, slot: Any, direction: Any, active: Any) -> Any:
+        """`Color3f` for light from a unit `direction` at the pixel number `slot`."""
+        first, total = slot * self._count, mi.Color3f(1)
+        for k, y in enumerate(terms(self._degree, direction.x, direction.y, direction.z)):
+            total = total + y * dr.gather(mi.Color3f, self._coefficients, first + k, active)
+        return dr.maximum(total, 0)
+
+    def at(self, slot: Any, target: Any, active: Any) -> Any:
+        """`Color3f` for light from the point `target`, in the scene's units."""
+        point = dr.gather(mi.Point3f, self._points, slot, active)
+        return self.towards(slot, dr.normalize(target - point), active)
+
+
+def field_of(scene: HairScene, camera: Camera, pixels: Ints) -> PixelField | None:
+    """The field of `scene` at the flat `pixels (P,)`; None where it has none."""
+    if scene.field is None or not len(pixels):
+        return None
+    seen: PixelField = scene.field.seen_by(scene, camera, pixels)
+    return seen
+
+
+def factor_of(field: PixelField | None) -> DeviceField | None:
+    """The factors of a modulation; None of what multiplies nothing."""
+    return None if field is None or field.additive else DeviceField(field)

@@ -1,0 +1,234 @@
+"""Fields are found back where they were planted, and say nothing where nothing was seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.fields.anchors import Grid, Places, nested
+from appearance.fields.basis import ViewBasis
+from appearance.fields.fit import Monitor, fit_pictures
+from appearance.fields.grams import Gram
+from appearance.fields.options import FieldOptions
+from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conjugate_gradients
+from appearance.render.harmonics import harmonics
+from reconstruction import Light
+
+LEVELS = ((2, 3, 3), (4, 6, 6))
+EXACT = FieldOptions(degree=1, levels=LEVELS, ridges=(1e-5, 1e-3, 0.1))
+
+
+def fitted(planted, views, options=EXACT, monitor=None):
+    return fit_pictures(views, planted.places, planted.scale, options, monitor)
+
+
+@pytest.mark.parametrize("kind", ["modulation", "additive", "whole"])
+def test_a_planted_field_is_found_back(planted, kind):
+    truth = planted.truth(kind)
+    views = planted.views(truth)
+    options = replace(EXACT, kind=kind, ridges=(1e-7, 1e-5))
+    found = fitted(planted, views, options)
+    for group in ("new lights", "new views", "both new"):
+        scores = found.validation[group]
+        assert scores["with"] > scores["without"] + 20, group
+    far = [replace(x, position=2 * x.position, intensity=4 * x.intensity) for x in views[0].lights]
+    for view in views[::2]:
+        wanted, have = (f.at(view.hits).lit(view.rendered, far) for f in (truth, found.field))
+        np.testing.assert_allclose(have.sum(0), wanted.sum(0), rtol=0.04, atol=0.002 * wanted.max())
+
+
+def test_the_gram_is_the_error_of_the_pictures_it_was_made_of(planted):
+    """Against the sum over pixels and lights, written out."""
+    view = planted.views(planted.truth(degree=2), 6)[0]
+    view.valid[2, ::3] = False
+    samples = view.samples(replace(EXACT, degree=2), planted.scale)
+    gram = Gram.of(samples, 2)
+    rng = np.random.default_rng(0)
+    g = 0.2 * rng.normal(size=(len(view.hits.pixels), 9, 3)).astype(np.float32)
+    total = 0.0
+    for i, light in enumerate(view.lights):
+        y = harmonics(light.position - view.hits.middle(), 2)
+        shown = view.rendered[i] * planted.scale * (1 + np.einsum("pn,pnc->pc", y, g))
+        off = (shown - view.captured[i] * planted.scale) ** 2 * samples.weight[i]
+        total += float(off[view.valid[i]].sum())
+    assert gram.error(g) == pytest.approx(total, rel=1e-4)
+    assert samples.weight[2, ::3].max() == 0
+
+
+@pytest.mark.parametrize("strands", [True, False])
+def test_pixels_and_anchors_are_transposes(planted, strands):
+    view = planted.views(planted.truth(), 4)[1]
+    grid = Grid.of((3, 4, 4), len(planted.strands))
+    basis = ViewBasis.of(view.hits, grid, planted.places, 2, in_strands=strands)
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(grid.count, 9 * 9 * 3)).astype(np.float32)
+    g = rng.normal(size=(len(view.hits.pixels), 9, 3)).astype(np.float32)
+    one, other = (basis.at_pixels(x) * g).sum(), (x * basis.at_anchors(g)).sum()
+    assert one == pytest.approx(other, rel=1e-3, abs=0.05)
+
+
+def test_coarse_grids_say_on_the_finest_what_they_say_by_themselves(planted):
+    grids = [Grid.of(level, 300) for level in ((2, 2, 2), (3, 4, 4))]
+    up = nested(grids, planted.places)
+    rng = np.random.default_rng(0)
+    coarse = rng.normal(size=grids[0].count).astype(np.float32)
+    fine = up @ np.concatenate([coarse, np.zeros(grids[1].count, np.float32)])
+    strand, along = rng.integers(300, size=50), rng.uniform(size=50)
+
+    def at(grid, values):
+        low, high, share = grid.near(strand, along, planted.places)
+        return (1 - share) * values[low] + share * values[high]
+
+    np.testing.assert_allclose(at(grids[1], fine), at(grids[0], coarse), atol=1e-6)
+
+
+def system_of(planted, views, ridge, degree=1):
+    options = replace(EXACT, degree=degree)
+    grids = [Grid.of(level, len(planted.strands)) for level in LEVELS]
+    samples = [v.samples(options, planted.scale) for v in views]
+    seen = [
+        Seen(
+            ViewBasis.of(v.hits, grids[-1], planted.places, degree, in_strands=True),
+            Gram.of(s, degree),
+        )
+        for v, s in zip(views, samples, strict=True)
+    ]
+    return LeastSquares(seen, nested(grids, planted.places), degree, ridge), samples
+
+
+def test_conjugate_gradients_and_adam_go_to_the_same_minimum(planted):
+    system, samples = system_of(planted, planted.views(planted.truth(), 4)[:2], 0.03)
+    found = conjugate_gradients(system, 200, 1e-5)
+    least = system.objective(found)
+    rng = np.random.default_rng(0)
+    for size in (1e-2, -1e-2):
+        off = size * rng.normal(size=found.shape).astype(np.float32)
+        assert system.objective(found + off) > least
+    start = system.objective(np.zeros_like(found))
+    reference = adam(system, samples, AdamOptions(0.005, 1500))
+    assert (system.objective(reference) - least) / (start - least) < 0.05
+    assert np.abs(reference - found).max() < 0.3 * np.abs(found).max()
+
+
+def test_a_ridge_without_end_leaves_the_pictures_as_they_are(planted):
+    views = planted.views(planted.truth())
+    found = fitted(planted, views, replace(EXACT, ridges=(1e12,)))
+    lit = found.field.at(views[0].hits).lit(views[0].rendered, views[0].lights)
+    np.testing.assert_allclose(lit, views[0].rendered, rtol=1e-4, atol=1e-6)
+    assert any("strongest ridge" in w for w in found.warnings)
+    none = fitted(planted, views, replace(EXACT, ridges=(1e-20,)))
+    assert np.isfinite(none.field.values).all()
+    assert any("weakest ridge" in w for w in none.warnings)
+
+
+def test_anchors_that_no_camera_sees_are_zero(planted):
+    views = planted.views(planted.truth())
+    options = replace(EXACT, levels=((4, 6, 6),))
+    found = fitted(planted, views, options)
+    seen = set()
+    for view in views:
+        strand = view.hits.column("strand")
+        on = strand >= 0
+        grid = Grid.of((4, 6, 6), 300)
+        low, high, share = grid.near(
+            strand[on].astype(int), view.hits.column("along")[on], planted.places
+        )
+        seen |= set(low[share < 1]) | set(high[share > 0])
+    assert set(found.field.rows) <= seen
+    assert len(seen) < 4 * 36, "some cells have no strand in sight"
+
+
+def test_odd_data_give_a_field_or_a_sentence(planted):
+    views = planted.views(planted.truth())
+
+    def cut(lights, cameras=5):
+        return [
+            replace(
+                v,
+                lights=tuple(v.lights[i] for i in lights),
+                rendered=v.rendered[lights],
+                captured=v.captured[lights],
+                valid=v.valid[lights],
+            )
+            for v in views[:cameras]
+        ]
+
+    alone = fitted(planted, cut([3], 1))
+    assert np.isfinite(alone.field.values).all()
+    assert alone.validation == {}
+    assert any("nothing can be held out" in w for w in alone.warnings)
+    assert set(fitted(planted, cut([3])).validation) == {"new views"}
+    twins = fitted(planted, cut([0, 0, 1, 1, 2, 2, 3, 3]))
+    assert np.isfinite(twins.field.values).all()
+    saturated = [replace(v, valid=np.zeros_like(v.valid)) for v in views]
+    assert not fitted(planted, saturated).field.values.any()
+    # pixels that are black without the field say nothing, and no number is lost over them
+    black = [
+        replace(v, rendered=np.where(np.arange(16)[:, None, None] < 8, v.rendered, 0))
+        for v in views
+    ]
+    dark = fitted(planted, black)
+    assert np.isfinite(dark.field.values).all()
+    assert (dark.field.at(views[0].hits).lit(black[0].rendered, black[0].lights)[8:] == 0).all()
+    inside = tuple(Light(x.name, 0.01 * x.position, 1e-4 * x.intensity) for x in views[0].lights)
+    near = fitted(planted, [replace(v, lights=inside) for v in views])
+    assert np.isfinite(near.field.values).all()
+    with pytest.raises(ValueError, match="needs a view"):
+        fitted(planted, [])
+
+
+def test_saturated_pixels_weigh_nothing(planted):
+    views = planted.views(planted.truth())
+    spoilt = []
+    for v in views:
+        bad = np.random.default_rng(0).uniform(size=v.valid.shape) < 0.2
+        captured = np.where(bad[..., None], 50.0, v.captured)
+        spoilt.append(replace(v, captured=captured.astype(np.float32), valid=~bad))
+    found = fitted(planted, spoilt)
+    assert found.validation["both new"]["with"] > found.validation["both new"]["without"] + 15
+
+
+def test_frames_that_no_factor_explains_are_told(planted):
+    """Black frames under half of the lights: a smooth factor undershoots there."""
+    views = planted.views(planted.truth())
+    x = np.array([light.position[0] for light in views[0].lights])
+    lit = np.where(x > 0, 1, 0)[:, None, None] * np.ones(3)
+    half = [replace(v, captured=(v.rendered * lit).astype(np.float32)) for v in views]
+    found = fitted(planted, half, replace(EXACT, degree=2))
+    assert found.clamped > 0.01
+    assert any("modulated below black" in w for w in found.warnings)
+    assert found.validation["new lights"]["with"] > found.validation["new lights"]["without"]
+
+
+def test_a_fit_that_was_killed_goes_on_behind_the_ridges_it_had_done(planted, tmp_path):
+    views, told = planted.views(planted.truth()), []
+
+    def killed(what, share):
+        told.append(what)
+        if what.startswith("ridge 0.001: held-out"):
+            raise KeyboardInterrupt
+
+    options = replace(EXACT, ridges=(1e-5, 1e-3, 0.1, 10.0))
+    checkpoint = tmp_path / "field.checkpoint.npz"
+    with pytest.raises(KeyboardInterrupt):
+        fitted(planted, views, options, Monitor(killed, checkpoint))
+    again = []
+    found = fitted(planted, views, options, Monitor(lambda w, s: again.append(w), checkpoint))
+    assert not [w for w in again if w.startswith(("ridge 10:", "ridge 0.1:"))]
+    whole = fitted(planted, views, options)
+    assert found.errors == whole.errors
+    np.testing.assert_array_equal(found.field.values, whole.field.values)
+
+
+def test_places_of_edited_strands():
+    grid, places = (
+        Grid.of((3, 2, 2), 4),
+        Places.of(np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])),
+    )
+    low, high, share = grid.near(np.array([1]), np.array([0.75]), places)
+    assert (low[0], high[0], share[0]) == (4 + 2, 8 + 2, 0.5)
+    cut = Places(places.root_uv, np.full(4, 0.5), places.fitted)
+    assert grid.near(np.array([1]), np.array([1.0]), cut)[0][0] == 4 + 2
+    assert Grid.of((8, 0, 0), 4).near(np.array([3]), np.array([0.0]), places)[0][0] == 3

@@ -1,0 +1,190 @@
+"""A field of a capture: kept where held-out pictures are better with it, in every picture then."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance import (
+    Environment,
+    Exposure,
+    FieldRequest,
+    FittedModel,
+    HairAppearance,
+    HeldOut,
+    Sampling,
+    fit_field_validated,
+    render_olat,
+)
+from appearance.fields.options import FieldOptions
+from appearance.model import validated
+from appearance.model.edit import cut, restyled
+from appearance.render.coverage import coverage
+from appearance.sun_fit.fitted_appearance import FittedAppearance
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureWriter,
+    Light,
+    Model,
+    ModelError,
+    Rig,
+    Step,
+    Strands,
+)
+from reconstruction.geometry.lights import dome_positions
+
+HAIR = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
+REQUEST = FieldRequest(
+    lights=12,
+    spp=64,
+    max_depth=2,
+    fit=FieldOptions(degree=1, levels=((2, 3, 3),), ridges=(1e-3, 1e-2, 0.1)),
+)
+
+
+@pytest.fixture(scope="module")
+def made(small, tmp_path_factory):
+    """Frames of one hair that is twice as bright to the red as the model has it, on its strands."""
+    folder = tmp_path_factory.mktemp("field")
+    angles = np.arange(4) * np.pi / 2
+    cameras = tuple(
+        Camera.look_at(f"c{k}", 14, 14, (0.5 * np.cos(a), 0.5 * np.sin(a), 0.1), (0, 0, 0), 12)
+        for k, a in enumerate(angles)
+    )
+    lights = tuple(
+        Light(f"l{i}", p, np.full(3, 5.0)) for i, p in enumerate(dome_positions(12, 1.0))
+    )
+    strands = small.tuft(300)
+    model = Model(folder / "model").create()
+    model.write_strands(strands)
+    skin = (0.3, 0.3, 0.3)
+    FittedAppearance(HAIR, skin, skin, Exposure(3.0), 0.1, 0.1, 0.1, HeldOut()).save(model)
+    scene = FittedModel.load(model).scene()
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights)]
+    writer = CaptureWriter.create(
+        folder / "capture", Rig("tuft", cameras, lights), {"steps": [s.to_dict() for s in steps]}
+    )
+    for camera in cameras:
+        mask = coverage(scene, camera)["hair"] > 0.6
+        model.write_mask(camera.name, "hair", mask)
+        frames = render_olat(scene, camera, lights, spp=256, max_depth=2, seed=9)
+        for step, image in zip(steps, frames, strict=True):
+            shown = (image * (2.0, 1.0, 1.0)).astype(np.float32)
+            writer.write_frame(step, camera.name, shown)
+    writer.finish("completed", {})
+    return Capture(folder / "capture"), model
+
+
+@pytest.fixture
+def own(made, tmp_path):
+    capture, model = made
+    shutil.copytree(model.path, tmp_path / "model")
+    return capture, Model(tmp_path / "model")
+
+
+def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
+    capture, model = own
+    shares = []
+    result = fit_field_validated(
+        capture, model, request=REQUEST, progress=lambda what, share: shares.append(share)
+    )
+    assert shares == sorted(shares)
+    assert result["rendered"]
+    for scores in result["validation"].values():
+        assert scores["with"] > scores["without"] + 0.5
+    fitted = FittedModel.load(model, capture)
+    bare = fitted.without_field()
+    camera, light = capture.rig.camera("c1"), capture.rig.light("l5")
+    sky = Environment(np.ones((2, 4, 3), np.float32))
+    for lights, maps in (([light], []), ([], [sky])):
+        with_it, without = (
+            m.render(camera, lights, maps, Sampling(64, 2))[5:10, 5:10].sum((0, 1))
+            for m in (fitted, bare)
+        )
+        assert with_it[0] / without[0] == pytest.approx(2, rel=0.08)
+        assert with_it[1] / without[1] == pytest.approx(1, rel=0.08)
+    assert not model.work("field").exists()
+    assert not [w for w in model.report()["field"].warnings if "not rendered" in w]
+    assert fitted.with_field_of(model, "none").field is None
+    with pytest.raises(ModelError, match="no field of the kind additive"):
+        fitted.with_field_of(model, "additive")
+
+
+def test_edited_hair_keeps_its_field(own, tmp_path):
+    capture, model = own
+    fit_field_validated(capture, model, request=REQUEST)
+    fitted = FittedModel.load(model, capture)
+    order = np.random.default_rng(0).permutation(300)
+    strands = [fitted.strands.points[8 * k : 8 * k + 8] for k in order]
+    shuffled = restyled(fitted, Strands.from_list(strands, radius=4e-4))
+    camera, light = capture.rig.camera("c0"), [capture.rig.light("l3")]
+    pictures = [
+        m.render(camera, light, [], Sampling(64, 2)).sum((0, 1)) for m in (fitted, shuffled)
+    ]
+    np.testing.assert_allclose(pictures[1], pictures[0], rtol=0.02)
+    short = cut(fitted, 0.03)
+    short.save(Model(tmp_path / "short"))
+    again = FittedModel.load(Model(tmp_path / "short"))
+    np.testing.assert_allclose(again.field.places.kept, short.field.places.kept, rtol=1e-6)
+    bare = again.without_field()
+    one, other = (m.render(camera, light, [], Sampling(64, 2)).sum((0, 1)) for m in (again, bare))
+    # what lay hidden below is less well known
+    assert (one[0] / one[1]) / (other[0] / other[1]) == pytest.approx(2, rel=0.15)
+    model.write_strands(Strands.from_list(strands[:10], radius=4e-4))
+    fitted.appearance.save(model)
+    fitted.field.save(model)
+    with pytest.raises(ModelError, match=r"is of 300 strands and strands\.npz holds 10"):
+        FittedModel.load(model)
+
+
+def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
+    capture, model = own
+    fit = validated.fit_field
+
+    def worse(*args):
+        found = fit(*args)
+        scores = {g: {"without": 30.0, "with": 29.5} for g in ("new lights",)}
+        return replace(found, validation=scores)
+
+    monkeypatch.setattr(validated, "fit_field", worse)
+    result = fit_field_validated(capture, model, request=REQUEST)
+    assert not result["rendered"]
+    fitted = FittedModel.load(model, capture)
+    assert fitted.field is None
+    assert fitted.with_field_of(model, "modulation").field is not None
+    warnings = model.report()["field"].warnings
+    told = "new lights: pictures are better without it, 30.00 dB against 29.50"
+    assert sum(told in w for w in warnings) == 1
+    assert fit_field_validated(capture, model, request=FieldRequest("none")) == {
+        "left_out": "no field was asked for"
+    }
+
+
+def test_a_killed_fit_renders_no_view_twice_and_memory_is_refused(own, monkeypatch):
+    from appearance.fields import pipeline
+
+    capture, model = own
+
+    def killed(what, share):
+        if what.startswith("c2"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_field_validated(capture, model, request=REQUEST, progress=killed)
+    rendered = []
+    smoothed = pipeline.olat_smoothed
+
+    def counted(scene, camera, *args, **more):
+        rendered.append(camera.name)
+        return smoothed(scene, camera, *args, **more)
+
+    monkeypatch.setattr(pipeline, "olat_smoothed", counted)
+    fit_field_validated(capture, model, request=REQUEST)
+    assert rendered == ["c2", "c3"]
+    monkeypatch.setattr(pipeline, "free_memory", lambda: 1e-4)
+    with pytest.raises(ModelError, match=r"takes about 0\.0 GB of memory, and 0\.0 GB are free"):
+        fit_field_validated(capture, model, request=REQUEST)
