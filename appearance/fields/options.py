@@ -37,7 +37,7 @@ class FieldOptions:
     levels: tuple[Level, ...] = NESTED
     ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
     iterations: Count = 40
-    tolerance: Annotated[float, Field(gt=0)] = 1e-3
+    tolerance: Annotated[float, Field(gt=0)] = 0.01
 
 
 @options

@@ -17,7 +17,9 @@ from appearance.render.harmonics import harmonics
 from reconstruction import Light
 
 LEVELS = ((2, 3, 3), (4, 6, 6))
-EXACT = FieldOptions(degree=1, levels=LEVELS, ridges=(1e-5, 1e-3, 0.1))
+EXACT = FieldOptions(
+    degree=1, levels=LEVELS, ridges=(1e-5, 1e-3, 0.1), tolerance=1e-4, iterations=100
+)
 
 
 def fitted(planted, views, options=EXACT, monitor=None):
