@@ -28,7 +28,7 @@ class Quality:
     rows of a camera and pose, `together` paths one light vector.
     """
 
-    lights: int = 20
+    lights: int = 16
     sweep: int = 16
     together: int = 24
     depth: int = 16
@@ -37,7 +37,7 @@ class Quality:
     @classmethod
     def scaled(cls, spp: int) -> Quality:
         """The default proportions with `spp` paths for the lights."""
-        return cls(spp, max(1, 4 * spp // 5), max(1, 6 * spp // 5))
+        return cls(spp, spp, max(1, 3 * spp // 2))
 
 
 @dataclass(frozen=True, eq=False)

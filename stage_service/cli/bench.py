@@ -15,6 +15,7 @@ BENCHMARKS = {
     "agreement": "a capture that Blender Cycles rendered, from its true strands",
     "appearance": "inverse rendering and its ablations on subjects of known appearance",
     "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
+    "frames": "the simulators' frames beside many paths: error against run time",
     "gradients": "path replay beside finite differences",
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, beside baselines",

@@ -22,6 +22,7 @@ MODULES = {
     "agreement": "benchmarks.renderers.agreement",
     "appearance": "benchmarks.appearance.ablations",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
+    "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",

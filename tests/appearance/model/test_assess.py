@@ -220,6 +220,18 @@ def test_smoothing_keeps_the_mean_and_takes_the_noise(made):
     assert error[1] < 0.85 * error[0]
 
 
+def test_few_paths_bring_direct_light_as_many_do(made):
+    capture, _, scene = made
+    camera, lights = capture.rig.cameras[0], [capture.rig.light("l4")]
+    mask = coverage(scene, camera)["hair"] > 0.5
+    reference, many = (
+        render_olat(scene, camera, lights, spp=spp, max_depth=1, seed=spp)[0][mask]
+        for spp in (576, 36)
+    )
+    few = olat_smoothed(scene, camera, lights, Sampling(4, 1, 3))[0][mask]
+    assert np.mean((few - reference) ** 2) < 0.8 * np.mean((many - reference) ** 2)
+
+
 def test_smoothing_does_not_cross_from_hair_to_head():
     share = {k: np.zeros((16, 16), np.float32) for k in ("hair", "head")}
     share["hair"][:, :8], share["head"][:, 8:] = 1, 1
