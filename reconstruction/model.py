@@ -42,6 +42,7 @@ FILES = {
     "lights.json": "the lights as inverse rendering found them",
     "field.npz": "what the hair reflects beyond its material (hairstage fit --field)",
     "rejected": "the same three files, where validation frames prefer going without",
+    "samples": "captured frames by camera, for pictures that interpolate them",
     "comparison.png": "held-out frames, captured and rendered",
     "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",
     "relit.png": "the hair under an environment map",

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from appearance.render.coverage import sees
 from appearance.render.paths import Surface, camera_rays
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction import Camera, Capture, Light
@@ -18,8 +19,6 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
 CAMERAS = 3
 """Nearest cameras that are asked; lights are three, too."""
-FUZZ = 0.005
-"""Metres of hair before a point that do not hide it: strands are porous, and off by as much."""
 
 
 def three_nearest(
@@ -79,7 +78,7 @@ class NearestCameras:
             inside = (depth > 0) & others[i].inside(where)
             pixels[k][met] = where
             fallback[k][met] = weight * inside
-            weights[k][met] = weight * (inside & _seen(scene, points[met], others[i]))
+            weights[k][met] = weight * (inside & sees(scene, others[i], points[met]))
         weights = np.where(weights.any(axis=0), weights, fallback)
         total = weights.sum(axis=0)
         weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
@@ -136,15 +135,3 @@ def _first_hits(scene: HairScene, camera: Camera, mask: Bools) -> tuple[Array, B
         met |= mask
     directions = camera.rays(np.stack([column, row], axis=-1)).reshape(*shape, 3)
     return camera.center + depth[..., None] * directions, met
-
-
-def _seen(scene: HairScene, points: Array, camera: Camera) -> Bools:
-    """Whether nothing but `FUZZ` lies between `points (P, 3)` and the camera `(P,)`."""
-    way = camera.center - points
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    start, end = ((points + FUZZ * way) * SCALE).T, camera.center * SCALE
-    origin = mi.Point3f(*(mi.Float(x.astype(np.float32)) for x in start))
-    towards = mi.Vector3f(*(float(x) for x in end)) - mi.Vector3f(origin)
-    ray = mi.Ray3f(origin, dr.normalize(towards))
-    ray.maxt = dr.norm(towards)
-    return ~np.array(scene.mi_scene.ray_test(ray, mi.Bool(True)), dtype=bool)

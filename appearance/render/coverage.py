@@ -7,9 +7,14 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.render.paths import Surface, wave
-from appearance.scene.hair_scene import HairScene
+from appearance.scene.hair_scene import SCALE, HairScene
+from appearance.scene.opaque import opaque
 from reconstruction import Camera
-from reconstruction.arrays import Floats, Ints
+from reconstruction.array_backend import for_kernels
+from reconstruction.arrays import AnyFloats, Bools, Floats, Ints
+
+FUZZ = 0.005
+"""Metres of hair before a point that do not hide it: strands are porous, and off by as much."""
 
 
 def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, Floats]:
@@ -38,3 +43,15 @@ def covered_pixels(scene: HairScene, camera: Camera, spp: int = 9) -> Ints:
     """
     shares = coverage(scene, camera, spp)
     return np.flatnonzero((shares["hair"] + shares["head"]).ravel() > 0)
+
+
+def sees(scene: HairScene, camera: Camera, points: AnyFloats) -> Bools:
+    """Whether nothing but `FUZZ` lies between `points (P, 3)`, metres, and the camera `(P,)`."""
+    way = camera.center - points
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    start, end = ((points + FUZZ * way) * SCALE).T, camera.center * SCALE
+    origin = mi.Point3f(*(mi.Float(for_kernels(x)) for x in start))
+    towards = mi.Vector3f(*opaque(end)) - mi.Vector3f(origin)
+    ray = mi.Ray3f(origin, dr.normalize(towards))
+    ray.maxt = dr.norm(towards)
+    return ~np.array(scene.mi_scene.ray_test(ray, mi.Bool(True)), dtype=bool)

@@ -17,6 +17,7 @@ BENCHMARKS = {
     "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
     "frames": "the simulators' frames beside many paths: error against run time",
     "gradients": "path replay beside finite differences",
+    "interpolation": "captured frames interpolated on strands, standard and guided by a model",
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, beside baselines",
     "masks": "automatic hair masks beside true ones, at several path counts",

@@ -24,6 +24,7 @@ MODULES = {
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",
+    "interpolation": "benchmarks.fields.interpolation",
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.support.commands import Commands, Output, add_command, progress_bar
 
 if TYPE_CHECKING:
-    from reconstruction import Progress
+    from appearance.model.interpolated import InterpolationOptions, Pose
+    from reconstruction import Camera, Capture, Light, Model, Progress
     from reconstruction.arrays import Floats
 
-FIELDS = ("none", "modulation", "additive")
+FIELDS = ("none", "modulation", "additive", "interpolation")
 SIZE = 512
 """Pixels across, where no camera of a rig says."""
 
@@ -41,7 +43,20 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--field",
         choices=FIELDS,
-        help="show the model with its field of this kind, or without one; default: as it is",
+        help="show the model with its field of this kind, or without one, or the hair as the frames "
+        "of --capture have it between their lights and cameras (interpolation); default: as it is",
+    )
+    render.add_argument(
+        "--guide",
+        choices=("kajiya_kay", "none"),
+        default="kajiya_kay",
+        help="what guides an interpolation; none is the standard one",
+    )
+    render.add_argument(
+        "--refine", action="store_true", help="turn the guide's tangents to each camera's frames"
+    )
+    render.add_argument(
+        "--strands", type=Path, help="a strand file of another pose: the same strands, moved"
     )
     render.add_argument("--spp", type=int, default=64, help="samples a pixel")
     render.add_argument("--seed", type=int, default=0)
@@ -51,18 +66,22 @@ def run(args: argparse.Namespace, output: Output) -> None:
     """A model under an environment map, or lights of its rig.
 
     Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, where
-    there are any), in the pose of its capture.
+    there are any), in the pose of its capture or of other --strands. With a field, its hair is what
+    captured frames say of it.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
+    for warning in done["warnings"]:
+        output.note(f"warning: {warning}")
     output.result(done, f"{done['image']} ({done['camera']}, {done['seconds']:.0f} s)")
 
 
 def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Render what was asked for; returns what was written."""
-    from appearance import Environment, FittedModel, Sampling
+    from appearance import Environment, FittedModel, Sampling, render_mixed
+    from appearance.model.interpolated import InterpolationOptions, Pose, all_lights
     from appearance.model.relight import environment_map, three_quarter_view
-    from reconstruction import Capture, Model
+    from reconstruction import Capture, Model, read_strands
     from reconstruction.files.durable import writing
     from stage_service.model_page import write_page
 
@@ -74,9 +93,13 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = Capture(args.capture) if args.capture is not None else None
     if capture is None and (args.camera is not None or args.light):
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
+    if capture is None and args.field == "interpolation":
+        raise ValueError("--field interpolation needs the frames: say whose with --capture")
     progress("building the scene", 0.0)
     model = Model(args.model)
-    fitted = FittedModel.load(model, capture).with_field_of(model, args.field)
+    of_model = None if args.field == "interpolation" else args.field
+    fitted = FittedModel.load(model, capture).with_field_of(model, of_model)
+    pose = Pose(fitted, read_strands(args.strands) if args.strands is not None else None)
     camera = three_quarter_view(fitted.strands, SIZE)
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
@@ -84,7 +107,13 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     maps = [] if environment is None else [Environment(environment_map(environment))]
     lights = fitted.lights(args.light) if args.light else []
     progress("rendering", 0.2)
-    image = fitted.render(camera, lights, maps, Sampling(args.spp, seed=args.seed))
+    sampling = Sampling(args.spp, seed=args.seed)
+    image = render_mixed(fitted.scene(pose.strands), camera, lights, maps, sampling)
+    found: dict[str, Any] = {"warnings": []}
+    if capture is not None and args.field == "interpolation":
+        lit = camera, all_lights(lights, maps)
+        options = InterpolationOptions(guide=args.guide, refine=args.refine)
+        image, found = _interpolated(image, options, (pose, model, capture), lit, progress)
     out: Path = args.out or model.file("render.png")
     with writing(out) as part:
         _write(part, image)
@@ -97,8 +126,36 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         "lights": args.light,
         "environment": environment,
         "field": "none" if fitted.field is None else fitted.field.kind,
+        **found,
         "seconds": time.perf_counter() - start,
     }
+
+
+def _interpolated(
+    image: Floats,
+    options: InterpolationOptions,
+    whose: tuple[Pose, Model, Capture],
+    lit: tuple[Camera, Sequence[Light]],
+    progress: Progress,
+) -> tuple[Floats, dict[str, Any]]:
+    """The picture with its hair from captured frames, and what there is to tell of it."""
+    from appearance.model.interpolated import interpolation_of, with_samples
+    from reconstruction import Stage
+
+    pose, model, capture = whose
+    stage = Stage("interpolation")
+    interpolation = interpolation_of(
+        pose.fitted,
+        model,
+        capture,
+        stage=stage,
+        options=options,
+        progress=lambda what, share: progress(what, 0.5 + 0.4 * share),
+    )
+    image, told = with_samples(image, interpolation, pose, *lit)
+    if told["hair_unseen"] > 0.01:
+        stage.warn(f"{told['hair_unseen']:.0%} of the hair was seen by no camera: it is rendered")
+    return image, {**told, "field": "interpolation", "guide": stage.figures, "warnings": stage.warnings}
 
 
 def _write(out: Path, image: Floats) -> None:

@@ -1,0 +1,354 @@
+"""Captured frames interpolated on strands: Photobooth's reflectance field (§4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from appearance.bsdf.maps import MappedStrands, root_normals
+from appearance.bsdf.strand_coordinates import transported
+from appearance.fields.hits import HitOptions, Hits, find_hits
+from appearance.fields.kajiya_kay import KajiyaKay
+from appearance.fields.neighbours import camera_weights, light_weights
+from appearance.fields.reflectance import CapturedView, ReflectanceField
+from appearance.render.coverage import sees
+from reconstruction import Light, Strands
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+
+HITS = HitOptions(4, seed=91)
+FLOOR = 0.3
+"""What is added to the guide on both sides of its ratio, in parts of its mean."""
+_AT_ONCE = 1 << 14
+"""Pixels in memory at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A captured view and the strands that its pixels show, in the pose of the capture.
+
+    Of a pixel in which the strands as they were found have no hair, `hits` are those of the nearest
+    one that shows some.
+    `turn (P, 3)` is an axis-angle by which each pixel's strands are turned before a guide sees them
+    (`appearance.fields.search.refined`).
+    """
+
+    view: CapturedView
+    hits: Hits
+    turn: Floats
+
+    @classmethod
+    def of(cls, view: CapturedView, mapped: MappedStrands) -> Source:
+        """With the strands' own tangents. Raises `ValueError` where no pixel shows a strand."""
+        hits = find_hits(mapped, view.camera, view.pixels, HITS)
+        bare = hits.column("strand").max(axis=1) < 0
+        if bare.all():
+            raise ValueError(f"{view.camera.name}: no strand is in front of its hair pixels")
+        place = np.stack(np.divmod(view.pixels, view.camera.width), -1)
+        _, nearest = cKDTree(place[~bare]).query(place[bare])
+        hits.table[bare] = hits.table[np.flatnonzero(~bare)[nearest]]
+        return cls(view, hits, np.zeros((len(view.pixels), 3), np.float32))
+
+    def guided(
+        self, model: KajiyaKay | None, lights: Sequence[Light], pixels: Ints, epsilon: float = 0.0
+    ) -> Floats:
+        """What the pixels of numbers `pixels (Q,)` send by `model` under each light `(L, Q, 3)`.
+
+        The mean over a pixel's hits on hair of irradiance times B + `epsilon`, or times 1 without
+        a model.
+        """
+        point, weight = self.hits.table["point"][pixels], self.hits.table["weight"][pixels]
+        tangent = turned(self.turn[pixels][:, None], self.hits.table["tangent"][pixels])
+        away = _unit(self.view.camera.center - point)
+        share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+        out = np.empty((len(lights), len(pixels), 3), np.float32)
+        for i, light in enumerate(lights):
+            found = share
+            if model is not None:
+                towards = _unit(light.position - point)
+                found = share * (model(tangent, away, towards) + np.float32(epsilon))
+            out[i] = np.einsum("qk,qkc->qc", found, irradiance(light, point))
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolation:
+    """What places on strands send from any light to any camera, by the captured frames about them.
+
+    Standard interpolation where `model` is None: the samples' weighted mean. With a model B each
+    sample I_ij is first scaled by (B + ε)/(B_ij + ε) (Photobooth, Eq. 5, with a bounded gain), ε
+    being `floor` times the mean of B. Samples are divided by the irradiance of their own lights
+    first, and multiplied by that of the new one. `kriged` says how lights are weighted
+    (`light_weights`); cameras are barycentric, of those that see the place (`camera_weights`).
+
+    `sources` and `mapped` are in the pose of the capture, that of `strands`.
+    """
+
+    field: ReflectanceField
+    sources: tuple[Source, ...]
+    mapped: MappedStrands
+    strands: Strands
+    model: KajiyaKay | None = None
+    kriged: bool = True
+    floor: float = FLOOR
+
+    @classmethod
+    def of(cls, field: ReflectanceField, mapped: MappedStrands, strands: Strands) -> Interpolation:
+        """Standard interpolation of `field` on `strands`, which `mapped` holds."""
+        sources = tuple(Source.of(view, mapped) for view in field.views)
+        return cls(field, sources, mapped, strands)
+
+    @property
+    def middle(self) -> Array:
+        """The hair's middle `(3,)`, about which directions of cameras and lights are compared."""
+        return np.asarray(self.strands.points.mean(axis=0), float)
+
+    @property
+    def epsilon(self) -> float:
+        """ε."""
+        return 0.0 if self.model is None else self.floor * self.model.mean
+
+    def neighbours(self, lights: Sequence[Light]) -> tuple[Ints, Floats]:
+        """The captured lights about each of `lights`, by number, and weights `(L, k)`."""
+        captured, new = (
+            _unit(np.array([x.position for x in many]) - self.middle).astype(float)
+            for many in (self.field.lights, lights)
+        )
+        return light_weights(captured, new, kriged=self.kriged)
+
+    def without(self, cameras: Sequence[str] = (), lights: Sequence[str] = ()) -> Interpolation:
+        """The same without some cameras and lights."""
+        kept = [i for i, light in enumerate(self.field.lights) if light.name not in lights]
+        sources = tuple(
+            replace(s, view=replace(s.view, table=s.view.table[kept] if lights else s.view.table))
+            for s in self.sources
+            if s.view.camera.name not in cameras
+        )
+        field = ReflectanceField(
+            tuple(self.field.lights[i] for i in kept),
+            tuple(s.view for s in sources),
+            self.field.scale,
+        )
+        return replace(self, field=field, sources=sources)
+
+    def seen_by(self, hits: Hits) -> Relit:
+        """The field at the pixels of `hits`, of any camera and any pose of the same strands.
+
+        A captured camera, where `hits` are its source's, has its own samples and no others'.
+        """
+        for c, source in enumerate(self.sources):
+            if hits is source.hits:
+                return self._own(c)
+        weights = camera_weights(
+            _unit(np.array([s.view.camera.center for s in self.sources]) - self.middle),
+            _unit(hits.camera.center - self.middle),
+        )
+        rest = self._at_rest(hits)
+        hair = hits.column("weight") > 0
+        index = np.full((len(self.sources), *hair.shape), -1)
+        share = np.zeros(index.shape, np.float32)
+        for c in np.flatnonzero(weights).tolist():
+            self._look(c, rest, hair, index)
+            share[c] = weights[c] * (index[c] >= 0)
+        lost = hair & (share.sum(axis=0) == 0)
+        if lost.any():
+            away = np.array([s.view.camera.center for s in self.sources]) - self.middle
+            cosine = _unit(away) @ _unit(hits.camera.center - self.middle)
+            for c in np.flatnonzero(weights == 0).tolist():
+                self._look(c, rest, lost, index)
+                share[c] = np.exp(cosine[c] / 0.1) * (index[c] >= 0)
+        total = share.sum(axis=0)
+        share = np.divide(share, total, out=np.zeros_like(share), where=total > 0)
+        return Relit(self, hits, index, share)
+
+    def _own(self, c: int) -> Relit:
+        """The field at the pixels of a captured camera: each its own."""
+        hits = self.sources[c].hits
+        index = np.full((len(self.sources), *hits.table.shape), -1)
+        index[c] = np.arange(len(hits.pixels))[:, None]
+        share = np.zeros(index.shape, np.float32)
+        share[c] = 1
+        return Relit(self, hits, index, share)
+
+    def _look(self, c: int, rest: Floats, wanted: Bools, index: Ints) -> None:
+        """Put into `index (C, P, K)` the pixels of source `c` that see the wanted places."""
+        view = self.sources[c].view
+        number = np.full(wanted.shape, -1)
+        number[wanted] = view.index(rest[wanted])
+        found = number >= 0
+        seen = sees(self.mapped.scene, view.camera, rest[found].astype(float))
+        number[found] = np.where(seen, number[found], -1)
+        index[c] = number
+
+    @cached_property
+    def frames_at_rest(self) -> tuple[Floats, Floats]:
+        """Tangents and transported normals `(N, 3)` of the strands' points."""
+        tangents = self.strands.tangents().astype(float)
+        counts, roots = np.diff(self.strands.offsets), root_normals(self.strands)
+        normals = transported(tangents, counts, roots)
+        return tangents.astype(np.float32), normals.astype(np.float32)
+
+    def _at_rest(self, hits: Hits) -> Floats:
+        """The places of `hits` in the pose of the capture `(P, K, 3)`."""
+        return self.along(hits, self.strands.points)
+
+    def along(self, hits: Hits, values: Floats) -> Floats:
+        """`values (N, 3)` of the strands' points at the places of `hits` `(P, K, 3)`."""
+        strand = np.maximum(hits.column("strand"), 0)
+        offsets = self.strands.offsets
+        last = offsets[strand + 1] - offsets[strand] - 1
+        at = hits.column("along") * last
+        low = np.minimum(at.astype(np.int64), last - 1)
+        share = (at - low)[..., None].astype(np.float32)
+        low += offsets[strand]
+        return np.asarray(values[low] * (1 - share) + values[low + 1] * share)
+
+
+@dataclass(frozen=True, eq=False)
+class Relit:
+    """An interpolation at the pixels of a camera, to be lit.
+
+    `index (C, P, K)` are the source's pixels of each hit, -1 where it does not see it; `share
+    (C, P, K)` their weights, which sum to 1 over the cameras, or are 0 where none sees the place.
+    """
+
+    of: Interpolation
+    hits: Hits
+    index: Ints
+    share: Floats
+
+    @property
+    def known(self) -> Floats:
+        """Of each pixel, the part of its hits that some camera saw `(P,)` in [0, 1]."""
+        return np.asarray((self.hits.column("weight") * (self.share.sum(axis=0) > 0)).sum(axis=1))
+
+    def under(self, lights: Sequence[Light]) -> tuple[Floats, Floats]:
+        """Radiance `(L, P, 3)` of what is known of each pixel, and the part that is `(L, P)`.
+
+        Radiance is the mean over the hits that have samples; 0 where none has. The part is less
+        than `known` where samples are missing or saturated.
+        """
+        parts = [part._lit(lights) for part in self._parts()]
+        if not parts:
+            none = np.zeros((len(lights), 0, 3), np.float32)
+            return none, none[..., 0]
+        lit, known = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+        return lit, known
+
+    def under_all(self, lights: Sequence[Light]) -> tuple[Floats, Floats]:
+        """`under` of all lights together: `(P, 3)`, and the largest part known `(P,)`."""
+        radiance = np.zeros((len(self.hits.pixels), 3), np.float32)
+        known, start = np.zeros(len(radiance), np.float32), 0
+        for part in self._parts():
+            end = start + len(part.hits.pixels)
+            lit, share = part._lit(lights)
+            radiance[start:end] = lit.sum(axis=0)
+            known[start:end] = share.max(axis=0, initial=0)
+            start = end
+        return radiance, known
+
+    def _parts(self) -> Iterator[Relit]:
+        """The same, few pixels at a time."""
+        for start in range(0, len(self.hits.pixels), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            hits = replace(self.hits, pixels=self.hits.pixels[part], table=self.hits.table[part])
+            yield Relit(self.of, hits, self.index[:, part], self.share[:, part])
+
+    def _lit(self, lights: Sequence[Light]) -> tuple[Floats, Floats]:
+        total = np.zeros((len(lights), len(self.hits.pixels), 3), np.float32)
+        known = np.zeros(total.shape[:2], np.float32)
+        for c in range(len(self.index)):
+            self._add(c, lights, total, known)
+        scale = np.float32(self.of.field.scale)
+        lit = np.divide(total, known[..., None] * scale, out=total, where=known[..., None] > 0)
+        return np.maximum(lit, 0), known
+
+    def _add(self, c: int, lights: Sequence[Light], total: Floats, known: Floats) -> None:
+        """Add what source `c` says to `total (L, P, 3)`, and its weight to `known (L, P)`."""
+        share = self.share[c] * self.hits.column("weight")
+        pixel, k = np.nonzero(share)
+        if not len(pixel) or not len(lights):
+            return
+        used, number = np.unique(self.index[c][pixel, k], return_inverse=True)
+        point, weight = self.hits.table["point"][pixel, k], share[pixel, k]
+        tangent, away = self._tangents(c, pixel, k), _unit(self.hits.camera.center - point)
+        order, weights = self.of.neighbours(lights)
+        near, place = np.unique(order, return_inverse=True)
+        incoming, place = self._incoming(c, near, used), place.reshape(order.shape)
+        for i, light in enumerate(lights):
+            value = weighted(incoming[place[i]], weights[i])[number] * irradiance(light, point)
+            if self.of.model is not None:
+                guide = self.of.model(tangent, away, _unit(light.position - point))
+                value = value * (guide + np.float32(self.of.epsilon))[:, None]
+            good = np.isfinite(value).all(axis=1)
+            value = np.where(good[:, None], value, 0) * weight[:, None]
+            for channel in range(3):
+                total[i, :, channel] += np.bincount(pixel, value[:, channel], total.shape[1])
+            known[i] += np.bincount(pixel, weight * good, known.shape[1])
+
+    def _incoming(self, c: int, lights: Ints, pixels: Ints) -> Floats:
+        """I_ij / E_ij / (B_ij + ε) of source `c` at its pixels `(Q,)`: `(k, Q, 3)`.
+
+        For the captured lights of numbers `lights (k,)`; NaN where no sample is known.
+        """
+        source, near = self.of.sources[c], [self.of.field.lights[j] for j in lights]
+        samples = source.view.table[lights][:, pixels].astype(np.float32)
+        divisor = source.guided(self.of.model, near, pixels, self.of.epsilon)
+        unknown = np.full_like(samples, np.nan)
+        return np.asarray(np.divide(samples, divisor, out=unknown, where=divisor > 0))
+
+    def _tangents(self, c: int, pixel: Ints, k: Ints) -> Floats:
+        """Tangents `(H, 3)` of hits as source `c` has them turned, in the pose of the hits."""
+        own, of = self.hits.table["tangent"][pixel, k], self.of
+        turn = of.sources[c].turn[self.index[c][pixel, k]]
+        if not turn.any():
+            return np.asarray(own)
+        # what the turn adds, in the strand's frame at rest, is added in its frame here
+        some = replace(self.hits, table=self.hits.table[pixel, k][:, None])
+        tangents, normals = of.frames_at_rest
+        rest = _unit(of.along(some, tangents)[:, 0])
+        added = turned(turn, rest) - rest
+        across = _unit(of.along(some, normals)[:, 0])
+        normal = self.hits.table["normal"][pixel, k]
+        out = own + (added * rest).sum(-1, keepdims=True) * own
+        out += (added * across).sum(-1, keepdims=True) * normal
+        out += (added * np.cross(rest, across)).sum(-1, keepdims=True) * np.cross(own, normal)
+        return _unit(out)
+
+
+def weighted(samples: AnyFloats, weights: AnyFloats) -> Floats:
+    """The mean `(Q, 3)` of `samples (k, Q, 3)` by `weights (k,)`, of those that are known.
+
+    NaN where none is, or none that has a weight.
+    """
+    good: Any = np.isfinite(samples).all(axis=-1)
+    each: Any = weights[:, None] * good
+    known: Any = np.where(good[..., None], samples, 0)
+    summed = np.einsum("kq,kqc->qc", each, known)
+    total, unknown = each.sum(axis=0)[:, None], np.full_like(summed, np.nan)
+    return np.asarray(np.divide(summed, total, out=unknown, where=total > 0), np.float32)
+
+
+def irradiance(light: Light, points: Floats) -> Floats:
+    """Across the ray from a light to `points (P, 3)`, `(P, 3)` W/m²: intensity over distance²."""
+    away = points - light.position
+    squared = np.maximum((away * away).sum(axis=-1, keepdims=True), 1e-12)
+    return np.asarray(light.intensity_towards(points) / squared, np.float32)
+
+
+def turned(axis_angle: Floats, vectors: Floats) -> Floats:
+    """`vectors (..., 3)` turned about `axis_angle (..., 3)` by its length in radians."""
+    angle = np.linalg.norm(axis_angle, axis=-1, keepdims=True)
+    axis = axis_angle / np.maximum(angle, 1e-12)
+    along = (axis * vectors).sum(axis=-1, keepdims=True) * axis
+    out = along + np.cos(angle) * (vectors - along) + np.sin(angle) * np.cross(axis, vectors)
+    return np.asarray(out, np.float32)
+
+
+def _unit(vectors: Array | Floats) -> Floats:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-12), np.float32)

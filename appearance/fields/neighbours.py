@@ -1,0 +1,107 @@
+"""Which captured cameras and lights stand for a new one, and with what weights."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+
+RADIAL = 6
+"""Neighbours of a light with radial weights; Photobooth takes about as many."""
+KRIGED = 12
+REACH = 0.3
+"""Radians over which samples of one place are taken to be alike; 0.2 to 0.4 does as well."""
+_NUGGET = _LEAST = 1e-6
+
+
+def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
+    """Weights `(C,)` of cameras in unit `directions (C, 3)` for one in that `towards (3,)`.
+
+    Barycentric over the triangles of the sphere (the faces of the directions' convex hull), so that
+    at most three are not 0 and they vary continuously (Photobooth §4.1). A direction that no
+    triangle holds has the two cameras of the edge nearest to it, or the one. Sums to 1.
+    """
+    directions = np.asarray(directions, float)
+    corners = _triangles(directions)
+    best, weights = -np.inf, None
+    for corner in corners:
+        matrix = directions[corner].T
+        if abs(np.linalg.det(matrix)) < 1e-9:
+            continue
+        inside = np.linalg.solve(matrix, towards)
+        # of a face in front and one behind, the outer one: its plane is the further out
+        if inside.min() >= -1e-9 and 1 / inside.sum() > best:
+            best, weights = 1 / inside.sum(), inside
+            chosen = corner
+    out = np.zeros(len(directions))
+    if weights is None:
+        pairs = (sorted(p) for c in corners for p in combinations(map(int, c), 2))
+        edges = {(i, j) for i, j in pairs}
+        chosen, weights = _nearest_edge(directions, towards, sorted(edges))
+    np.add.at(out, chosen, np.clip(weights, 0, None))
+    return out / out.sum()
+
+
+def light_weights(
+    directions: AnyFloats, towards: AnyFloats, *, kriged: bool = True
+) -> tuple[Ints, Floats]:
+    """Of each direction `towards (T, 3)` the nearest lights `(T, k)` and their weights `(T, k)`.
+
+    Unit `directions (L, 3)`. The weights are those of least error for samples whose covariance
+    falls with the angle as exp(-angle/`REACH`) (ordinary kriging of `KRIGED` lights); those below
+    0 count as next to nothing. Not `kriged`, as in Photobooth §4.1: radial ones of `RADIAL` lights,
+    Franke and Little's ((R - d)/(R d))² of the angle d, R that of the next light. Both vary
+    continuously, or very nearly, and give a light's own direction to it alone, in equal parts to
+    lights in one place. Rows sum to 1.
+    """
+    cosine = np.clip(towards @ directions.T, -1, 1)
+    count = min(KRIGED if kriged else RADIAL, len(directions))
+    order = np.argsort(-cosine, axis=1, kind="stable")
+    angle = np.arccos(np.take_along_axis(cosine, order[:, : count + 1], axis=1))
+    near, order = angle[:, :count], order[:, :count]
+    if kriged:
+        # where samples are missing, those that would weigh nothing stand in for them
+        weight = np.maximum(_kriged(directions[order], near), _LEAST * np.exp(-near / REACH))
+    else:
+        reach = angle[:, -1:] if len(directions) > count else np.full((len(towards), 1), 2 * np.pi)
+        left = np.maximum(reach - near, 1e-6 * (reach + 1e-6))  # where all are as far: alike
+        weight = (left / np.maximum(near, 1e-5)) ** 2
+    return order, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def _kriged(directions: AnyFloats, angle: Array) -> Array:
+    """Weights `(T, k)` of lights `(T, k, 3)` at so many radians `(T, k)`, summing to 1."""
+    count = angle.shape[1]
+    between = np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1))
+    system = np.ones((len(angle), count + 1, count + 1))
+    system[:, :count, :count] = np.exp(-between / REACH) + _NUGGET * np.eye(count)
+    system[:, count, count] = 0
+    right = np.ones((len(angle), count + 1, 1))
+    right[:, :count, 0] = np.exp(-angle / REACH)
+    return np.asarray(np.linalg.solve(system, right)[:, :count, 0])
+
+
+def _triangles(directions: AnyFloats) -> Ints:
+    """Triangles `(F, 3)` of the directions' hull; of two cameras or one, degenerate ones."""
+    if len(directions) <= 3:
+        return np.arange(3)[None] % len(directions)
+    return np.asarray(ConvexHull(directions, qhull_options="QJ").simplices)
+
+
+def _nearest_edge(
+    directions: AnyFloats, towards: AnyFloats, edges: list[tuple[int, int]]
+) -> tuple[list[int], Array]:
+    """The ends of the arc nearest to `towards`, and its place between them."""
+    found = []
+    for i, j in edges:
+        ends = directions[[i, j]].T
+        weights = np.clip(np.linalg.lstsq(ends, towards, rcond=None)[0], 0, None)
+        if not weights.any() or weights.min() == 0:
+            weights = np.eye(2)[int(np.argmax(towards @ ends))]
+        point = ends @ weights
+        found.append((-float(towards @ point / np.linalg.norm(point)), [i, j], weights))
+    _, chosen, weights = min(found, key=lambda x: x[0])
+    return chosen, weights

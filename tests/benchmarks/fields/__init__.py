@@ -1,0 +1,1 @@
+"""Fields of reflectance on fixed strands."""
