@@ -15,7 +15,6 @@ from appearance.fields.interpolation import HITS, Interpolation
 from appearance.fields.reflectance import gather
 from appearance.fields.search import refined, searched
 from appearance.model.fitted_model import FittedModel
-from appearance.model.validated import far_apart
 from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import check_environment
@@ -88,12 +87,12 @@ def interpolation_of(
     stage.figures |= {"sample_bytes": field.bytes}
     if options.guide == "none":
         return found
-    positions = np.array([x.position for x in field.lights])
-    most = min(options.left_out, len(positions) - 2)
+    count = len(field.lights)
+    most = min(options.left_out, count - 2)
     if most < 1:
         stage.warn("too few lights to leave one out: standard interpolation")
         return found
-    names = [field.lights[k].name for k in far_apart(positions, most)]
+    names = [field.lights[int((i + 0.5) * count / most)].name for i in range(most)]
     search = searched(found, names, progress=progress)
     search.tell(stage)
     found = replace(found, model=search.best)

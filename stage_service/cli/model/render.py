@@ -43,8 +43,8 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--field",
         choices=FIELDS,
-        help="show the model with its field of this kind, or without one, or the hair as the frames "
-        "of --capture have it between their lights and cameras (interpolation); default: as it is",
+        help="show the model with its field of this kind, or without one, or its hair interpolated "
+        "between the frames of --capture; default: the model as it is",
     )
     render.add_argument(
         "--guide",
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, where
     there are any), in the pose of its capture or of other --strands. With a field, its hair is what
-    captured frames say of it.
+    the capture's frames say of it.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
@@ -155,7 +155,12 @@ def _interpolated(
     image, told = with_samples(image, interpolation, pose, *lit)
     if told["hair_unseen"] > 0.01:
         stage.warn(f"{told['hair_unseen']:.0%} of the hair was seen by no camera: it is rendered")
-    return image, {**told, "field": "interpolation", "guide": stage.figures, "warnings": stage.warnings}
+    return image, {
+        **told,
+        "field": "interpolation",
+        "guide": stage.figures,
+        "warnings": stage.warnings,
+    }
 
 
 def _write(out: Path, image: Floats) -> None:
