@@ -73,8 +73,8 @@ def cost(scene: HairScene, camera: Camera, lights: Sequence[Light], effort: Effo
     """
     K = camera.K.copy()
     K[:2] *= effort.timed
-    size = (max(int(effort.timed * n), 8) for n in (camera.width, camera.height))
-    small = replace(camera, K=K, **dict(zip(("width", "height"), size, strict=True)))
+    width, height = (max(int(effort.timed * n), 8) for n in (camera.width, camera.height))
+    small = replace(camera, K=K, width=width, height=height)
     pixels = covered_pixels(scene, small)
     seconds = []
     for render in (methods(replace(effort, plain=(16,)))[PLAIN, 16], *methods(effort).values()):
