@@ -46,6 +46,7 @@ from stage_service.service_models import (
 )
 from stage_service.storage import Removed, Storage
 from stage_service.verification import Verification, Verifier
+from stage_service.watching import NotReady, Watching
 
 T = TypeVar("T")
 
@@ -96,7 +97,8 @@ class Service:
         self._control = Control(self._captures.audit)
         self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
         self._queue = JobQueue(root, gpu_workers=gpu_workers)
-        self._follower = JobFollower(root, self._queue, self._captures.events)
+        self._follower = JobFollower(root, self._queue, self._captures.events, self._captures.audit)
+        self.watching = Watching(root, self._captures, self._queue, self._follower)
         self.storage = Storage(root, self._captures, self._control, self._queue)
         self._verifier = Verifier(
             root / "verified.json",
@@ -437,6 +439,14 @@ class Service:
             lamps=lamps["state"],
             problems=problems,
         )
+
+    def ready(self) -> None:
+        """Raise `NotReady` where no capture could begin, but for one that runs."""
+        problems = self.watching.problems()
+        if not self._has_stage:
+            problems.insert(0, "the service has not started")
+        if problems:
+            raise NotReady(problems)
 
     def _masks(self, folder: Path) -> dict[str, Any]:
         masks = {}

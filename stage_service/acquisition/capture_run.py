@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from typing import Any
 
 from reconstruction import Capture, CaptureWriter
@@ -38,6 +39,7 @@ class CaptureRun:
         self._events = events
         self._writer = writer
         self._first = read_status(writer.path)
+        self._again = 0
         living = plan.rig_file.safety.living_subject
         free = not living or (plan.plan.consent is not None and consented)
         self.sequencer = Sequencer(
@@ -60,11 +62,19 @@ class CaptureRun:
             }
         )
 
+    def frames(self) -> Counter[str]:
+        """What this run made of frames: "written", "missing" and shot "again"."""
+        written, missing = self._writer.counts()
+        before = self._first.frames_written
+        return Counter(written=written - before, missing=missing, again=self._again)
+
     def give_up(self) -> None:
         """Let go of the folder without having begun."""
         self._writer.close()
 
     def _notify(self, kind: str, data: dict[str, Any]) -> None:
+        if kind == "capture.frame_missing" and data["shot_again"]:
+            self._again += len(data["cameras"])
         self._events.publish(kind, {"id": self.id, **data})
 
 

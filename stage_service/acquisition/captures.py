@@ -6,6 +6,7 @@ import logging
 import secrets
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import cached_property
@@ -20,7 +21,14 @@ from reconstruction.reading import printable
 from stage_service.acquisition.capture_run import CaptureRun, plan_of
 from stage_service.acquisition.latch import Latch, Unsafe
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
-from stage_service.acquisition.states import CaptureStatus, WrongState, possible, read_status
+from stage_service.acquisition.states import (
+    OUTCOMES,
+    CaptureStatus,
+    State,
+    WrongState,
+    possible,
+    read_status,
+)
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.last_seen import LastSeen
@@ -31,6 +39,7 @@ from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
 from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 from stage_service.records.lease import RootLock
+from stage_service.records.logs import about
 
 log = logging.getLogger("hairstage.captures")
 T = TypeVar("T")
@@ -104,6 +113,11 @@ class CaptureManager:
         self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
         self._found: dict[str, CaptureStatus] | None = None
+        self._counts: dict[str, Counter[str]] = {
+            "captures": Counter(dict.fromkeys(OUTCOMES.values(), 0)),
+            "frames": Counter(written=0, missing=0, again=0),
+            "device_faults": Counter(),
+        }
         self._stay_on_exit = off_on_exit(self.close)
 
     @cached_property
@@ -241,6 +255,29 @@ class CaptureManager:
         """The id of the capture that is being made; asks neither disk nor device."""
         run = self._running
         return None if run is None else run.id
+
+    @property
+    def running_state(self) -> State:
+        """Where the capture is that is being made; "idle" where there is none."""
+        run = self._running
+        return "idle" if run is None else _not_yet_over(run.status()).state
+
+    def counts(self) -> dict[str, dict[str, float]]:
+        """Since the start: captures by how they ended, frames by what became of them, faults by
+        device. Asks neither disk nor device."""
+        with self._lock:
+            frames = self._counts["frames"].copy()
+            if self._running is not None:
+                frames.update(self._running.frames())
+            return {**{k: dict(v) for k, v in self._counts.items()}, "frames": dict(frames)}
+
+    def devices_seen(self) -> dict[str, str]:
+        """Each device's state when it was last asked, by kind or a camera's name; asks nobody."""
+        if self.rig_file.devices is None:
+            return {}
+        seen = self._seen.peek()
+        named = {**seen.pop("cameras", {}), **seen}
+        return {k: v["state"] for k, v in named.items() if isinstance(v, dict) and "state" in v}
 
     def get(self, capture_id: str) -> CaptureStatus:
         """What is known about a capture. Raises `UnknownCapture`."""
@@ -433,6 +470,10 @@ class CaptureManager:
         return self.get(capture_id)
 
     def _run(self, run: CaptureRun) -> None:
+        with about(capture=run.id):
+            self._shoot(run)
+
+    def _shoot(self, run: CaptureRun) -> None:
         # Not while a short connection of `devices` holds a serial port.
         with self._talking:
             pass
@@ -461,6 +502,9 @@ class CaptureManager:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
         with self._lock:
+            self._counts["captures"][result] += 1
+            self._counts["frames"].update(run.frames())
+            self._counts["device_faults"].update(run.sequencer.faults)
             self._done[run.id] = self.ended = status
             self._running = None
 

@@ -20,7 +20,7 @@ from stage_service.acquisition.timings import Timings
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import CameraDevice, Frame
 from stage_service.devices.device_set import DeviceSet
-from stage_service.devices.errors import Cancelled, IndexShift
+from stage_service.devices.errors import Cancelled, DeviceError, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.plan.resolved import ResolvedPlan
 from stage_service.plan.stepping import SHORTEST_RUN
@@ -66,6 +66,7 @@ class Sequencer:
     ) -> None:
         self.devices = devices
         self.error: str | None = None
+        self.faults: list[str] = []  # the names of devices that failed
         self.blackout: Blackout | None = None
         self.steps_done = 0
         self._began: float | None = None
@@ -385,6 +386,8 @@ class Sequencer:
             raise WrongState(action, self.state)
 
     def _fail(self, error: BaseException) -> None:
+        all_of = error.exceptions if isinstance(error, BaseExceptionGroup) else (error,)
+        self.faults += [e.device for e in all_of if isinstance(e, DeviceError)]
         text = str(error) or type(error).__name__
         self.error = text if self.error is None else f"{self.error}; {text}"
         self._move("fail")

@@ -14,6 +14,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from stage_service.api.connections import MOST_STREAMS
 from stage_service.api.steering import READS
 from stage_service.records.events import EventLog
+from stage_service.records.tokens import Identity
 
 reading = APIRouter(dependencies=READS)
 POLL_S = 0.5
@@ -33,7 +34,8 @@ async def stream_events(
     """Events after `Last-Event-ID` (or `after`), then new ones as they come.
 
     Without either, only new ones; 0 replays all that are kept. Numbers start at 1 with the service:
-    a number that it has not reached yet is from before a restart, and replays everything.
+    a number that it has not reached yet is from before a restart, and replays everything. A token
+    that is revoked ends it.
     """
     if request.app.state.streams >= MOST_STREAMS:
         raise HTTPException(503, f"{MOST_STREAMS} listeners follow the events already")
@@ -49,9 +51,15 @@ async def _follow(
 ) -> AsyncIterator[ServerSentEvent]:
     request.app.state.streams += 1
     try:
-        while not await request.is_disconnected():
+        while not await request.is_disconnected() and _may(request):
             for event in await asyncio.to_thread(events.wait, number, POLL_S):
                 number, data = event.number, json.dumps(asdict(event))
                 yield ServerSentEvent(id=str(number), event=event.kind, data=data)
     finally:
         request.app.state.streams -= 1
+
+
+def _may(request: Request) -> bool:
+    """Whether the token still opens what it did: one that is revoked ends what follows events."""
+    identity: Identity | None = request.state.identify(request.headers)
+    return identity == request.state.identity

@@ -74,7 +74,8 @@ class Gate:
         refusal = self._access.refusal(headers)
         if refusal is None:
             identity = self._access.identity(headers)
-            scope.setdefault("state", {})["identity"] = identity
+            state = scope.setdefault("state", {})
+            state["identity"], state["identify"] = identity, self._access.identity
             if identity is None and scope["path"] not in OPEN:
                 detail = "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown"
                 refusal = "unauthorized", detail, None

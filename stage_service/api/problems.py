@@ -35,6 +35,7 @@ from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
 from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
 from stage_service.storage import BadUpload, InUse, NotThere
+from stage_service.watching import NotReady
 
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"
@@ -118,6 +119,8 @@ unknown-artifact 404 No such file in the model folder
 jobs-unavailable 503 The job database does not answer
     Captures, blackout and abort do not need it. `GET /health` says what is wrong; what
     completed captures were asked to be followed by is enqueued once it answers.
+not-ready 503 No capture could begin
+    `problems` has a sentence for each reason. A capture that runs is none.
 damaged-capture 409 The capture folder cannot be read
     `detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.
 http 400 The request cannot be served
@@ -166,6 +169,7 @@ BY_ERROR: dict[type[Exception], str] = {
     MissingFrame: "missing-frame",
     NoSuchJob: "unknown-job",
     UnknownArtifact: "unknown-artifact",
+    NotReady: "not-ready",
     CaptureError: "damaged-capture",
 }
 """Which error class becomes which kind; a subclass stands before its base."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response, status
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, PlainTextResponse
 
 from stage_service.api.downloads import RANGES, bytes_response, file_response
 from stage_service.api.frames import png_preview
@@ -24,6 +24,7 @@ from stage_service.service_models import (
     JobRequest,
     ResumeRequest,
 )
+from stage_service.watching import text_of
 
 router = APIRouter()
 reading = APIRouter(dependencies=READS)
@@ -178,3 +179,18 @@ async def get_artifact(job: str, path: str, service: OnService, lanes: OnLanes) 
 async def health(service: OnService, lanes: OnLanes) -> Health:
     """How service, lamps and jobs are, as far as is known; asks no device and no database."""
     return await lanes.health(service.health)
+
+
+@reading.get("/ready", tags=["service"])
+async def ready(service: OnService, lanes: OnLanes) -> dict[str, bool]:
+    """Whether a capture could begin, were none running: 503 where not, with the reasons. Asks no
+    device and no database."""
+    await lanes.health(service.ready)
+    return {"ready": True}
+
+
+@reading.get("/metrics", response_class=PlainTextResponse, tags=["service"])
+async def metrics(service: OnService, lanes: OnLanes) -> Response:
+    """Figures for Prometheus. Asks no device and no database: how old theirs are is a figure."""
+    text = await lanes.health(lambda: text_of(service.watching.metrics()))
+    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -17,8 +17,13 @@ class LastSeen:
     `look()` returns what it saw, or None where it gave up; before the first look it is `unseen`.
     """
 
-    def __init__(self, look: Callable[[], dict[str, Any] | None], unseen: dict[str, Any]) -> None:
-        self._look, self._seen = look, unseen
+    def __init__(
+        self,
+        look: Callable[[], dict[str, Any] | None],
+        unseen: dict[str, Any],
+        wait_s: float = WAIT_S,
+    ) -> None:
+        self._look, self._seen, self._wait_s = look, unseen, wait_s
         self._at: float | None = None
         self._looking = False
         self._changed = threading.Condition()
@@ -29,9 +34,14 @@ class LastSeen:
             if not self._looking:
                 self._looking = True
                 threading.Thread(target=self._run, name="device-look", daemon=True).start()
-            self._changed.wait_for(lambda: not self._looking, WAIT_S)
+            self._changed.wait_for(lambda: not self._looking, self._wait_s)
             age = None if self._at is None else time.monotonic() - self._at
             return {**self._seen, "age_s": age}
+
+    def peek(self) -> dict[str, Any]:
+        """What was seen last; has nobody look."""
+        with self._changed:
+            return dict(self._seen)
 
     def _run(self) -> None:
         seen, at = None, time.monotonic()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,12 +12,15 @@ from pydantic import ValidationError
 
 from reconstruction import Model
 from stage_service.acquisition.states import CaptureStatus
-from stage_service.jobs.queue import JobQueue, JobsUnavailable
+from stage_service.jobs.queue import JobQueue, JobsUnavailable, Waiting
 from stage_service.jobs.records import Job, PipelineRequest
+from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 
 log = logging.getLogger("hairstage.jobs")
 POLL_S = 0.5
+COUNT_S = 5.0
+"""How old the count of jobs that wait may be."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +36,10 @@ class JobFollower:
     """Enqueues what completed captures were asked to be followed by, and tells what becomes of
     jobs. While the database is away it tries again."""
 
-    def __init__(self, root: Path, queue: JobQueue, events: EventLog) -> None:
-        self._root, self._queue, self._events = root, queue, events
+    def __init__(self, root: Path, queue: JobQueue, events: EventLog, audit: AuditLog) -> None:
+        self._root, self._queue, self._events, self._audit = root, queue, events, audit
+        self.waiting: Waiting | None = None
+        self.waiting_at = 0.0
         self._lock = threading.Lock()
         self._owed: dict[str, _Wish] = {}  # by capture; whether its job is there is not known yet
         self._certain: set[str] = set()  # captures whose job is there
@@ -92,6 +98,8 @@ class JobFollower:
             try:
                 self._enqueue_what_is_owed()
                 self._tell()
+                if time.monotonic() - self.waiting_at > COUNT_S:
+                    self.waiting, self.waiting_at = self._queue.waiting(), time.monotonic()
                 self._told = None
             except Exception as error:  # the thread goes on, whatever is wrong with the database
                 if self._closed or str(error) == self._told:
@@ -122,6 +130,7 @@ class JobFollower:
         job = self._queue.submit(wish.pipeline, wish.capture, model, job=job_of(capture))
         self._certain.add(capture)
         self._owed.pop(capture, None)
+        self._audit.record(SERVICE, "job.submit", job.id, detail=f"{job.pipeline} on {capture}")
         return job
 
     def _tell(self) -> None:

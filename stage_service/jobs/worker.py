@@ -27,6 +27,7 @@ from stage_service.jobs.queue import WORKFLOW, JobQueue, JobsUnavailable, databa
 from stage_service.jobs.records import JobOptions
 from stage_service.jobs.slots import BEAT_S, WorkerSlot, hold_dead
 from stage_service.jobs.steps import STEPS, StepContext
+from stage_service.records.logs import about
 from stage_service.signals import taken
 
 log = logging.getLogger("hairstage.worker")
@@ -77,7 +78,7 @@ class Worker:
         options = parse_options(JobOptions, spec["options"])
         capture = self.queue.path(spec["capture"])
         context = StepContext(capture, model, options, progress, previous)
-        with self._slots:
+        with self._slots, about(job=job, capture=capture.name):
             log.info("%s: %s begins", job, step)
             start = time.perf_counter()
             self._under_way.add(job)

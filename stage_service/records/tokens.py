@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import pwd
 import secrets
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -75,7 +78,7 @@ class Tokens:
 
         Of 256 random bits a plain hash tells nothing.
         """
-        with self._lock:
+        with self._changing():
             entries = self.entries()
             if not is_file_name(name) or name in [e.name for e in entries]:
                 raise TokenError(f"{name!r}: not a name, or there is a token of that name already")
@@ -86,12 +89,20 @@ class Tokens:
 
     def revoke(self, name: str) -> None:
         """End a token. Raises `TokenError` where there is none of that name."""
-        with self._lock:
+        with self._changing():
             entries = self.entries()
             kept = [e for e in entries if e.name != name]
             if len(kept) == len(entries):
                 raise TokenError(f"there is no token {name!r}; there are {[e.name for e in kept]}")
             self._write(kept)
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """For one thread of one process at a time; another's change in between would be lost."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._lock, self._path.with_suffix(".lock").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
 
     def _known(self) -> dict[str, Identity]:
         try:
@@ -108,7 +119,6 @@ class Tokens:
         return self._read[1]
 
     def _write(self, entries: list[Entry]) -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         write_secret(self._path, json.dumps([e.model_dump() for e in entries], indent=1) + "\n")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import json
 import re
 import shlex
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 
 from stage_service.cli import build_parser
 from stage_service.cli.support.commands import rig_path
@@ -46,6 +48,23 @@ def test_units_start_commands_that_there_are(unit):
     assert Path(program).name == "hairstage"
     parsed = build_parser().parse_args(arguments)
     assert str(parsed.root) == "/var/lib/hairstage"
+
+
+def test_containers_start_commands_that_there_are_on_files_that_there_are():
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    image = (DEPLOY / "Containerfile").read_text()
+    own = json.loads(re.findall(r"^CMD (.*)$", image, re.MULTILINE)[0])
+    started = {k: s["command"] for k, s in compose["services"].items() if "command" in s}
+    assert set(started) == {"service", "worker"}
+    for command in (own, *started.values()):
+        assert str(build_parser().parse_args(command).root) == "/var/lib/hairstage"
+    for copied in re.findall(r"^COPY (.*) \S+$", image, re.MULTILINE):
+        assert all((DEPLOY.parent / name).exists() for name in copied.split())
+    build = compose["services"]["service"]["build"]
+    assert (DEPLOY / build["context"] / build["dockerfile"]).samefile(DEPLOY / "Containerfile")
+    rules = (DEPLOY / "udev" / "70-hairstage.rules").read_text()
+    for device in compose["services"]["service"]["devices"]:
+        assert f'SYMLINK+="{Path(device).name}"' in rules
 
 
 def test_rig_files_use_the_ports_that_the_udev_rules_name():

@@ -63,6 +63,9 @@ def add(commands: Commands) -> None:
     )
     worker.add_argument("--take-over", metavar="HOST", help="that machine's workers are dead")
 
+    for process in (serve, worker):
+        process.add_argument("--log-json", action="store_true", help="a JSON object for each line")
+
     simulate = add_command(commands, "simulate", run_simulate)
     add_subject(simulate)
     simulate.add_argument("--state", type=Path, default=Path("runs/simulated"), help="state folder")
@@ -81,7 +84,7 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     the commands send this user's own, which is made where there is none; 'hairstage token' makes
     others.
     """
-    log_to_stderr()
+    log_to_stderr(args.log_json)
     from stage_service.api.app import Endpoint, serve
     from stage_service.config import load_rig_file
     from stage_service.devices.ownership import StageInUse
@@ -140,7 +143,7 @@ def run_worker(args: argparse.Namespace, output: Output) -> None:
     this machine, which goes on at the step that was under way. Workers of several machines mount
     the root and share a PostgreSQL database, $HAIRSTAGE_DATABASE_URL.
     """
-    log_to_stderr()
+    log_to_stderr(args.log_json)
     from stage_service.jobs.worker import run_worker as work
 
     os.umask(PRIVATE)
@@ -198,10 +201,11 @@ def exit_on_sigterm() -> None:
         signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
 
 
-def log_to_stderr() -> None:
+def log_to_stderr(as_json: bool = False) -> None:
     """Log records of level INFO and above go to stderr."""
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.INFO,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-    )
+    from stage_service.records.logs import JsonLines
+
+    handler = logging.StreamHandler(sys.stderr)
+    plain = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
+    handler.setFormatter(JsonLines() if as_json else plain)
+    logging.basicConfig(level=logging.INFO, handlers=[handler])

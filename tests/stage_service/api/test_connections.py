@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import os
 import resource
+import shutil
 import socket
+import ssl
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 
+import httpx
 import pytest
 import uvicorn
 from waiting import until
@@ -125,3 +132,37 @@ def test_answers_leave_at_once():
             return delay_off
 
     assert asyncio.run(accepted()) == 1
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl here")
+def test_serve_speaks_tls_and_nothing_else_where_it_has_a_certificate(rig_file, tmp_path):
+    """The command itself, from its first line to SIGTERM."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
+    made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
+    names = ["-subj", "/CN=stage", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"]
+    into = ["-keyout", str(key), "-out", str(certificate)]
+    subprocess.run([*made, *names, *into], check=True, capture_output=True)
+    command = [sys.executable, "-m", "stage_service.cli", "serve", "--json", "--port", "0"]
+    command += ["--rig", str(rig_file.path), "--root", str(tmp_path / "root")]
+    command += ["--tls-cert", str(certificate), "--tls-key", str(key)]
+    environment = {**os.environ, "HAIRSTAGE_TOKEN_FILE": str(tmp_path / "token")}
+    service = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+    )
+    try:
+        assert service.stdout is not None
+        url = json.loads(service.stdout.readline())["url"]
+        assert url.startswith("https://127.0.0.1:")
+        token = {"Authorization": f"Bearer {(tmp_path / 'token').read_text().strip()}"}
+        trusted = ssl.create_default_context(cafile=certificate)
+        with httpx.Client(verify=trusted, trust_env=False, timeout=60) as http:
+            assert http.get(f"{url}/health", headers=token).json()["status"] == "ok"
+            assert http.get(f"{url}/health").status_code == 401
+            with pytest.raises(httpx.HTTPError):
+                http.get(url.replace("https", "http") + "/health", headers=token)
+        service.terminate()
+        assert service.wait(60) == 0
+    finally:
+        service.kill()
+        service.wait()
+        service.stdout.close()

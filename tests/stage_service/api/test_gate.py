@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
+from serving import serving
 
 from reconstruction import Model
 from stage_service.api import event_stream, gate
@@ -230,3 +232,36 @@ def test_a_job_submitted_twice_under_one_key_is_one_job(ask, tokens, service, mo
     ]
     assert sent[0] == sent[1] != sent[2]
     assert submitted == [sent[0], sent[2]]
+
+
+def test_a_token_that_is_revoked_ends_what_follows_the_events(rig_file, tmp_path):
+    tokens = Tokens(tmp_path / "tokens.json")
+    access = Access(tokens)
+    headers = {"Authorization": f"Bearer {tokens.make('ada', ('read',))}"}
+    with (
+        serving(rig_file, tmp_path, access) as http,
+        http.stream("GET", "/events?after=0", headers=headers) as answer,
+    ):
+        assert answer.status_code == 200
+        http.service.events.publish("test", {})
+        lines = answer.iter_lines()
+        assert any(line.startswith("event: test") for line in lines)
+        tokens.revoke("ada")
+        for _ in lines:  # it ends
+            pass
+        assert http.get("/lease", headers=headers).status_code == 401
+
+
+def test_tokens_that_are_made_at_the_same_time_are_all_there(tmp_path):
+    """Each `Tokens` stands for a process: they share nothing but the file."""
+
+    def make(of: int) -> None:
+        for number in range(5):
+            Tokens(tmp_path / "tokens.json").make(f"{of}-{number}", ("read",))
+
+    makers = [threading.Thread(target=make, args=(n,)) for n in range(6)]
+    for maker in makers:
+        maker.start()
+    for maker in makers:
+        maker.join()
+    assert len(Tokens(tmp_path / "tokens.json").entries()) == 30

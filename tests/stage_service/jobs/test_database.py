@@ -18,6 +18,7 @@ from stage_service.jobs.follower import JobFollower, job_of
 from stage_service.jobs.progress import read_progress
 from stage_service.jobs.queue import JobQueue, JobsUnavailable
 from stage_service.jobs.records import Job, PipelineRequest
+from stage_service.records.audit import AuditLog
 from stage_service.records.events import EventLog
 
 
@@ -140,7 +141,7 @@ def completed(root: Path, name: str) -> CaptureStatus:
 def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_path):
     monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", "postgresql://nobody@127.0.0.1:1/nothing")
     queue = JobQueue(tmp_path)
-    follower = JobFollower(tmp_path, queue, EventLog())
+    follower = JobFollower(tmp_path, queue, EventLog(), AuditLog(tmp_path / "audit.jsonl"))
     follower.owe(completed(tmp_path, "fresh"))
     follower.owe(completed(tmp_path, "lost"), fresh=False)
     follower.owe(completed(tmp_path, "made"), fresh=False)
@@ -153,6 +154,11 @@ def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_pat
         until(lambda: queue.problem is None and follower.job_after("made") is None)
         # A model that is there is not made again because its job was lost with the database.
         assert queue.ids() == {job_of("fresh"), job_of("lost")}
+        told = AuditLog(tmp_path / "audit.jsonl").latest(10)
+        assert sorted((a.who, a.action, a.subject) for a in told) == [
+            ("service", "job.submit", job_of("fresh")),
+            ("service", "job.submit", job_of("lost")),
+        ]
     finally:
         follower.close()
         queue.close()

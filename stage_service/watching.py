@@ -1,0 +1,137 @@
+"""What a studio's monitoring asks for: figures of the service, and whether it can shoot."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reconstruction.files.durable import RESERVE
+from stage_service.acquisition.captures import CaptureManager
+from stage_service.devices.last_seen import LastSeen
+from stage_service.jobs.follower import JobFollower
+from stage_service.jobs.queue import JobQueue
+from stage_service.jobs.slots import workers_seen
+
+LONGEST_LOOK_S = 0.5
+"""How long a request waits for a disk that is slow to say how it is."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of one name: `samples` has its value for each set of labels.
+
+    A "counter" counts since the service started.
+    """
+
+    name: str
+    help: str
+    samples: list[tuple[dict[str, str], float]]
+    kind: str = "gauge"
+
+
+class NotReady(RuntimeError):
+    """A capture could not begin now; `problems` says why."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("; ".join(problems))
+        self.problems = problems
+
+
+class Watching:
+    """Figures of one service. Nobody who asks touches a device or the job database: those are as
+    they were when they were last seen, and how long ago that was is a figure, too."""
+
+    def __init__(
+        self, root: Path, captures: CaptureManager, queue: JobQueue, follower: JobFollower
+    ) -> None:
+        self.root, self.captures, self.queue, self.follower = root, captures, queue, follower
+        self._started = time.time()
+        self._disk = LastSeen(self._look, {"free": None, "workers": []}, LONGEST_LOOK_S)
+
+    def problems(self) -> list[str]:
+        """Why no capture could begin, a sentence each; one that runs is no reason."""
+        safety, free = self.captures.safety(), self._disk.get()["free"]
+        found = [safety["detail"]] if safety["state"] == "unknown, unsafe" else []
+        if free is None:
+            found.append(f"{self.root}: the disk does not answer")
+        elif free < RESERVE:
+            left = f"{free / 1e6:.0f} MB free; {RESERVE / 1e6:.0f} MB are kept"
+            found.append(f"{self.root}: {left}")
+        return found
+
+    def metrics(self) -> Iterator[Metric]:
+        """Every figure."""
+        captures, disk, jobs = self.captures, self._disk.get(), self.follower.waiting
+        safety, running = captures.safety(), captures.running_state
+        yield _one("start_time_seconds", "when the service started", self._started)
+        yield _one("latched", "1 while nobody knows whether the lamps are off", _latched(safety))
+        yield _per("lamps", "1 for what is known of the lamps", "state", {safety["state"]: 1.0})
+        yield _per("capture", "1 for the state that the capture is in", "state", {running: 1.0})
+        counts = captures.counts()
+        for name, (label, text) in _COUNTED.items():
+            yield _per(f"{name}_total", text, label, counts[name], "counter")
+        reachable = {
+            name: float(state == "ok")
+            for name, state in captures.devices_seen().items()
+            if state in ("ok", "unreachable")
+        }
+        yield _per("device_reachable", "when it was last asked", "device", reachable)
+        if disk["free"] is not None:
+            yield _one("disk_free_bytes", "of the root folder", disk["free"])
+            yield _one("disk_seen_age_seconds", "since the disk was last seen", disk["age_s"])
+        yield _one("job_database_up", "1 while it answers", float(self.queue.problem is None))
+        if jobs is not None:
+            states = {"queued": float(jobs.queued), "running": float(jobs.running)}
+            yield _per("jobs", "not done", "state", states)
+            yield _one("job_wait_seconds", "of the job that has waited longest", jobs.oldest_s)
+            age = time.monotonic() - self.follower.waiting_at
+            yield _one("jobs_seen_age_seconds", "since the job database was last seen", age)
+        alive = {f"{w.host}/{w.name}": float(w.alive) for w in disk["workers"]}
+        ages = {f"{w.host}/{w.name}": w.age_s for w in disk["workers"]}
+        yield _per("worker_alive", "1 while it lives", "worker", alive)
+        yield _per("worker_heartbeat_age_seconds", "since it last said so", "worker", ages)
+
+    def _look(self) -> dict[str, Any]:
+        free = shutil.disk_usage(self.root).free
+        return {"free": float(free), "workers": workers_seen(self.root)}
+
+
+_COUNTED = {
+    "captures": ("outcome", "that ended"),
+    "frames": ("what", "written, missing after all retries, and shot again"),
+    "device_faults": ("device", "that ended a capture"),
+}
+"""What `CaptureManager.counts` has: the label of each, and its help."""
+
+
+def text_of(metrics: Iterator[Metric]) -> str:
+    """The figures in Prometheus's text format, version 0.0.4."""
+    lines = []
+    for metric in metrics:
+        name = f"hairstage_{metric.name}"
+        lines += [f"# HELP {name} {metric.help}", f"# TYPE {name} {metric.kind}"]
+        for labels, value in metric.samples:
+            told = ",".join(f'{k}="{_escaped(v)}"' for k, v in labels.items())
+            lines.append(f"{name}{{{told}}} {value!r}" if told else f"{name} {value!r}")
+    return "\n".join(lines) + "\n"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+
+
+def _latched(safety: dict[str, Any]) -> float:
+    return float(safety["latched"] is not None)
+
+
+def _one(name: str, help: str, value: float) -> Metric:
+    return Metric(name, help, [({}, float(value))])
+
+
+def _per(name: str, help: str, label: str, values: dict[str, float], kind: str = "gauge") -> Metric:
+    samples = [({label: key}, float(value)) for key, value in values.items()]
+    return Metric(name, help, samples, kind)
