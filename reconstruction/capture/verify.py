@@ -9,6 +9,7 @@ from pathlib import Path
 
 from reconstruction.capture.folder import Capture, CaptureError, FrameRecord
 from reconstruction.capture.writer import sha256
+from reconstruction.containment import inside
 from reconstruction.files.exr import read_exr
 from reconstruction.report.report import Progress, silent
 
@@ -57,17 +58,27 @@ def _manifest(capture: Capture) -> Iterator[str]:
         return
     if (outcome := manifest.get("outcome")) != "completed":
         yield f"The capture's outcome is {outcome!r}, not 'completed'."
-    for name, expected in manifest.get("files", {}).items():
-        file = capture.path / name
+    files, known = manifest.get("files", {}), manifest.get("journal", {})
+    if not (isinstance(files, dict) and isinstance(known, dict)):
+        yield "manifest.json is damaged: 'files' and 'journal' have no checksums."
+        return
+    for name, expected in files.items():
+        try:
+            file = inside(capture.path, name)
+        except ValueError as error:
+            yield f"manifest.json is damaged: {error}."
+            continue
         if not file.is_file():
             yield f"{name} is missing; the manifest lists it."
         elif sha256(file) != expected:
             yield f"{name} does not match its checksum in the manifest."
-    journal, known = capture.path / "journal.jsonl", manifest.get("journal", {})
+    journal = capture.path / "journal.jsonl"
     if not journal.is_file():
         return
     data, count = journal.read_bytes(), known.get("bytes", 0)
-    if len(data) < count:
+    if not isinstance(count, int) or count < 0:
+        yield f"manifest.json is damaged: the journal's length is {count!r}."
+    elif len(data) < count:
         yield f"journal.jsonl has {len(data)} bytes, fewer than the manifest's {count}."
     elif hashlib.sha256(data[:count]).hexdigest() != known.get("sha256"):
         yield "journal.jsonl does not match its checksum in the manifest."

@@ -22,6 +22,7 @@ BENCHMARKS = {
     "light_planes": "strands of three subjects, still and drifting, beside baselines",
     "masks": "automatic hair masks beside true ones, at several path counts",
     "renderers": "our renderers beside Mitsuba's path integrator, light by light and line by line",
+    "soak": "a service that shoots for an hour and is killed: memory, frames, blackouts",
     "all": "every one of them",
 }
 """What each is about, for `python -m benchmarks` and its help too."""

@@ -29,6 +29,7 @@ MODULES = {
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",
     "renderers": "benchmarks.renderers.errors",
+    "soak": "benchmarks.service.soak",
 }
 """Each has its `BENCHMARK`."""
 

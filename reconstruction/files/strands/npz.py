@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,9 @@ def read_npz(path: Path) -> Strands:
             radius: NDArray[Any] | float = 4e-5
             if "radius.npy" in archive.namelist():
                 radius = _member(archive, "radius", "f")
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, OSError, NotImplementedError) as e:
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as e:
+        raise StrandFileError(f"not a whole .npz archive ({e})") from e
+    except RuntimeError as e:  # encrypted, or packed in a way that is not known
         raise StrandFileError(f"not a whole .npz archive ({e})") from e
     if points.ndim != 2 or points.shape[1] != 3:
         raise StrandFileError(f"points must be (N, 3), got {points.shape}")

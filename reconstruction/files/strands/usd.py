@@ -25,9 +25,12 @@ _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 def read_usd(path: Path) -> Strands:
     """Read all linear `BasisCurves` of a stage at its default time, in metres with z up."""
     try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
+        return _read(Usd.Stage.Open(str(path)))
+    except Tf.ErrorException as error:  # also of values, which are read when they are asked for
         raise StrandFileError(f"cannot be read as USD ({_first_line(error)})") from error
+
+
+def _read(stage: Any) -> Strands:
     turn = float(UsdGeom.GetStageMetersPerUnit(stage)) * np.eye(3)
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
