@@ -147,7 +147,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                 "cost": float(costs[k]),
                 **_summary(found),
                 "mean": float(np.mean(means)),
-                "mean_sd": float(np.std(means)),
+                **({"mean_sd": float(np.std(means, ddof=1))} if len(means) > 1 else {}),
             }
         )
         save(args.out / "frames.json", result)
