@@ -14,8 +14,6 @@ Degree = Annotated[int, Field(ge=0, le=3)]
 Level = tuple[Count, Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 NESTED: tuple[Level, ...] = ((2, 4, 4), (4, 12, 12), (8, 32, 32))
-OF_STRANDS: tuple[Level, ...] = ((8, 0, 0),)
-"""Eight anchors on every strand (GroomLight §3.4)."""
 
 
 @options

@@ -64,7 +64,15 @@ def fit_field(
     pixels = {name: index for name, index in pixels.items() if len(index)}
     if not pixels:
         raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
-    _check_memory([len(p) for p in pixels.values()], len(rendered.lights), request, model)
+    needed = memory_needed([len(p) for p in pixels.values()], len(rendered.lights), request)
+    progress(f"will take about {needed:.1f} GB of memory beside the scene", 0.0)
+    free = free_memory()
+    if free is not None and needed > free:
+        raise ModelError(
+            f"{model}: a field of {len(rendered.lights)} lights takes about {needed:.1f} GB of "
+            f"memory, and {free:.1f} GB are free: lower the field's pixels, now {request.pixels}, "
+            f"hits, now {request.hits}, or lights, now {request.lights}"
+        )
     views = []
     for i, (name, index) in enumerate(pixels.items()):
         progress(f"{name}: rendering {len(rendered.lights)} lights", 0.7 * i / len(pixels))
@@ -123,13 +131,3 @@ def memory_needed(pixels: Sequence[int], lights: int, request: FieldRequest) -> 
     pixel = request.hits * hit + 2 * 3 * 4 * (n * (n + 1) // 2 + 3 * n) + 8 * 3 * lights
     view = max(pixels) * (3 * 8 * 6 * lights + 4 * n * (n + 1) // 2 * lights)
     return (sum(pixels) * pixel + view) / 1e9
-
-
-def _check_memory(pixels: Sequence[int], lights: int, request: FieldRequest, model: Model) -> None:
-    needed, free = memory_needed(pixels, lights, request), free_memory()
-    if free is not None and needed > free:
-        raise ModelError(
-            f"{model}: a field of {sum(pixels)} pixels under {lights} lights takes about "
-            f"{needed:.1f} GB of memory, and {free:.1f} GB are free: lower the field's pixels, now "
-            f"{request.pixels}, hits, now {request.hits}, or lights, now {request.lights}"
-        )

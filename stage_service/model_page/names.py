@@ -13,6 +13,7 @@ PICTURES = {
     "ours": "ours",
     "inverse_rendering": "inverse rendering",
     "sun_fit": "Sun's fit",
+    "without_field": "without the field",
     "diffuse": "diffuse",
     "mean_colour": "mean colour",
     "three_nearest": "three nearest lights",

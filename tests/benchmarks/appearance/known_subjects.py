@@ -102,7 +102,7 @@ def known_subject(
     mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, head))
     truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed, rig.truth)
     shown = mapped.with_maps(truth)
-    cameras, lights = _ring(strands, rig), _dome(rig)
+    cameras, lights = ring(strands, rig), dome(rig)
     views, halves = [], []
     for k, camera in enumerate(cameras):
         pixels = np.flatnonzero((coverage(shown, camera)["hair"] > 0.7).ravel())
@@ -197,7 +197,7 @@ def _rms_angle(one: Array, other: Array) -> float:
     return float(np.sqrt((np.arctan2(sine, (one * other).sum(axis=1)) ** 2).mean()))
 
 
-def _ring(strands: Strands, rig: SmallStage) -> list[Camera]:
+def ring(strands: Strands, rig: SmallStage) -> list[Camera]:
     low, high = strands.points.min(axis=0).astype(float), strands.points.max(axis=0).astype(float)
     middle = 0.5 * (low + high)
     reach = 0.5 * float(np.linalg.norm(high - low))
@@ -211,6 +211,6 @@ def _ring(strands: Strands, rig: SmallStage) -> list[Camera]:
     return out
 
 
-def _dome(rig: SmallStage) -> list[Light]:
+def dome(rig: SmallStage) -> list[Light]:
     places = dome_positions(rig.lights, 1.2, lowest_deg=-30)
     return [Light(f"light_{i:02d}", p, np.full(3, 8.0)) for i, p in enumerate(places)]

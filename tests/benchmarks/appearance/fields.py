@@ -1,0 +1,294 @@
+"""Fields of reflectance beside what they have to beat, and their solver beside Adam.
+
+On the wavy groom with a truth finer than the fit, and inverse rendering emulated: strands bent by
+5°, coarse colours, β_M 7 % and β_N 10 % off. Leaves `fields.json` and `fields.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appearance import Exposure, build_scene
+from appearance.bsdf.maps import MappedStrands, scalp_coordinates
+from appearance.fields.anchors import Grid, Places, nested
+from appearance.fields.basis import ViewBasis
+from appearance.fields.fit import GROUPS, Pictures, fit_pictures
+from appearance.fields.grams import Gram
+from appearance.fields.hits import HitOptions, find_hits
+from appearance.fields.options import FieldOptions
+from appearance.fields.solver import (
+    AdamOptions,
+    LeastSquares,
+    Seen,
+    adam,
+    conjugate_gradients,
+)
+from appearance.metrics.scores import srgb
+from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat_parts
+from appearance.render.smoothed import smoothed
+from benchmarks.appearance.known_subjects import SmallStage, bent, dome, dyed, ring
+from benchmarks.command import SUBJECT, Benchmark, option
+from benchmarks.results import markdown, save, spread
+from benchmarks.subjects import Subject, simulated
+from reconstruction import Progress, silent
+from reconstruction.arrays import Array, Floats
+
+STAGE = SmallStage(size=24, cameras=6, lights=18, spp=48, max_depth=6, truth=(12, 48, 48))
+COARSE = (4, 8, 8)
+"""Cells of the emulated inverse rendering's colours."""
+HELD_VIEWS = (0, 3)
+FIELDS = {
+    "GaussianHair's: dual harmonics of the whole picture, degree 3": FieldOptions(
+        "whole", degree=3
+    ),
+    "additive (GroomLight's), degree 3": FieldOptions("additive", degree=3),
+    "modulation, degree 0": FieldOptions(degree=0),
+    "modulation, degree 1": FieldOptions(degree=1),
+    "modulation, degree 2": FieldOptions(),
+}
+SIZES = {"full": STAGE, "quick": SmallStage(12, cameras=4, lights=8, spp=16, max_depth=3)}
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """A subject: `halves` of the truth's and of inverse rendering's pictures, views by number.
+
+    Each is two independent pictures `(L, P, 3)`; `pictures` have the means, under all lights.
+    """
+
+    pictures: tuple[Pictures, ...]
+    true: tuple[tuple[Floats, Floats], ...]
+    rendered: tuple[tuple[Floats, Floats], ...]
+    places: Places
+    scale: float
+    held_views: tuple[int, ...]
+    held_lights: tuple[int, ...]
+
+    def training(self) -> list[Pictures]:
+        """What a fit sees."""
+        lights = len(self.pictures[0].lights)
+        kept = [i for i in range(lights) if i not in self.held_lights]
+        return [
+            replace(
+                p,
+                lights=tuple(p.lights[i] for i in kept),
+                rendered=p.rendered[kept],
+                captured=p.captured[kept],
+                valid=p.valid[kept],
+            )
+            for k, p in enumerate(self.pictures)
+            if k not in self.held_views
+        ]
+
+    def psnr(self, pictures: Mapping[int, tuple[Array, Array]]) -> dict[str, float]:
+        """PSNR without noise by group of `GROUPS`: products of errors of independent halves."""
+        found: dict[str, list[Array]] = {g: [] for g in GROUPS}
+        for k, (one, other) in pictures.items():
+            a, b = (
+                srgb(x * self.scale) - srgb(t * self.scale)
+                for x, t in zip((one, other), self.true[k], strict=True)
+            )
+            product = (a * b).mean(axis=2)
+            new = np.isin(np.arange(len(product)), self.held_lights)
+            if k in self.held_views:
+                found[GROUPS[1]].append(product[~new].ravel())
+                found[GROUPS[2]].append(product[new].ravel())
+            else:
+                found[GROUPS[0]].append(product[new].ravel())
+        return {
+            g: float(-10 * np.log10(max(float(np.concatenate(v).mean()), 1e-6)))
+            for g, v in found.items()
+        }
+
+
+def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
+    """The wavy groom dyed finely, captured; and as inverse rendering would have it."""
+    strands, head = subject.strands, subject.head
+    uv = scalp_coordinates(strands, head)
+    scene = subject.scene()
+    truth = dyed(subject.hair, seed, rig.truth)
+    shown = MappedStrands.of(scene, strands, uv).with_maps(truth)
+    noisy = bent(strands, uv, 5.0, seed)
+    base = build_scene(noisy, head, hair=subject.hair, skin=subject.skin)
+    mapped = MappedStrands.of(base, noisy, uv)
+    coarse = truth.resized(COARSE)
+    coarse = replace(coarse, beta_m=1.07 * truth.beta_m, beta_n=1.1 * truth.beta_n)
+    fitted = mapped.with_maps(coarse)
+    lights = tuple(dome(rig))
+    cameras = ring(strands, rig)
+    held = tuple(k for k in HELD_VIEWS if k < len(cameras))
+    pictures, true, rendered = [], [], []
+    for k, camera in enumerate(cameras):
+        pixels = np.flatnonzero((coverage(shown, camera, 32)["hair"] > 0.7).ravel())
+        halves = []
+        for where, stream in ((shown, 0), (fitted, 1)):
+            share = coverage(where, camera, 32)
+            two = []
+            for half in (0, 1):
+                first, rest = render_olat_parts(
+                    where,
+                    camera,
+                    lights,
+                    np.arange(camera.width * camera.height),
+                    spp=rig.spp // 2,
+                    max_depth=rig.max_depth,
+                    seed=(seed << 10) + 100 * stream + 2 * k + half,
+                )
+                size = (len(lights), camera.height, camera.width, 3)
+                smooth = smoothed(rest.reshape(size), share, 1.5).reshape(len(lights), -1, 3)
+                two.append((first + smooth)[:, pixels])
+            halves.append((two[0], two[1]))
+        true.append(halves[0])
+        rendered.append(halves[1])
+        hits = find_hits(mapped, camera, pixels, HitOptions(16, seed))
+        captured, shown_there = (0.5 * (a + b) for a, b in halves)
+        valid = np.ones(captured.shape[:2], bool)
+        pictures.append(Pictures(hits, lights, shown_there, captured, valid))
+    held_lights = tuple(range(1, len(lights), 3))
+    kept = [i for i in range(len(lights)) if i not in held_lights]
+    seen = [p.captured[kept] for k, p in enumerate(pictures) if k not in held]
+    scale = Exposure.of(x.reshape(-1, 3) for x in seen).scale
+    return Frames(
+        tuple(pictures),
+        tuple(true),
+        tuple(rendered),
+        Places.of(uv),
+        scale,
+        held,
+        held_lights,
+    )
+
+
+def rows_of(
+    frames: Frames, fields: Mapping[str, FieldOptions], progress: Progress
+) -> dict[str, Any]:
+    """PSNR by group of every row of the table, and what the fits took."""
+    training = frames.training()
+    colour = np.mean([p.captured.mean(axis=(0, 1)) for p in training], axis=0)
+    flat = {k: (np.broadcast_to(colour, t[0].shape),) * 2 for k, t in enumerate(frames.true)}
+    rows: dict[str, Any] = {
+        "mean colour": frames.psnr(flat),  # type: ignore[arg-type]
+        "inverse rendering": frames.psnr(dict(enumerate(frames.rendered))),
+    }
+    for name, options in fields.items():
+        progress(name, 0.5)
+        begun = time.process_time()
+        found = fit_pictures(training, frames.places, frames.scale, options)
+        seconds = time.process_time() - begun
+        lit = {}
+        for k, p in enumerate(frames.pictures):
+            at = found.field.at(p.hits)
+            one, other = (at.lit(x.astype(np.float32), p.lights) for x in frames.rendered[k])
+            lit[k] = one, other
+        rows[name] = {
+            **frames.psnr(lit),
+            "cpu_seconds": seconds,
+            "ridge": found.ridge,
+            "clamped": found.clamped,
+            "kept": bool(found.validation)
+            and all(v["with"] >= v["without"] for v in found.validation.values()),
+            "warnings": found.warnings,
+        }
+    return rows
+
+
+def solvers(frames: Frames, quick: bool = False) -> dict[str, list[dict[str, float]]]:
+    """Objective above its minimum, as a share of that of no field, against CPU seconds."""
+    options = FieldOptions()
+    training = frames.training()
+    grids = [Grid.of(level, len(frames.places.fitted)) for level in options.levels]
+    samples = [p.samples(options, frames.scale) for p in training]
+    begun = time.process_time()
+    grams = [Gram.of(s, options.degree) for s in samples]
+    reducing = time.process_time() - begun
+    seen = [
+        Seen(ViewBasis.of(p.hits, grids[-1], frames.places, options.degree, in_strands=True), g)
+        for p, g in zip(training, grams, strict=True)
+    ]
+    system = LeastSquares(seen, nested(grids, frames.places), options.degree, 0.03)
+    least = system.objective(conjugate_gradients(system, 12 if quick else 80, 1e-6))
+    start = system.objective(np.zeros(system.shape, np.float32))
+    curves: dict[str, list[dict[str, float]]] = {}
+
+    def watch(name: str, every: int, offset: float) -> Any:
+        curve = curves.setdefault(name, [])
+        clock = [time.process_time() - offset]
+
+        def note(done: int, x: Floats, _: float) -> None:
+            if done % every == 0:
+                now = time.process_time()
+                above = (system.objective(x) - least) / (start - least)
+                curve.append({"cpu_seconds": now - clock[0], "above": float(above)})
+                clock[0] += time.process_time() - now
+
+        return note
+
+    conjugate_gradients(system, 24, 1e-6, None, watch("conjugate gradients", 4, reducing))
+    for rate in (0.003, 0.01, 0.03):
+        steps = 30 if quick else 240
+        note = watch(f"Adam, rate {rate:g}", max(1, steps // 6), 0.0)
+        adam(system, samples, AdamOptions(rate, steps), note)
+    return curves
+
+
+def run_bench(
+    out: Path,
+    subjects: Sequence[Subject],
+    rig: SmallStage = STAGE,
+    *,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The table for `subjects`, a seed each, and the solvers on the first; into `out`."""
+    result: dict[str, Any] = {"rig": asdict(rig), "seeds": []}
+    for k, subject in enumerate(subjects):
+        progress(f"seed {seed + k}: frames", k / len(subjects))
+        begun = time.process_time()
+        frames = frames_of(subject, rig, seed + k)
+        made = time.process_time() - begun
+        result["seeds"].append(
+            {"frames_cpu_seconds": made, "rows": rows_of(frames, FIELDS, progress)}
+        )
+        if k == 0:
+            result["solvers"] = solvers(frames, quick=rig is SIZES["quick"])
+        save(out / "fields.json", result)
+    (out / "fields.md").write_text(report(result))
+    return result
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """The tables, for people."""
+    seeds = [s["rows"] for s in result["seeds"]]
+    lines = []
+    for name in seeds[0]:
+        cells = []
+        for group in (*GROUPS, "cpu_seconds"):
+            values = [rows[name][group] for rows in seeds if group in rows[name]]
+            found = spread(values) if values else {}
+            sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
+            cells.append(f"{found['mean']:.2f}{sd}" if values else "")
+        kept = [rows[name]["kept"] for rows in seeds if "kept" in rows[name]]
+        lines.append([name, *cells, f"{sum(kept)} of {len(kept)}" if kept else ""])
+    text = markdown(["model", *GROUPS, "fit, CPU s", "kept"], lines) + "\n"
+    for name, curve in result["solvers"].items():
+        points = ", ".join(f"{p['cpu_seconds']:.2f} s: {p['above']:.1e}" for p in curve)
+        text += f"- {name}: {points}\n"
+    return text
+
+
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    rig = SIZES["quick"] if args.quick else STAGE
+    count = 1 if args.quick else args.seeds
+    subjects = [simulated(args.rig, args.subject, args.head, args.seed + k) for k in range(count)]
+    return run_bench(args.out, subjects, rig, seed=args.seed, progress=progress)
+
+
+BENCHMARK = Benchmark(_bench, (*SUBJECT, option("--seeds", "of the table", type=int, default=3)))
