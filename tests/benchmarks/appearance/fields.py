@@ -39,7 +39,7 @@ from benchmarks.command import SUBJECT, Benchmark, option
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
 from reconstruction import Progress, silent
-from reconstruction.arrays import Array, Floats
+from reconstruction.arrays import AnyFloats, Array, Floats
 
 STAGE = SmallStage(size=24, cameras=6, lights=18, spp=48, max_depth=6, truth=(12, 48, 48))
 COARSE = (4, 8, 8)
@@ -88,7 +88,7 @@ class Frames:
             if k not in self.held_views
         ]
 
-    def psnr(self, pictures: Mapping[int, tuple[Array, Array]]) -> dict[str, float]:
+    def psnr(self, pictures: Mapping[int, tuple[AnyFloats, AnyFloats]]) -> dict[str, float]:
         """PSNR without noise by group of `GROUPS`: products of errors of independent halves."""
         found: dict[str, list[Array]] = {g: [] for g in GROUPS}
         for k, (one, other) in pictures.items():
@@ -149,7 +149,7 @@ def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
         true.append(halves[0])
         rendered.append(halves[1])
         hits = find_hits(mapped, camera, pixels, HitOptions(16, seed))
-        captured, shown_there = (0.5 * (a + b) for a, b in halves)
+        captured, shown_there = (np.float32(0.5) * (a + b) for a, b in halves)
         valid = np.ones(captured.shape[:2], bool)
         pictures.append(Pictures(hits, lights, shown_there, captured, valid))
     held_lights = tuple(range(1, len(lights), 3))
@@ -175,7 +175,7 @@ def rows_of(
     colour = np.mean([p.captured.mean(axis=(0, 1)) for p in training], axis=0)
     flat = {k: (np.broadcast_to(colour, t[0].shape),) * 2 for k, t in enumerate(frames.true)}
     rows: dict[str, Any] = {
-        "mean colour": frames.psnr(flat),  # type: ignore[arg-type]
+        "mean colour": frames.psnr(flat),
         "inverse rendering": frames.psnr(dict(enumerate(frames.rendered))),
     }
     for name, options in fields.items():
