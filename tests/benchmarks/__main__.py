@@ -22,7 +22,7 @@ MODULES = {
     "agreement": "benchmarks.renderers.agreement",
     "appearance": "benchmarks.appearance.ablations",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
-    "fields": "benchmarks.appearance.fields",
+    "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",
     "interpolation": "benchmarks.fields.interpolation",

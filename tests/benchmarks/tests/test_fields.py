@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from benchmarks.appearance.fields import FIELDS, SIZES, frames_of, rows_of, solvers
+from benchmarks.fields.modulation import FIELDS, SIZES, frames_of, rows_of, solvers
 from benchmarks.subjects import Subject
 
 from appearance import HairAppearance
