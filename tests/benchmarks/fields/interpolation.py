@@ -170,7 +170,7 @@ def score(shot: Captured, k: int, made: AnyFloats) -> dict[str, float]:
         bright = whole & (light >= np.quantile(light[whole], HIGHLIGHTS))
         found["hair"].append(float(error.mean()))
         found["highlights"].append(float(error[bright[block]].mean()))
-    return {n: float(-10 * np.log10(max(np.mean(v), 1e-6))) for n, v in found.items()}
+    return {n: float(-10 * np.log10(max(float(np.mean(v)), 1e-6))) for n, v in found.items()}
 
 
 def measure(subject: Subject, size: Size, seed: int, progress: Progress) -> dict[str, Any]:
