@@ -53,7 +53,9 @@ class Soak:
         name = f"service-{self.kills}"
         self._child: subprocess.Popen[str] = self._children.start(name, command, answers=True)
         url = self._children.first_line(name, self._child, 300)["url"]
-        self.http = httpx.Client(base_url=url, timeout=60, trust_env=False)
+        # A connection each: one that waits for its next request makes room where there are many.
+        each = httpx.Limits(max_keepalive_connections=0)
+        self.http = httpx.Client(base_url=url, timeout=60, trust_env=False, limits=each)
 
     def kill(self) -> None:
         """SIGKILL, and a new one."""
