@@ -7,9 +7,13 @@ is up, and one unit is written a metre.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from reconstruction.files.durable import writing
 from reconstruction.files.strands.errors import StrandFileError
@@ -23,30 +27,84 @@ def write_abc(path: Path, strands: Strands) -> None:
 
     Raises `StrandFileError` where the extra is not installed.
     """
+    with archive(path) as top:
+        add_curves(top, "hair", strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3)))
+
+
+@contextmanager
+def archive(path: Path) -> Iterator[Any]:
+    """The top object of a new archive; afterwards `path` is whole or not there.
+
+    Raises `StrandFileError` where the extra is not installed or the file cannot be written.
+    """
     try:
-        import imath
-        from alembic3d import Abc, AbcGeom
+        from alembic3d import Abc
     except ImportError as error:
         raise StrandFileError(
             f"{path}: .abc is written by alembic3d, which is not installed ({error}): "
             "pip install 'hairstage[alembic]'"
         ) from error
-    turned = strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3))
-    vary = isinstance(strands.radius, np.ndarray)
-    width = 2 * np.atleast_1d(np.asarray(strands.radius, np.float32))
-    scope = AbcGeom.GeometryScope.kVertexScope if vary else AbcGeom.GeometryScope.kConstantScope
-    # A sample only points at its arrays: the names keep them alive until it is written.
-    points = imath.V3fArrayFromBuffer(turned.points)
-    counts = imath.IntArrayFromBuffer(np.diff(strands.offsets).astype(np.int32))
-    widths = imath.FloatArrayFromBuffer(width)
-    kind = AbcGeom.CurveType.kLinear, AbcGeom.CurvePeriodicity.kNonPeriodic
-    width_sample = AbcGeom.OFloatGeomParamSample(widths, scope)
-    sample = AbcGeom.OCurvesSchemaSample(points, counts, *kind, width_sample)
     try:
         with writing(path) as temporary:
-            archive = Abc.OArchive(str(temporary))
-            curves = AbcGeom.OCurves(archive.getTop(), "hair")
-            curves.getSchema().set(sample)
-            del curves, archive  # the file is complete when the last of these is gone
+            made = Abc.OArchive(str(temporary))
+            yield made.getTop()
+            del made  # the file is complete when this and all curves in it are gone
     except RuntimeError as error:
         raise StrandFileError(f"{path}: cannot be written ({error})") from error
+
+
+def add_curves(top: Any, name: str, strands: Strands) -> Any:
+    """Add linear curves as they are, a width at each point; returns them, to add values to.
+
+    Readers go by more than the type: Blender makes Bézier curves without a radius of linear ones
+    whose basis is not said to be none, and takes no width that is one for all.
+    """
+    import imath
+    from alembic3d import AbcGeom
+
+    # A sample only points at its arrays: the names keep them alive until it is written.
+    points = imath.V3fArrayFromBuffer(strands.points)
+    counts = imath.IntArrayFromBuffer(np.diff(strands.offsets).astype(np.int32))
+    width = 2 * np.asarray(strands.radius, np.float32)
+    widths = imath.FloatArrayFromBuffer(np.full(len(strands.points), width, np.float32))
+    curves = AbcGeom.OCurves(top, name)
+    curves.getSchema().set(
+        AbcGeom.OCurvesSchemaSample(
+            points,
+            counts,
+            AbcGeom.CurveType.kLinear,
+            AbcGeom.CurvePeriodicity.kNonPeriodic,
+            AbcGeom.OFloatGeomParamSample(widths, AbcGeom.GeometryScope.kVertexScope),
+            AbcGeom.OV2fGeomParamSample(),
+            AbcGeom.ON3fGeomParamSample(),
+            AbcGeom.BasisType.kNoBasis,
+        )
+    )
+    return curves
+
+
+def add_values(curves: Any, name: str, values: NDArray[Any] | str, scope: str) -> None:
+    """Add a geometry parameter of `scope` "constant", "uniform" (a strand) or "vertex" (a point).
+
+    `values` are text, int16, int32, float32 `(M,)` or float32 `(M, 2 or 3)`.
+    """
+    import imath
+    from alembic3d import AbcGeom
+
+    if isinstance(values, str):
+        kind, array = "String", imath.StringArray(1)
+        array[0] = values
+    elif values.dtype == np.int16:
+        kind, array = "Int16", imath.ShortArray(len(values))
+        for i, value in enumerate(values.tolist()):
+            array[i] = value
+    else:
+        form = {"i": "Int", "f": "Float"}[values.dtype.kind]
+        if values.ndim == 2:
+            form = f"V{values.shape[1]}f"
+        kind = "Int32" if form == "Int" else form
+        array = getattr(imath, f"{form}ArrayFromBuffer")(np.ascontiguousarray(values))
+    where = getattr(AbcGeom.GeometryScope, f"k{scope.capitalize()}Scope")
+    parameters = curves.getSchema().getArbGeomParams()
+    parameter = getattr(AbcGeom, f"O{kind}GeomParam")(parameters, name, False, where, 1)
+    parameter.set(getattr(AbcGeom, f"O{kind}GeomParamSample")(array, where))

@@ -1,9 +1,10 @@
 """USD `BasisCurves` through `usd-core`.
 
 Linear curves are written: `curveVertexCounts`, `points`, `widths` (twice the radius), z up, one
-unit a metre. Every linear `BasisCurves` of a stage is read, in the world's frame, turned to z up
-and scaled to metres by what the stage says of itself. Cubic curves are refused: taking their
-control points for points on the hair would be wrong by up to a control segment.
+unit a metre. Every linear `BasisCurves` of a stage is read, but for those whose purpose is "guide",
+in the world's frame, turned to z up and scaled to metres by what the stage says of itself. Cubic
+curves are refused: taking their control points for points on the hair would be wrong by up to a
+control segment.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def _read(stage: Any) -> Strands:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
     cache = UsdGeom.XformCache()
-    hair = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves))
+    curves = (UsdGeom.BasisCurves(prim) for prim in stage.Traverse())
+    hair = (c.GetPrim() for c in curves if c and c.ComputePurpose() != UsdGeom.Tokens.guide)
     found = [_curves(prim, cache, turn) for prim in hair]
     if not found:
         raise StrandFileError("no BasisCurves in this stage")
@@ -82,11 +84,22 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
 
 def write_usd(path: Path, strands: Strands) -> None:
     """Write one linear `BasisCurves` prim, `/hair`, the stage's default prim."""
+    stage = new_stage(UsdGeom.Tokens.z)
+    stage.SetDefaultPrim(define_curves(stage, "/hair", strands).GetPrim())
+    save_stage(stage, path)
+
+
+def new_stage(up: Any) -> Any:
+    """An empty stage in metres whose axis `up`, "Y" or "Z", points upwards."""
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageUpAxis(stage, up)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    curves = UsdGeom.BasisCurves.Define(stage, "/hair")
-    stage.SetDefaultPrim(curves.GetPrim())
+    return stage
+
+
+def define_curves(stage: Any, where: str, strands: Strands) -> Any:
+    """Linear `BasisCurves` at the path `where`, their widths and their extent."""
+    curves = UsdGeom.BasisCurves.Define(stage, where)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
     curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
     curves.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(strands.points))
@@ -101,17 +114,16 @@ def write_usd(path: Path, strands: Strands) -> None:
         low, high = strands.points.min(axis=0) - reach, strands.points.max(axis=0) + reach
         corners = [Gf.Vec3f(*map(float, corner)) for corner in (low, high)]
         curves.CreateExtentAttr(Vt.Vec3fArray(corners))
+    return curves
+
+
+def save_stage(stage: Any, path: Path) -> None:
+    """Write a stage, whole or not at all. Raises `StrandFileError` naming the file."""
     try:
         with writing(path) as temporary:
             stage.GetRootLayer().Export(str(temporary))
     except Tf.ErrorException as error:
         raise StrandFileError(f"{path}: cannot be written ({_first_line(error)})") from error
-
-
-def open_curves(path: Path) -> tuple[Any, Any]:
-    """The stage of a file that `write_usd` wrote and its curves, to add primvars to."""
-    stage = Usd.Stage.Open(str(path))
-    return stage, UsdGeom.BasisCurves(stage.GetDefaultPrim())
 
 
 def _first_line(error: Exception) -> str:

@@ -4,58 +4,113 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
 
-SUFFIXES = {"usd": (".usd", ".usda", ".usdc"), "abc": (".abc",), "hair": (".hair",)}
-SIZE = 512
-"""Pixels across of a Mitsuba scene's camera, where no camera of a rig says."""
+if TYPE_CHECKING:
+    from appearance.export.groom import Groom
+    from reconstruction import Capture
+
+USD = (".usd", ".usda", ".usdc")
+SUFFIXES = {
+    **{"usd": USD, "houdini": USD, "unreal": (".abc",), "abc": (".abc",), "hair": (".hair",)},
+    "gltf": (".glb",),
+}
+FOLDERS = ("blender", "mitsuba", "maps")
+STRANDS = ("abc", "hair")
+"""What holds strands alone and needs no fit."""
+SIZE = 640
+"""Pixels across of a Mitsuba scene's camera, where no camera of a rig says: relit.png's."""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     export = add_command(commands, "export", run)
     export.add_argument("model", type=Path, help="fitted model folder")
-    export.add_argument("--to", choices=("maps", "mitsuba", *SUFFIXES), required=True)
+    export.add_argument("--to", choices=(*SUFFIXES, *FOLDERS), required=True)
     export.add_argument("--out", type=Path, required=True, help="file, or folder of several")
     export.add_argument("--capture", type=Path, help="the capture that gives rig and head")
+    export.add_argument(
+        "--strands", type=int, help="so many, drawn at random, their radius larger to cover as much"
+    )
+    export.add_argument(
+        "--guides", type=int, default=0, help="strands that stand for clumps, given apart"
+    )
+    export.add_argument("--cards", type=int, default=600, help="ribbons of gltf's finest level")
+    export.add_argument("--seed", type=int, default=0)
     export.add_argument("--camera", help="a camera of the rig for mitsuba's view")
+    export.add_argument(
+        "--environment", default="studio", help="mitsuba's light: studio, sky, .hdr or .exr file"
+    )
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
     """A fitted model for other programs.
 
-    Write MODEL for others. maps: a folder with an OpenEXR file for each layer of the hair maps;
-    mitsuba: a folder with a scene for stock Mitsuba 3; usd: strands with the appearance as
-    primvars; abc, hair: the strands alone, for Alembic's and cyHair's readers.
+    Write MODEL for others. usd: strands, head and MaterialX hair, z up; houdini: the same, y up;
+    blender: a folder with a script that makes Hair Curves with Principled Hair; unreal: Alembic in
+    centimetres with groom_ attributes; gltf: hair cards in three levels of detail; mitsuba: a
+    folder with a scene for stock Mitsuba 3; maps: an OpenEXR file for each layer of the hair maps;
+    abc, hair: the strands alone, for Alembic's and cyHair's readers.
     """
-    from appearance import FittedModel
-    from appearance.model.export import export_maps, export_mitsuba, export_usd
-    from appearance.model.relight import three_quarter_view
-    from reconstruction import Capture, Model, write_strands
-    from reconstruction.files.durable import writing
+    from appearance.export.groom import Groom, thinned
+    from appearance.export.options import ExportOptions
+    from reconstruction import Capture, Model, parse_options, write_strands
 
     out: Path = args.out
     if args.to in SUFFIXES and out.suffix not in SUFFIXES[args.to]:
         raise BadArgument(
             f"--out {out}: expected a file ending in {' or '.join(SUFFIXES[args.to])}"
         )
+    if args.to in FOLDERS and out.is_file():
+        raise BadArgument(f"--out {out} is a file: {args.to} makes a folder")
     if args.camera is not None and (args.capture is None or args.to != "mitsuba"):
         raise BadArgument("--camera is a view for mitsuba, of the rig of --capture")
+    names = ("strands", "guides", "cards", "seed")
+    options = parse_options(ExportOptions, {n: getattr(args, n) for n in names}, "export")
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
-    files = [out]
-    if args.to in ("abc", "hair"):
-        write_strands(out, model.strands())
+    if args.to in STRANDS:
+        strands, _ = thinned(model.strands(), options.strands, options.seed)
+        write_strands(out, strands)
+        files = [out]
     else:
-        fitted = FittedModel.load(model, capture)
-        if args.to == "maps":
-            files = export_maps(fitted.maps, out)
-        elif args.to == "usd":
-            with writing(out) as part:
-                export_usd(fitted, part)
-        else:
-            camera = three_quarter_view(fitted.strands, SIZE)
-            if capture is not None and args.camera is not None:
-                camera = capture.rig.camera(args.camera)
-            files = [export_mitsuba(fitted, out, camera)]
+        groom = Groom.load(model, capture, options)
+        if groom.head is None:
+            output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
+        files = _write(args, groom, capture)
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
+
+
+def _write(args: argparse.Namespace, groom: Groom, capture: Capture | None) -> list[Path]:
+    """Write the file or folder; returns what was written."""
+    out: Path = args.out
+    if args.to in ("usd", "houdini"):
+        from appearance.export.usd import export_usd
+
+        return export_usd(groom, out, up="Z" if args.to == "usd" else "Y")
+    if args.to == "blender":
+        from appearance.export.blender import export_blender
+
+        return export_blender(groom, out)
+    if args.to == "unreal":
+        from appearance.export.unreal import export_unreal
+
+        export_unreal(groom, out)
+        return [out]
+    if args.to == "gltf":
+        from appearance.export.cards import export_gltf
+
+        export_gltf(groom, out, args.cards, args.seed)
+        return [out]
+    if args.to == "maps":
+        from appearance.export.maps import export_maps
+
+        return export_maps(groom.maps, out)
+    from appearance.export.mitsuba import View, export_mitsuba
+    from appearance.model.relight import environment_map, three_quarter_view
+
+    camera = three_quarter_view(groom.strands, SIZE)
+    if capture is not None and args.camera is not None:
+        camera = capture.rig.camera(args.camera)
+    return [export_mitsuba(groom, out, View(camera, environment_map(args.environment)))]

@@ -21,12 +21,13 @@ from appearance import (
 )
 from appearance.bsdf.maps import HairMaps
 from appearance.bsdf.parameters import StrandHit
+from appearance.export.groom import at_points
+from appearance.export.maps import export_maps
 from appearance.inverse_rendering.found_lights import save_lights
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.model.edit import cut, recoloured, restyled, wisp_of
-from appearance.model.export import at_points, export_maps, export_mitsuba, export_usd
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import Camera, Model, Rig, read_exr, read_strands
+from reconstruction import Camera, Model, Rig, read_exr
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 CAMERA = Camera.look_at("c", 16, 16, (0, -0.5, 0.1), (0, 0, 0.0), 12)
@@ -106,31 +107,6 @@ def test_maps_are_exported_as_layers_that_read_back(fitted, tmp_path):
     image, _ = read_exr(tmp_path / "sigma_a_01.exr")
     np.testing.assert_allclose(image, fitted.maps.sigma_a[1].transpose(1, 0, 2), rtol=1e-6)
     assert "beta_m" in (tmp_path / "maps.json").read_text()
-
-
-def test_stock_mitsuba_opens_the_scene_and_sees_about_our_picture(fitted, tmp_path):
-    scene = mi.load_file(str(export_mitsuba(fitted, tmp_path, CAMERA, spp=64)))
-    path = mi.load_dict({"type": "path", "max_depth": 16, "hide_emitters": True})
-    stock = np.array(mi.render(scene, integrator=path, seed=0))[..., :3]
-    sky = np.ones((4, 8, 3), np.float32)
-    ours = render_environment(fitted.scene(), CAMERA, sky, Sampling(64, 15))
-    np.testing.assert_allclose(stock.mean((0, 1)), ours.mean((0, 1)), rtol=0.35)
-    columns = [x.mean((0, 2)) for x in (stock, ours)]
-    assert np.corrcoef(columns)[0, 1] > 0.9
-
-
-def test_usd_has_the_maps_as_attributes(fitted, tmp_path):
-    from pxr import Usd, UsdGeom
-
-    export_usd(fitted, tmp_path / "hair.usdc")
-    stage = Usd.Stage.Open(str(tmp_path / "hair.usdc"))
-    api = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim())
-    sigma_a, _ = at_points(fitted.maps, fitted.strands, fitted.root_uv)
-    found = np.array(api.GetPrimvar("sigma_a").Get())
-    np.testing.assert_allclose(found, sigma_a, rtol=1e-5)
-    assert api.GetPrimvar("scalp_uv").GetInterpolation() == "uniform"
-    assert api.GetPrimvar("beta_m").Get() == pytest.approx(HAIR.beta_m)
-    assert len(read_strands(tmp_path / "hair.usdc")) == len(fitted.strands)
 
 
 def test_values_at_points_are_those_that_the_bsdf_looks_up(fitted):

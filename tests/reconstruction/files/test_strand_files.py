@@ -281,11 +281,24 @@ def test_alembic_curves_are_y_up(vary: bool, two: Strands, tmp_path: Path) -> No
     schema = AbcGeom.ICurves(Abc.IArchive(str(path)).getTop(), "hair").getSchema()
     sample = schema.getValue()
     assert sample.getType() == AbcGeom.CurveType.kLinear
+    assert sample.getBasis() == AbcGeom.BasisType.kNoBasis  # what Blender goes by
     assert np.asarray(memoryview(sample.getCurvesNumVertices())).tolist() == [3, 2]
     points = np.asarray(memoryview(sample.getPositions()))
     np.testing.assert_array_equal(points, two.points[:, [0, 2, 1]] * np.float32([1, 1, -1]))
     widths = schema.getWidthsParam().getExpandedValue()
-    np.testing.assert_allclose(list(widths.getVals()), 2 * np.atleast_1d(radius), rtol=1e-6)
+    np.testing.assert_allclose(list(widths.getVals()), np.full(5, 2 * radius), rtol=1e-6)
+    assert widths.getScope() == AbcGeom.GeometryScope.kVertexScope
+
+
+def test_usd_guides_are_not_read_as_hair(two: Strands, tmp_path: Path) -> None:
+    from pxr import Usd, UsdGeom
+
+    write_strands(tmp_path / "hair.usda", two)
+    stage = Usd.Stage.Open(str(tmp_path / "hair.usda"))
+    UsdGeom.Imageable(stage.GetDefaultPrim()).CreatePurposeAttr("guide")
+    stage.GetRootLayer().Save()
+    with pytest.raises(StrandFileError, match="no BasisCurves"):
+        read_strands(tmp_path / "hair.usda")
 
 
 def test_alembic_that_is_not_installed_or_has_no_folder(

@@ -1,0 +1,1 @@
+"""Fitted models for other programs: USD, Alembic, Blender, Unreal, Houdini, Mitsuba, glTF."""

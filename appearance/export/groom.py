@@ -1,0 +1,175 @@
+"""What every export is made of: strands with a value for each point and strand, head, material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+
+from appearance.bsdf.longitudinal import colour_of_absorption
+from appearance.bsdf.maps import HairMaps
+from appearance.export.options import ExportOptions
+from appearance.model.fitted_model import FittedModel
+from reconstruction import Capture, Mesh, Model, Strands
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+
+MEASURED = 2e-3
+"""Metres from a triangulated point at which the confidence of a strand's point is exp(-1/2)."""
+SAME = 1e-6
+"""Metres within which a vertex of the head is one of the scalp map's."""
+SHAPE = 8
+"""Points at equal arc lengths by which the shapes of strands are compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class Groom:
+    """Strands as they go out.
+
+    `root_uv (S, 2)` are the roots' places on the scalp's map; `ids (S,)` the strands' places in the
+    model's `strands.npz`. `confidence (N,)` in [0, 1] says how near a point is to a triangulated
+    one (Gaussian of `MEASURED`), None where the model has no points. `guides (G,)` are the
+    strands that stand for clumps, `clump (S,)` which of them each strand follows; both empty
+    without guides. `head_uv (V, 2)` is the map at the head's vertices, NaN off the scalp, or None.
+    """
+
+    strands: Strands
+    head: Mesh | None
+    skin: tuple[float, float, float]
+    maps: HairMaps
+    root_uv: Array
+    ids: Ints
+    confidence: Floats | None
+    guides: Ints
+    clump: Ints
+    head_uv: Array | None = None
+
+    @classmethod
+    def load(
+        cls, model: Model, capture: Capture | None = None, options: ExportOptions | None = None
+    ) -> Groom:
+        """The groom of a model, with what its points and its scalp's map say of it.
+
+        `capture` gives the head where none was laid. Raises `ModelError` naming what is missing.
+        """
+        fitted = FittedModel.load(model, capture)
+        measured = model.points().points if model.has("points.npz") else None
+        groom = cls.of(fitted, options or ExportOptions(), measured)
+        if fitted.head is None or not model.has("scalp_map.npz"):
+            return groom
+        known = model.arrays("scalp_map.npz")
+        distance, nearest = cKDTree(known["vertices"]).query(fitted.head.vertices)
+        uv = np.where(distance[:, None] < SAME, known["uv"][nearest], np.nan)
+        return replace(groom, head_uv=uv)
+
+    @classmethod
+    def of(
+        cls, fitted: FittedModel, options: ExportOptions, measured: AnyFloats | None = None
+    ) -> Groom:
+        """The groom of a fit; `measured (M, 3)` are triangulated points."""
+        strands, ids = thinned(fitted.strands, options.strands, options.seed)
+        confidence = None
+        if measured is not None and len(measured):
+            far = 5 * MEASURED
+            distance, _ = cKDTree(measured).query(strands.points, distance_upper_bound=far)
+            confidence = np.exp(-0.5 * (distance / MEASURED) ** 2).astype(np.float32)
+        guides, clump = clumps(strands, options.guides, options.seed)
+        uv = fitted.root_uv[ids]
+        skin = fitted.appearance.skin
+        maps, head = fitted.maps, fitted.head
+        return cls(strands, head, skin, maps, uv, ids, confidence, guides, clump)
+
+    @cached_property
+    def along(self) -> Floats:
+        """Place of each point on its strand `(N,)`, 0 the root and 1 the tip, by its index."""
+        strand, offsets = self.strands.strand_of_point, self.strands.offsets
+        last = np.diff(offsets)[strand] - 1
+        return ((np.arange(len(strand)) - offsets[strand]) / last).astype(np.float32)
+
+    @cached_property
+    def looked_up(self) -> tuple[Array, Array]:
+        """Absorption `(N, 3)` and correctives `(N, 2)` at the points."""
+        return at_points(self.maps, self.strands, self.root_uv)
+
+    def colour(self, sigma_a: AnyFloats) -> Floats:
+        """Linear RGB of dense hair of absorption `sigma_a (…, 3)` (Sun 2021, Eq. 11 inverted)."""
+        return colour_of_absorption(sigma_a, self.maps.beta_n).astype(np.float32)
+
+
+def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, Ints]:
+    """`count` of the strands, drawn at random, and their indices `(count,)`, in order.
+
+    The radius grows by the total length over the length that is left: the area that strands cover
+    where they do not hide each other stays.
+    """
+    if count is None or count >= len(strands):
+        return strands, np.arange(len(strands))
+    drawn = np.random.default_rng(seed).choice(len(strands), count, replace=False)
+    ids = np.sort(drawn)
+    few = strands.subset(ids)
+    # of radii that vary the area counts, length by length
+    wider = _area(strands) / _area(few)
+    return replace(few, radius=few.radius * wider), ids
+
+
+def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
+    """Indices of `count` guides (fewer where there are not as many shapes), each strand's guide.
+
+    k-means of the strands' points at `SHAPE` equal arc lengths; a guide is the strand nearest to
+    its cluster's mean.
+    """
+    if not count or not len(strands):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    shape = shapes(strands).reshape(len(strands), -1)
+    start = np.random.default_rng(seed).choice(len(shape), min(count, len(shape)), replace=False)
+    centres, _ = kmeans2(shape, shape[np.sort(start)], iter=8, minit="matrix", missing="warn")
+    _, guides = cKDTree(shape).query(centres)
+    guides = np.unique(guides)
+    _, clump = cKDTree(shape[guides]).query(shape)
+    clump[guides] = np.arange(len(guides))  # twins of a guide must not take its place
+    return guides, clump
+
+
+def shapes(strands: Strands, count: int = SHAPE) -> Array:
+    """Each strand's points at `count` equal arc lengths `(S, count, 3)`."""
+    points, offsets = strands.points.astype(float), strands.offsets
+    step = np.zeros(len(points))
+    starts = strands.segment_starts
+    step[starts + 1] = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
+    arc = np.cumsum(step)
+    first, length = arc[offsets[:-1]], strands.lengths()
+    at = first[:, None] + length[:, None] * np.linspace(0, 1, count)
+    left = np.searchsorted(arc, at.ravel(), side="right").reshape(at.shape) - 1
+    left = np.clip(left, offsets[:-1, None], offsets[1:, None] - 2)
+    span = arc[left + 1] - arc[left]
+    share = np.divide(at - arc[left], span, out=np.zeros_like(span), where=span > 0)
+    share = np.clip(share, 0, 1)[..., None]
+    return points[left] * (1 - share) + points[left + 1] * share
+
+
+def at_points(maps: HairMaps, strands: Strands, root_uv: Array) -> tuple[Array, Array]:
+    """Absorption `(N, 3)` and correctives `(N, 2)` at the strands' points."""
+    counts = np.diff(strands.offsets)
+    strand = strands.strand_of_point
+    along = (np.arange(len(strands.points)) - strands.offsets[:-1][strand]) / (counts[strand] - 1)
+    out = []
+    for table in (maps.sigma_a, maps.rotation):
+        layers, columns, rows, _ = table.shape
+        u = np.minimum((root_uv[:, 0] * columns).astype(int), columns - 1)[strand]
+        v = np.minimum((root_uv[:, 1] * rows).astype(int), rows - 1)[strand]
+        height = along * (layers - 1)
+        low = np.minimum(height.astype(int), max(layers - 2, 0))
+        share = (height - low)[:, None]
+        high = np.minimum(low + 1, layers - 1)
+        out.append(table[low, u, v] * (1 - share) + table[high, u, v] * share)
+    return out[0], out[1]
+
+
+def _area(strands: Strands) -> float:
+    starts = strands.segment_starts
+    points = strands.points.astype(float)
+    length = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
+    radius = np.broadcast_to(np.asarray(strands.radius, float), len(points))
+    return float(length @ radius[starts])

@@ -1,0 +1,140 @@
+"""A scene for stock Mitsuba 3, which needs nothing of ours.
+
+Its `hair` has one colour a shape: the segments of all strands are sorted into shapes of like
+colour, which changes no curve, since a piece of a spline keeps its own control points. What is lost
+are differences within a shape and the correctives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from appearance.bsdf.maps import HairMaps
+from appearance.export.groom import Groom
+from appearance.scene.curves import spline_control_points
+from appearance.scene.hair_scene import SCALE, mitsuba_hair
+from reconstruction import Camera, Mesh, write_exr, write_obj
+from reconstruction.arrays import AnyFloats, Array, Ints
+from reconstruction.files.durable import write_whole, writing
+
+GROUPS = 32
+"""Shapes of one colour each."""
+SAMPLE = 20000
+"""Segments from whose colours those of the shapes are found."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What is seen: by a `camera`, under an `environment (h, w, 3)` as our renderers take it."""
+
+    camera: Camera
+    environment: AnyFloats
+    spp: int = 64
+
+
+def export_mitsuba(groom: Groom, folder: Path, view: View) -> Path:
+    """Write `scene.xml`, its curves, the head and the environment; returns the scene's path.
+
+    Units are centimetres; radiance is ours. A pinhole, the principal point in the image's middle.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    shapes = []
+    points, segments = spline_control_points(groom.strands)
+    colours, label = _shapes(groom)
+    for i, colour in enumerate(colours):
+        of_shape = segments[label == i]
+        if len(of_shape):
+            name = f"hair_{i:02d}.txt"
+            _write_curves(folder / name, points, of_shape)
+            shapes.append(_hair(name, colour, groom.maps))
+    if groom.head is not None:
+        scaled = Mesh(groom.head.vertices * SCALE, groom.head.faces)
+        with writing(folder / "head.obj") as part:
+            write_obj(part, scaled)
+        shapes.append(_head(groom.skin))
+    write_exr(folder / "environment.exr", np.asarray(view.environment, np.float32))
+    path = folder / "scene.xml"
+    text = (
+        '<scene version="3.0.0">\n <integrator type="path"><integer name="max_depth" value="16"/>'
+        '<boolean name="hide_emitters" value="true"/></integrator>\n'
+        + _sensor(view.camera, view.spp)
+        + "".join(shapes)
+        # ours has z up and +x in the middle of the map; Mitsuba's local frame is y up
+        + ' <emitter type="envmap"><string name="filename" value="environment.exr"/>\n'
+        '  <transform name="to_world"><matrix value="0 0 1 0 1 0 0 0 0 1 0 0 0 0 0 1"/>'
+        "</transform></emitter>\n</scene>\n"
+    )
+    write_whole(path, text.encode())
+    return path
+
+
+def _shapes(groom: Groom) -> tuple[Array, Ints]:
+    """Absorptions `(G, 3)` of the shapes, and the shape of each segment `(N - S,)`."""
+    starts = groom.strands.segment_starts
+    if groom.maps.uniform or not len(starts):
+        return np.array([groom.maps.mean().sigma_a]), np.zeros(len(starts), np.int64)
+    sigma_a, _ = groom.looked_up
+    root = np.sqrt(0.5 * (sigma_a[starts] + sigma_a[starts + 1]))  # colours are even in the root
+    few = np.random.default_rng(0).choice(len(root), min(SAMPLE, len(root)), replace=False)
+    different = np.unique(root[few].round(6), axis=0)
+    k = min(GROUPS, len(different))
+    if k == len(different):
+        centres = different
+    else:
+        centres, _ = kmeans2(root[few], k, seed=0, minit="++")
+    label = np.empty(len(root), np.int64)
+    for part in np.array_split(np.arange(len(root)), max(len(root) // 200_000, 1)):
+        label[part] = ((root[part, None] - centres) ** 2).sum(axis=2).argmin(axis=1)
+    means = [
+        root[label == i].mean(axis=0) if (label == i).any() else c for i, c in enumerate(centres)
+    ]
+    return np.stack(means) ** 2, label
+
+
+def _write_curves(path: Path, points: Array, segments: Ints) -> None:
+    """Control points `(M, 4)` of runs of `segments`, whose first points these are, as text."""
+    ends = np.flatnonzero(np.diff(segments) != 1)
+    runs = np.split(segments, ends + 1)
+    text = []
+    for run in runs:
+        rows = points[run[0] : run[-1] + 4] * SCALE
+        text.append("\n".join(f"{x:.7g} {y:.7g} {z:.7g} {r:.6g}" for x, y, z, r in rows.tolist()))
+    write_whole(path, ("\n\n".join(text) + "\n").encode())
+
+
+def _hair(file: str, sigma_a: Array, maps: HairMaps) -> str:
+    scalars = {k: v for k, v in mitsuba_hair(maps.mean()).items() if isinstance(v, float | int)}
+    floats = "".join(f'<float name="{k}" value="{v:.6g}"/>' for k, v in scalars.items())
+    rgb = " ".join(f"{x:.6g}" for x in sigma_a)
+    return (
+        f' <shape type="bsplinecurve"><string name="filename" value="{file}"/>\n'
+        f'  <bsdf type="hair">{floats}<rgb name="sigma_a" value="{rgb}"/></bsdf></shape>\n'
+    )
+
+
+def _head(skin: tuple[float, float, float]) -> str:
+    rgb = " ".join(f"{x:.6g}" for x in skin)
+    return (
+        ' <shape type="obj"><string name="filename" value="head.obj"/>\n'
+        '  <boolean name="face_normals" value="true"/><bsdf type="twosided"><bsdf type="diffuse">'
+        f'<rgb name="reflectance" value="{rgb}"/></bsdf></bsdf></shape>\n'
+    )
+
+
+def _sensor(camera: Camera, spp: int) -> str:
+    fov = np.degrees(2 * np.arctan(0.5 * camera.width / camera.K[0, 0]))
+    eye = camera.center * SCALE
+    vectors = {"origin": eye, "target": eye + camera.R[2], "up": -camera.R[1]}
+    look = " ".join(f'{k}="{", ".join(f"{x:.6f}" for x in value)}"' for k, value in vectors.items())
+    return (
+        f' <sensor type="perspective"><float name="fov" value="{fov:.6f}"/>\n'
+        f'  <string name="fov_axis" value="x"/><transform name="to_world"><lookat {look}/>'
+        f'</transform>\n  <sampler type="independent"><integer name="sample_count" value="{spp}"/>'
+        f'</sampler>\n  <film type="hdrfilm"><integer name="width" value="{camera.width}"/>'
+        f'<integer name="height" value="{camera.height}"/>'
+        '<rfilter type="box"/></film></sensor>\n'
+    )

@@ -1,0 +1,25 @@
+"""What an export can be asked for; light, so that the command line checks it without Mitsuba."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from reconstruction.options import Count, options
+
+
+@options
+class ExportOptions:
+    """What becomes of the strands on their way out.
+
+    `strands`: so many of them, drawn at random, their radius larger by as much as the length lost,
+    which keeps the area that they cover; all where None or where there are fewer. `guides`: strands
+    that stand for clumps of the others, 0 for none. `cards`: ribbons of the finest level of glTF;
+    each further level has a quarter of them.
+    """
+
+    strands: Count | None = None
+    guides: Annotated[int, Field(ge=0)] = 0
+    cards: Count = 600
+    seed: int = 0
