@@ -6,10 +6,12 @@ Blender's own importers make curves without the material and without their place
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from appearance.export.groom import Groom
+from appearance.export.groom import Groom, upwards
 from appearance.export.maps import SCALARS
 from reconstruction.files.durable import write_whole, writing
 
@@ -25,16 +27,16 @@ def export_blender(groom: Groom, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     strands, maps = groom.strands, groom.maps
     sigma_a = np.array([maps.mean().sigma_a]) if maps.uniform else groom.looked_up[0]
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "points": strands.points,
         "counts": np.diff(strands.offsets).astype(np.int32),
         "radius": np.full(len(strands.points), strands.radius, np.float32),
-        "root_uv": (groom.root_uv * (1, -1) + (0, 1)).astype(np.float32),
+        "root_uv": groom.st,
         "strand_id": groom.ids.astype(np.int32),
         "sigma_a": sigma_a.astype(np.float32),
         "guides": groom.guides.astype(np.int32),
         "skin": np.array(groom.skin, np.float32),
-        **{name: np.float32(getattr(maps, name)) for name in SCALARS},
+        **{name: np.array(getattr(maps, name), np.float32) for name in SCALARS},
     }
     if len(groom.guides):
         arrays["clump"] = groom.clump.astype(np.int32)
@@ -44,10 +46,9 @@ def export_blender(groom: Groom, folder: Path) -> list[Path]:
         arrays["head_vertices"] = groom.head.vertices.astype(np.float32)
         arrays["head_faces"] = groom.head.faces.astype(np.int32)
         if groom.head_uv is not None:
-            uv = np.nan_to_num(groom.head_uv * (1, -1) + (0, 1), nan=-1.0)
-            arrays["head_uv"] = uv.astype(np.float32)
+            arrays["head_uv"] = np.nan_to_num(upwards(groom.head_uv), nan=-1.0)
     with writing(folder / "groom.npz") as part:
-        np.savez(part, **arrays)
+        np.savez(part, allow_pickle=False, **arrays)
     script = Path(__file__).with_name("in_blender.py").read_bytes()
     write_whole(folder / SCRIPT, script)
     return [folder / SCRIPT, folder / "groom.npz"]

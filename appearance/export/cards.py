@@ -75,7 +75,9 @@ def make_cards(groom: Groom, count: int, segments: int, seed: int) -> Cards:
     size = np.bincount(clump)
     middle = np.stack([_means(clump, x, size) for x in points.reshape(len(points), -1).T], axis=1)
     middle = middle.reshape(len(size), segments + 1, 3)
-    along = unit_or_zero(np.gradient(middle, axis=1).reshape(-1, 3)).reshape(middle.shape)
+    along = unit_or_zero(np.asarray(np.gradient(middle, axis=1)).reshape(-1, 3)).reshape(
+        middle.shape
+    )
     centre = (
         groom.strands.points.mean(axis=0) if groom.head is None else groom.head.vertices.mean(0)
     )

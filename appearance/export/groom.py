@@ -76,7 +76,7 @@ class Groom:
             distance, _ = cKDTree(measured).query(strands.points, distance_upper_bound=far)
             confidence = np.exp(-0.5 * (distance / MEASURED) ** 2).astype(np.float32)
         guides, clump = clumps(strands, options.guides, options.seed)
-        uv = fitted.root_uv[ids]
+        uv = fitted.root_uv[ids] if len(ids) else np.zeros((0, 2))  # nothing has no middle
         skin = fitted.appearance.skin
         maps, head = fitted.maps, fitted.head
         return cls(strands, head, skin, maps, uv, ids, confidence, guides, clump)
@@ -88,6 +88,11 @@ class Groom:
         last = np.diff(offsets)[strand] - 1
         return ((np.arange(len(strand)) - offsets[strand]) / last).astype(np.float32)
 
+    @property
+    def st(self) -> Floats:
+        """`root_uv (S, 2)` as others have it: t upwards on the pictures of `layer_image`."""
+        return upwards(self.root_uv)
+
     @cached_property
     def looked_up(self) -> tuple[Array, Array]:
         """Absorption `(N, 3)` and correctives `(N, 2)` at the points."""
@@ -96,6 +101,11 @@ class Groom:
     def colour(self, sigma_a: AnyFloats) -> Floats:
         """Linear RGB of dense hair of absorption `sigma_a (…, 3)` (Sun 2021, Eq. 11 inverted)."""
         return colour_of_absorption(sigma_a, self.maps.beta_n).astype(np.float32)
+
+
+def upwards(uv: Array) -> Floats:
+    """`uv (N, 2)` of pictures whose rows go down, with v that goes up."""
+    return (uv * (1, -1) + (0, 1)).astype(np.float32)
 
 
 def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, Ints]:

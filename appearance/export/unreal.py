@@ -13,7 +13,7 @@ import numpy as np
 
 from appearance.export.groom import Groom
 from reconstruction import Strands
-from reconstruction.arrays import AnyFloats
+from reconstruction.arrays import AnyFloats, Ints
 from reconstruction.files.strands.alembic import add_curves, add_values, archive
 
 CM = 100.0
@@ -34,21 +34,18 @@ def export_unreal(groom: Groom, path: Path) -> None:
             add_values(guides, "groom_guide", np.array([1], np.int16), "constant")
 
 
-def _curves(
-    top: Any, name: str, groom: Groom, which: AnyFloats, colour: AnyFloats | None = None
-) -> Any:
+def _curves(top: Any, name: str, groom: Groom, which: Ints, colour: AnyFloats | None = None) -> Any:
     """The strands `which (M,)` as curves, with the values that strands and guides share."""
     strands = groom.strands.subset(which)
     large = Strands(CM * strands.points, strands.offsets, CM * strands.radius)
     curves = add_curves(top, name, large)
     width = np.full(len(large.points), 2 * large.radius, np.float32)
-    uv = (groom.root_uv * (1, -1) + (0, 1))[which].astype(np.float32)
     add_values(curves, "groom_version_major", np.array([1], np.int16), "constant")
     add_values(curves, "groom_version_minor", np.array([5], np.int16), "constant")
     add_values(curves, "groom_tool", "hairstage", "constant")
     add_values(curves, "groom_group_id", np.array([0], np.int32), "constant")
     add_values(curves, "groom_id", groom.ids[which].astype(np.int32), "uniform")
-    add_values(curves, "groom_root_uv", uv, "uniform")
+    add_values(curves, "groom_root_uv", groom.st[which], "uniform")
     add_values(curves, "groom_width", width, "vertex")
     if colour is not None:
         add_values(curves, "groom_color", colour, "vertex")

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from appearance.export.groom import Groom
+from appearance.export.groom import Groom, upwards
 from appearance.export.maps import SCALARS, layer_image
 from reconstruction import write_exr
 from reconstruction.arrays import AnyFloats, Array, Ints
@@ -60,8 +60,7 @@ def export_usd(groom: Groom, path: Path, *, up: Literal["Y", "Z"] = "Z") -> list
 
 def _primvars(groom: Groom, api: Any) -> None:
     tokens = UsdGeom.Tokens
-    flipped = groom.root_uv * (1, -1) + (0, 1)
-    _primvar(api, "st", TYPES.TexCoord2fArray, tokens.uniform, flipped)
+    _primvar(api, "st", TYPES.TexCoord2fArray, tokens.uniform, groom.st)
     _primvar(api, "strand_id", TYPES.IntArray, tokens.uniform, groom.ids)
     if len(groom.guides):
         _primvar(api, "clump", TYPES.IntArray, tokens.uniform, groom.clump)
@@ -191,7 +190,7 @@ def _head(groom: Groom, stage: Any, turn: Array) -> None:
         api, "displayColor", TYPES.Color3fArray, UsdGeom.Tokens.constant, np.array([groom.skin])
     )
     if groom.head_uv is not None:
-        uv = np.nan_to_num(groom.head_uv * (1, -1) + (0, 1), nan=-1.0)
+        uv = np.nan_to_num(upwards(groom.head_uv), nan=-1.0)
         _primvar(api, "st", TYPES.TexCoord2fArray, UsdGeom.Tokens.vertex, uv)
     if head.scalp is not None:
         which = Vt.IntArray.FromNumpy(np.flatnonzero(head.scalp).astype(np.int32))

@@ -113,7 +113,7 @@ def test_usd_has_hair_head_and_guides_in_one_frame(fitted, tmp_path, up):
     api = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/model/hair"))
     held = {
         p.GetPrimvarName(): (p.GetInterpolation(), len(p.Get()) if p.GetTypeName().isArray else 1)
-        for p in api.GetPrimvars()
+        for p in api.GetPrimvarsWithValues()
     }
     assert held["st"] == held["strand_id"] == held["clump"] == ("uniform", 40)
     assert held["confidence"] == ("vertex", 320)
@@ -142,7 +142,7 @@ def test_usd_hair_is_chiangs_with_our_parameters(fitted, tmp_path):
     assert angle == pytest.approx(2.0, abs=1e-4)
     given = [roughness.GetInput(k).Get() for k in ("longitudinal", "azimuthal")]
     assert given == pytest.approx([0.25, 0.35])
-    surface, _, _ = material.ComputeSurfaceSource(["mtlx"])
+    surface, _, _ = material.ComputeSurfaceSource("mtlx")
     assert surface.GetIdAttr().Get() == "ND_surface"
     bound = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/model/hair")).ComputeBoundMaterial()
     assert bound[0].GetPath() == material.GetPath()
