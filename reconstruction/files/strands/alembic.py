@@ -38,6 +38,7 @@ def archive(path: Path) -> Iterator[Any]:
     Raises `StrandFileError` where the extra is not installed or the file cannot be written.
     """
     try:
+        import imath  # noqa: F401
         from alembic3d import Abc
     except ImportError as error:
         raise StrandFileError(
