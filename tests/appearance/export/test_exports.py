@@ -208,7 +208,7 @@ def test_stock_mitsuba_renders_our_picture(which, request, tmp_path):
     noisy: their difference is held against that of two of ours."""
     model = request.getfixturevalue(which)
     camera = Camera.look_at("c", 16, 16, (0.1, -0.5, 0.1), (0, 0, -0.02), 14)
-    light = studio(32)
+    light = studio()
     groom = Groom.of(model, ExportOptions())
     path = export_mitsuba(groom, tmp_path, View(camera, light, spp=256))
     # elsewhere: on the tests' one thread Mitsuba waits for itself while it reads an EXR
