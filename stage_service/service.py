@@ -17,7 +17,7 @@ from reconstruction import Capture, CaptureError, Model, Rig, read_obj
 from reconstruction.containment import inside, is_file_name, plain_file
 from stage_service.acquisition.captures import CaptureManager, UnknownCapture
 from stage_service.acquisition.control import Caller, Control
-from stage_service.acquisition.states import CaptureStatus
+from stage_service.acquisition.states import CaptureStatus, Outcome
 from stage_service.config import RigFile
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.pipelines import PIPELINES
@@ -213,9 +213,16 @@ class Service:
         """A capture's status. Raises `UnknownCapture`."""
         return self._view(self._captures.get(capture_id))
 
-    def captures(self) -> list[CaptureView]:
-        """All captures, oldest first."""
-        return [self._view(status) for status in self._captures.list()]
+    def captures(
+        self, limit: int, offset: int = 0, outcome: Outcome | None = None
+    ) -> list[CaptureView]:
+        """The latest `limit` captures, of that outcome, before the `offset` newest; oldest
+        first."""
+        known = self._captures.list()
+        if outcome is not None:
+            known = [status for status in known if status.outcome == outcome]
+        end = max(0, len(known) - offset)
+        return [self._view(status) for status in known[max(0, end - limit) : end]]
 
     def pause(self, capture_id: str, by: Caller) -> CaptureView:
         """Pause at the next step boundary. Raises `UnknownCapture`, `WrongState`, `Leased`."""

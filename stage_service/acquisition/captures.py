@@ -29,6 +29,7 @@ from stage_service.acquisition.states import (
     possible,
     read_status,
 )
+from stage_service.acquisition.status_index import FILES, read_statuses
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.last_seen import LastSeen
@@ -133,7 +134,8 @@ class CaptureManager:
         """What nobody is shooting, by id; the folders are read when it is first asked for."""
         with self._lock:
             if self._found is None:
-                self._found = {p.name: read_status(p) for p in _folders(self.folder)}
+                index = self.folder.with_name("captures.index")
+                self._found = read_statuses(_folders(self.folder), index)
                 for status in self._found.values():
                     if status.outcome == "damaged":
                         log.warning("%s is damaged: %s", status.path, status.error)
@@ -525,11 +527,8 @@ def _folders(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if printable(path.name) != path.name:
             log.warning("%s: the folder's name is not UTF-8: left out", printable(str(path)))
-        elif not path.name.startswith(".") and any(_there(path / name) for name in _OF_A_CAPTURE):
+        elif not path.name.startswith(".") and any(_there(path / name) for name in FILES):
             yield path
-
-
-_OF_A_CAPTURE = ("plan.json", "rig.json", "journal.jsonl", "manifest.json")
 
 
 def _there(path: Path) -> bool:

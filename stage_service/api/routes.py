@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Response, status
 from fastapi.responses import FileResponse, PlainTextResponse
 
+from stage_service.acquisition.states import Outcome
 from stage_service.api.downloads import RANGES, bytes_response, file_response
 from stage_service.api.frames import png_preview
 from stage_service.api.lanes import OnLanes
@@ -47,9 +48,14 @@ def start_capture(
 
 
 @reading.get("/captures", tags=["captures"])
-def list_captures(service: OnService) -> list[CaptureView]:
-    """All captures, oldest first."""
-    return service.captures()
+def list_captures(
+    service: OnService,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 200,
+    offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones left out")] = 0,
+    outcome: Annotated[Outcome | None, Query(description="only these")] = None,
+) -> list[CaptureView]:
+    """The latest captures, the oldest of them first."""
+    return service.captures(limit, offset, outcome)
 
 
 @reading.get("/captures/{capture}", tags=["captures"])

@@ -15,6 +15,7 @@ BENCHMARKS = {
     "agreement": "a capture that Blender Cycles rendered, from its true strands",
     "appearance": "inverse rendering and its ablations on subjects of known appearance",
     "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
+    "captures": "10,000 captures in a root: the service's start, and a page of them",
     "fields": "fields of reflectance beside baselines on new lights and views; their solver",
     "frames": "the simulators' frames beside many paths: error against run time",
     "gradients": "path replay beside finite differences",

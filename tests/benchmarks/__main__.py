@@ -22,6 +22,7 @@ MODULES = {
     "agreement": "benchmarks.renderers.agreement",
     "appearance": "benchmarks.appearance.ablations",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
+    "captures": "benchmarks.acquisition.listing",
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",

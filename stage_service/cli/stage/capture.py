@@ -128,7 +128,7 @@ def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) 
 
 def run_list_captures(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """List captures, oldest first."""
-    captures = service.get("/captures")
+    captures = service.get("/captures?limit=1000")
     lines = [
         f"{c['id']}  {c['outcome'] or c['state']}  {c['frames_written']}/{c['frames_planned']} "
         f"frames  {c['path']}"

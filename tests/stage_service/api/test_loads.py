@@ -20,6 +20,7 @@ from waiting import until
 
 from reconstruction import CaptureWriter
 from stage_service.acquisition import captures as manager_module
+from stage_service.acquisition import status_index
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
@@ -180,7 +181,7 @@ def test_a_fault_is_answered_and_the_connection_kept(rig_file, world, tmp_path, 
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)
     with serving(rig_file, tmp_path) as http:
 
-        def broken() -> None:
+        def broken(*_: Any) -> None:
             raise RuntimeError("caf\udce9")
 
         monkeypatch.setattr(http.service, "captures", broken)
@@ -214,13 +215,13 @@ def test_it_darkens_first_and_starts_whatever_lies_in_its_folder(
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(text.encode("utf-8", "surrogatepass"))
     lit_at_the_first_look = []
-    real = manager_module.read_status
+    real = status_index.read_status
 
     def look(path: Path) -> Any:
         lit_at_the_first_look.append((set(world.lit), world.show))
         return real(path)
 
-    monkeypatch.setattr(manager_module, "read_status", look)
+    monkeypatch.setattr(status_index, "read_status", look)
     world.lit, world.show = {1, 2}, "ON 65535"
     with serving(rig_file, tmp_path) as http:
         assert lit_at_the_first_look == [(set(), "OFF")] * 2
