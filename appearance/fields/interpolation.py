@@ -93,7 +93,7 @@ class Interpolation:
     mapped: MappedStrands
     strands: Strands
     model: KajiyaKay | None = None
-    kriged: bool = True
+    kriged: bool = False
     floor: float = FLOOR
 
     @classmethod
