@@ -1,8 +1,8 @@
-"""The pictures of kept paths, and how they change with what all hair shares, exactly."""
+"""The pictures of kept paths, and how they change with the hair, exactly."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -19,6 +19,7 @@ from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 SCALARS = ("beta_m", "beta_n", "eta")
+SHARED = ("sigma_a", *SCALARS)
 _DARK = 1e-25
 """BSDF below which a path counts as black: its logarithm's derivative is not asked for."""
 
@@ -49,17 +50,35 @@ class Cells:
         flat, share = table.reshape(-1, table.shape[-1]), self.share[:, None]
         return np.asarray(flat[self.low] * (1 - share) + flat[self.low + self.stride] * share)
 
+    def gathered(self, values: Array, vertex: Ints, size: int) -> Array:
+        """The sums `(size, c)` of what `values (N, c)` at the numbers `vertex (N,)` give cells: the
+        transpose of `look_up`."""
+        low, share = self.low[vertex], self.share[vertex, None]
+        parts = ((low, values * (1 - share)), (low + self.stride, values * share))
+        return np.asarray(
+            sum(
+                np.stack([np.bincount(cell, x, size) for x in part.T], axis=-1)
+                for cell, part in parts
+            )
+        )
+
 
 class LinearisedPictures:
     """Pictures `(2, L, P, 3)` of either half of the `paths`, with `maps` on the hair.
 
-    `intensities (L, 3)` of the lights are in scene units, pictures in theirs.
+    `intensities (L, 3)` of the lights are in scene units, pictures in theirs. Derivatives are those
+    by `names`, of `SHARED` and "rotation".
     """
 
     def __init__(
-        self, paths: KeptPaths, mapped: MappedStrands, maps: HairMaps, intensities: AnyFloats
+        self,
+        paths: KeptPaths,
+        mapped: MappedStrands,
+        maps: HairMaps,
+        intensities: AnyFloats,
+        names: Sequence[str] = SHARED,
     ) -> None:
-        self._paths = paths
+        self._paths, self._names = paths, tuple(names)
         self._cells = Cells.of(paths, mapped, maps.shape)
         onward, self._onward = self._scattered(maps, paths.onward)
         lit, self._lit = self._scattered(maps, paths.lit)
@@ -78,7 +97,8 @@ class LinearisedPictures:
         return self._film(self._light)
 
     def change(self, moved: Mapping[str, Any], *, first_hit: bool = False) -> Array:
-        """Their derivative along `moved`: changes of sigma_a `(n_c, w, h, 3)` and of scalars.
+        """Their derivative along `moved`: changes of sigma_a `(n_c, w, h, 3)`, of rotation
+        `(n_c, w, h, 2)` and of scalars.
 
         On `first_hit`, of the light alone that the first vertex of a path gets and how it scatters
         it: hardly noisy.
@@ -90,13 +110,28 @@ class LinearisedPictures:
         before = self._along(onward, np.add, 0.0)
         return self._film(self._light * (before[self._paths.lit.vertex] + lit))
 
+    def rotation_gradient(self, weight: Array, shape: tuple[int, int, int]) -> Array:
+        """By the correctives `(n_c, w, h, 2)` of `shape`: the derivative of the sum of `weight (2,
+        L, P, 3)` times the pictures, of the first hit's light."""
+        light = self._light * np.where(self._first, weight.reshape(-1, 3)[self._index], 0)
+        values = (light[..., None] * self._lit["rotation"]).sum(axis=1)
+        found = self._cells.gathered(values, self._paths.lit.vertex, int(np.prod(shape)))
+        return found.reshape(*shape, 2)
+
     def _logarithms(
         self, moved: Mapping[str, Any], which: Scattering, logs: Mapping[str, Floats]
     ) -> Array:
         """Changes of the BSDF's logarithm `(N, 3)`."""
         total = np.zeros((len(which.vertex), 3))
         for name, by in moved.items():
-            total += logs[name] * (by if name in SCALARS else self._cells.look_up(by)[which.vertex])
+            if name in SCALARS:
+                total += logs[name] * by
+                continue
+            here = self._cells.look_up(by)[which.vertex]
+            if name == "rotation":
+                total += (logs[name] * here[:, None]).sum(axis=-1)
+            else:
+                total += logs[name] * here
         return total
 
     def _along(self, values: AnyFloats, combine: Any, first: float) -> Array:
@@ -115,41 +150,61 @@ class LinearisedPictures:
         return film.reshape(2, self._paths.lights, self._paths.pixels, 3)
 
     def _scattered(self, maps: HairMaps, which: Scattering) -> tuple[Floats, dict[str, Floats]]:
-        """BSDF times cosine `(N, 3)`, and its logarithm's derivatives `(N, 3)` by name.
+        """BSDF times cosine `(N, 3)`, and its logarithm's derivatives by name.
 
-        Those by sigma_a are by each channel's own. Skin keeps its value.
+        `(N, 3)`, those by sigma_a by each channel's own; `(N, 3, 2)` by rotation. Skin keeps its
+        value.
         """
-        at, names = which.vertex, ("sigma_a", *SCALARS)
+        at = which.vertex
         if not len(at):
-            return which.value, dict.fromkeys(names, which.value)
-        sigma_a = mi.Color3f(*_floats(self._cells.look_up(maps.sigma_a)[at]))
-        scalars = {n: dr.opaque(mi.Float, float(getattr(maps, n))) for n in SCALARS}
-        tilt = dr.opaque(mi.Float, float(np.radians(maps.tilt_deg)))
-        turn = None
-        if maps.rotation.any():
-            a, b = _floats(self._cells.look_up(maps.rotation)[at])
-            turn = mi.Vector3f(*axis_in_frame(a, b, *_floats(self._paths.normal[at])))
-        frame = ShadingFrame(None, turn)
-        wi = frame.enter(mi.Vector3f(*_floats(self._paths.incoming[at])))
-        wo = frame.enter(mi.Vector3f(*_floats(which.direction)))
-        value = mi.Color3f(evaluate(Fibre(sigma_a, **scalars, tilt=tilt), wi, wo)[0])
-        changes = {}
-        for name in names:
-            known: dict[str, Any] = {"sigma_a": sigma_a, **scalars}
-            kind: Any = type(known[name])
-            known[name] = kind(known[name])
-            dr.enable_grad(known[name])
-            dr.set_grad(known[name], 1)
-            moved = mi.Color3f(evaluate(Fibre(**known, tilt=tilt), wi, wo)[0])
-            changes[name] = dr.forward_to(moved)
+            nothing: dict[str, Floats] = dict.fromkeys(SHARED, which.value)
+            return which.value, nothing | {"rotation": np.zeros((0, 3, 2), np.float32)}
+        known: dict[str, Any] = {
+            "sigma_a": mi.Color3f(*_floats(self._cells.look_up(maps.sigma_a)[at])),
+            **{n: dr.opaque(mi.Float, float(getattr(maps, n))) for n in SCALARS},
+        }
+        turn: list[Any] | None = None
+        if maps.rotation.any() or "rotation" in self._names:
+            turn = _floats(self._cells.look_up(maps.rotation)[at])
+        wi = mi.Vector3f(*_floats(self._paths.incoming[at]))
+        wo = mi.Vector3f(*_floats(which.direction))
+        normal, tilt = _floats(self._paths.normal[at]), float(np.radians(maps.tilt_deg))
+        opaque_tilt = dr.opaque(mi.Float, tilt)
+
+        def scattered(hair: Mapping[str, Any], turn: Sequence[Any] | None) -> Any:
+            axis = None if turn is None else mi.Vector3f(*axis_in_frame(*turn, *normal))
+            frame = ShadingFrame(None, axis)
+            fibre = Fibre(**hair, tilt=opaque_tilt)
+            return mi.Color3f(evaluate(fibre, frame.enter(wi), frame.enter(wo))[0])
+
+        value = scattered(known, turn)
+        changes: dict[str, list[Any]] = {}
+        for name in self._names:
+            if name == "rotation" and turn is not None:
+                free = [[_moving(x) if i == k else x for i, x in enumerate(turn)] for k in (0, 1)]
+                changes[name] = [dr.forward_to(scattered(known, x)) for x in free]
+            else:
+                moved = scattered({**known, name: _moving(known[name])}, turn)
+                changes[name] = [dr.forward_to(moved)]
         dr.eval(value, changes)
         hair = self._paths.hair[at][:, None]
         values = np.where(hair, rows_of(value), which.value)
         bright = hair & (values > _DARK)
         whole = np.where(bright, values, 1)
-        return values, {
-            name: np.where(bright, rows_of(change) / whole, 0) for name, change in changes.items()
-        }
+        logs = {}
+        for name, change in changes.items():
+            each = [np.where(bright, rows_of(x) / whole, 0) for x in change]
+            logs[name] = np.stack(each, axis=-1) if name == "rotation" else each[0]
+        return values, logs
+
+
+def _moving(value: Any) -> Any:
+    """A copy of a Dr.Jit `value` whose derivative is asked for, forwards."""
+    kind: Any = type(value)
+    out = kind(value)
+    dr.enable_grad(out)
+    dr.set_grad(out, 1)
+    return out
 
 
 def half_of(samples: Ints) -> Ints:

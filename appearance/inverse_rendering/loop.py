@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.batches import Batch, Pairs
 from appearance.inverse_rendering.checkpoint import State
+from appearance.inverse_rendering.correctives import solve_correctives
 from appearance.inverse_rendering.global_parameters import WIDE, Evidence, solve_global_parameters
 from appearance.inverse_rendering.initial_absorption import absorption_of_cells
 from appearance.inverse_rendering.options import InverseRenderingOptions, Variant
@@ -107,7 +108,9 @@ class _Fit:
         self.start, self.lights = maps, lights
         free, self.spatial = VARIANTS[options.variant]
         self.solves = [n for n in free if n in WIDE] if options.gauss_newton else []
-        self.free = [n for n in free if n not in self.solves and n != "gain"]
+        self.turns = options.gauss_newton and "rotation" in free
+        kept = {"gain", "rotation"} if self.turns else {"gain"}
+        self.free = [n for n in free if n not in self.solves and n not in kept]
         if self.spatial and not options.cell_start and self.solves:
             self.free.append("sigma_a")
         self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
@@ -186,6 +189,11 @@ class _Fit:
             self._record(raw, gain, "global parameters", 0.5 * (k + 1) / rounds)
             if cells:
                 raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
+        if self.turns and not self.start.rotation.any():
+            effort, seed = self.options.effort, (self.seed << 4) + 15
+            self.monitor.progress("correctives", 0.5)
+            raw = solve_correctives(self.problem, raw, gain, effort, seed=seed).raw
+            self._record(raw, gain, "correctives", 0.5)
         return raw, gain
 
     def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:

@@ -21,8 +21,10 @@ LEAST_NOISE = 0.1
 """Of the median pixel's: what a pixel's noise is held to be at least, known from few paths."""
 LEAST_ERROR = 0.02
 """Of the root of the squares: below it smoothness gets no more say."""
-LAMBDA_SIGMA, LAMBDA_R = 0.5, 10.0
-"""Weights of smoothness along strands, of absorption and of correctives."""
+LAMBDA_SIGMA, LAMBDA_R = 0.5, 0.003
+"""Weights of smoothness along strands, of absorption, and of correctives: GroomLight's 10 forbids
+turns that undo a bend of 5°. Between neighbours on the scalp too, where correctives are solved
+for."""
 
 
 def level(captured: Array) -> Array:

@@ -34,12 +34,12 @@ class InverseRenderingOptions:
 
     `shape` is the volume's (n_c, w, h), reached at once by `cell_start` (see
     `absorption_of_cells`), or else over `levels` doublings. With `gauss_newton` the numbers that
-    all hair shares and the lights' intensities are solved for (see `global_parameters`), and steps
-    are for what is left: correctives and the lights' places, and nothing in the variants before
-    those. There are at most `steps`, of `images` pairs each: lights of one view on shared paths, or
-    pairs drawn one by one and rendered alone. `common_numbers` repeats the same random numbers for
-    a view in every step. The validation error is that of `validation_views` views, every
-    `check_every` steps; after `halvings` of the learning rate the fit has converged.
+    all hair shares and the lights' intensities are solved for (see `global_parameters`), then
+    correctives (see `correctives`), and steps are for what is left: the lights' places, in the
+    variant "lights". There are at most `steps`, of `images` pairs each: lights of one view on
+    shared paths, or pairs drawn one by one and rendered alone. `common_numbers` repeats the same
+    random numbers for a view in every step. The validation error is that of `validation_views`
+    views, every `check_every` steps; after `halvings` of the learning rate the fit has converged.
     """
 
     variant: Variant = "lights"

@@ -19,12 +19,12 @@ from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode, encode, hair_values
 from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
-from appearance.render.kept_paths import KeptSampling, WeightedPixels, keep_paths
-from appearance.render.olat import render_olat
+from appearance.render.kept_paths import KeptPaths, KeptSampling, WeightedPixels, keep_paths
+from appearance.render.olat import render_olat, render_olat_parts
 from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import Array, Ints
+from reconstruction.arrays import AnyFloats, Array, Ints
 
 ValidationSet = Sequence[tuple[Patch, Array]]
 """Patches, and the share `(k, P, 3)` of its weight that each value keeps."""
@@ -32,6 +32,14 @@ ValidationSet = Sequence[tuple[Patch, Array]]
 
 _FRAME_BYTES, _PICTURE_BYTES, _PATH_BYTES = 25, 96, 3000
 """Of a captured pixel under a light, of a rendered one, and of a kept path, about."""
+_LIT_BYTES = 30
+"""Of a light and a kept path of one vertex, about: three in ten reach it."""
+_DIRECT_PATHS, _FEWEST, _MOST = 400_000, 4, 16
+"""Kept paths of one vertex of all views together, and a pixel."""
+_ALL = 1e-9
+"""A light so dim casts its shadow ray: which do must not depend on the hair."""
+_LEAST_SPP = 16
+"""Of indirect light, whose noise is no less for small pictures."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
 
@@ -49,12 +57,35 @@ class Objective:
     smooth: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class DirectLight:
+    """Kept paths of one vertex through a `patch`: its direct light, for any maps on its strands.
+
+    `intensities (L, 3)` of the patch's lights are in scene units, times the exposure.
+    """
+
+    mapped: MappedStrands
+    patch: Patch
+    paths: KeptPaths
+    intensities: AnyFloats
+
+    def linearised(self, maps: HairMaps, names: Sequence[str]) -> LinearisedPictures:
+        """With `maps` on the hair, and derivatives by `names`, in exposure units."""
+        return LinearisedPictures(self.paths, self.mapped, maps, self.intensities, names)
+
+
 def memory_needed(pixels: Sequence[int], lights: int, effort: Effort) -> float:
     """GB that a fit takes beside its scene, about: views of so many `pixels` under `lights`."""
     frames = sum(pixels) * lights * _FRAME_BYTES
     picture = max(pixels, default=0) * lights * _PICTURE_BYTES
     paths = min(max(pixels, default=0), effort.pixels) * 2 * effort.spp * _PATH_BYTES
-    return (frames + max(picture, paths)) / 1e9
+    direct = sum(pixels) * direct_spp(sum(pixels)) * lights * _LIT_BYTES
+    return (frames + max(picture, paths, direct)) / 1e9
+
+
+def direct_spp(pixels: int) -> int:
+    """Kept paths of one vertex a pixel, where all views together have so many `pixels`."""
+    return int(np.clip(_DIRECT_PATHS // max(pixels, 1), _FEWEST, _MOST))
 
 
 class FitProblem:
@@ -174,11 +205,8 @@ class FitProblem:
     def render_all(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:
         """All pixels of a view under all lights `(L, P, 3)`, for means over lights: those of single
         lights are noisy, as a path asks few of them."""
-        o = self.views[view]
-        lights = np.arange(len(o.lights))
-        whole = Patch(view, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
         spent = {"first_lights": _FIRST_LIGHTS, "deep_lights": _DEEP_LIGHTS}
-        scene, camera, packed, pixels = self._seen(raw, gain, whole)
+        scene, camera, packed, pixels = self._seen(raw, gain, self._whole(view))
         spent |= {"spp": effort.spp, "max_depth": effort.max_depth}
         radiance = render_olat(scene, camera, packed, seed=seed, pixels=pixels, **spent)
         return radiance.astype(float) * self.scale
@@ -196,6 +224,29 @@ class FitProblem:
         paths = keep_paths(scene, camera, lights, wanted, sampling, seed)
         intensities = light_arrays(lights)[1] * self.scale
         return LinearisedPictures(paths, self.mapped, decode(raw), intensities)
+
+    def direct(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> DirectLight:
+        """Paths of one vertex through a patch under `gain (L,)`, which every light is asked at."""
+        scene, camera, lights, pixels = self._seen(raw, gain, patch)
+        wanted = WeightedPixels(pixels, np.ones((len(lights), len(pixels)), np.float32))
+        paths = keep_paths(scene, camera, lights, wanted, KeptSampling(effort.spp, 1, _ALL), seed)
+        return DirectLight(self.mapped, patch, paths, light_arrays(lights)[1] * self.scale)
+
+    def indirect(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:
+        """All pixels of a view under all lights `(L, P, 3)`, without the light that reaches the
+        first hit directly."""
+        scene, camera, lights, pixels = self._seen(raw, gain, self._whole(view))
+        spent: dict[str, int] = {
+            "spp": max(_LEAST_SPP, effort.spp // 4),
+            "max_depth": effort.max_depth,
+        }
+        _, rest = render_olat_parts(scene, camera, lights, pixels, seed=seed, **spent)
+        return rest.astype(float) * self.scale
+
+    def _whole(self, view: int) -> Patch:
+        """All pixels of a view under all lights."""
+        lights = np.arange(len(self.lights))
+        return Patch(view, lights, np.ones(len(lights)), np.arange(len(self.views[view].pixels)))
 
     def deviations(self, raw: Raw, gain: Array) -> LightDeviations:
         """How `raw` and `gain (L,)` have the lights."""

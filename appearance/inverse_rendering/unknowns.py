@@ -75,7 +75,7 @@ def encode(maps: HairMaps, lights: LightDeviations, profile_of: Ints) -> Raw:
     """The unconstrained numbers of `maps` and `lights`; `profile_of (L,)` numbers the profiles."""
     raw = {
         "sigma_a": encode_absorption(maps.sigma_a),
-        "rotation": MOST_TURN * np.arctanh(np.clip(maps.rotation / MOST_TURN, -0.999, 0.999)),
+        "rotation": encode_rotation(maps.rotation),
         "tilt_deg": np.array(
             [MOST_TILT * np.arctanh(np.clip(maps.tilt_deg / MOST_TILT, -0.99, 0.99))]
         ),
@@ -133,6 +133,11 @@ def encode_absorption(sigma_a: Array) -> Array:
     log_colour = -BRACKET * np.sqrt(np.maximum(sigma_a, 1e-12))
     short = np.maximum(-np.expm1(log_colour), 1e-7)
     return log_colour - np.log(short)
+
+
+def encode_rotation(rotation: Array) -> Array:
+    """The unconstrained numbers of correctives `(…, 2)`, those at their limit just within it."""
+    return np.asarray(MOST_TURN * np.arctanh(np.clip(rotation / MOST_TURN, -0.999, 0.999)))
 
 
 def _log_sigmoid(x: Any) -> Any:

@@ -74,7 +74,7 @@ def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain, tufte
     assert off(check(cut, HairMaps.of(START), ENOUGH), tufted.truth) < 0.4
 
 
-def test_a_cell_that_no_ray_meets_stays_at_its_prior(tufted, plain):
+def test_a_cell_that_no_ray_meets_stays_and_turns_no_more_than_its_neighbours(tufted, plain):
     # the cells beyond the last strand's column hold no strand
     uv = tufted.mapped.root_uv * [0.4, 1.0]
     mapped = type(tufted.mapped).of(tufted.scene, tufted.strands, uv)
@@ -83,7 +83,8 @@ def test_a_cell_that_no_ray_meets_stays_at_its_prior(tufted, plain):
     options = replace(OPTIONS, variant="correctives", shape=(2, 2, 1), steps=6)
     found = run(problem, start, options=options).maps
     np.testing.assert_allclose(found.sigma_a[:, 1], START.sigma_a[0], rtol=1e-3)
-    assert (np.abs(found.rotation[:, 1]) < 1e-6).all()
+    met, unmet = (np.abs(found.rotation[:, k]).max() for k in (0, 1))
+    assert unmet <= met + 1e-6
 
 
 def test_gradients_at_no_rotation_are_finite_and_not_all_zero(plain):

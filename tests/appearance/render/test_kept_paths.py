@@ -9,7 +9,7 @@ import pytest
 
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.linearised import LinearisedPictures, half_of
+from appearance.inverse_rendering.linearised import SHARED, LinearisedPictures, half_of
 from appearance.render.coverage import coverage
 from appearance.render.kept_paths import KeptSampling, WeightedPixels, keep_paths
 from appearance.scene.hair_scene import light_arrays
@@ -43,14 +43,14 @@ def tuft(small):
     return mapped, maps, camera, lights, pixels
 
 
-def kept(tuft, spp, maps=None, seed=1):
+def kept(tuft, spp, maps=None, seed=1, names=(*SHARED, "rotation")):
     """Paths, drawn with the tuft's own maps, and their pictures with `maps`."""
     mapped, own, camera, lights, pixels = tuft
     wanted = WeightedPixels(pixels, np.full((len(lights), len(pixels)), 0.3))
     scene = mapped.with_maps(own)
     paths = keep_paths(scene, camera, lights, wanted, KeptSampling(spp, DEPTH), seed)
     intensities = light_arrays(lights)[1]
-    return paths, LinearisedPictures(paths, mapped, maps or own, intensities)
+    return paths, LinearisedPictures(paths, mapped, maps or own, intensities, names)
 
 
 def test_their_mean_is_the_picture_that_is_traced(tuft):
@@ -65,7 +65,7 @@ def test_their_mean_is_the_picture_that_is_traced(tuft):
     np.testing.assert_allclose(halves[0].mean() / halves[1].mean(), 1, atol=0.05)
 
 
-@pytest.mark.parametrize("name", ["sigma_a", "beta_m", "beta_n", "eta"])
+@pytest.mark.parametrize("name", ["sigma_a", "beta_m", "beta_n", "eta", "rotation"])
 def test_derivatives_are_those_of_the_same_paths_with_other_hair(tuft, name):
     _, maps, *_ = tuft
     value = getattr(maps, name)
@@ -79,6 +79,17 @@ def test_derivatives_are_those_of_the_same_paths_with_other_hair(tuft, name):
     first = pictures.change({name: by}, first_hit=True)
     assert 0 < np.abs(first).sum() < np.abs(found).sum() * 2
     assert (first != found).any()
+
+
+def test_the_gradient_by_correctives_is_the_transpose_of_the_change(tuft):
+    _, maps, *_ = tuft
+    _, pictures = kept(tuft, 4)
+    rng = np.random.default_rng(1)
+    weight = rng.normal(size=pictures.picture().shape)
+    moved = rng.normal(size=maps.rotation.shape)
+    one = (weight * pictures.change({"rotation": moved}, first_hit=True)).sum()
+    other = (pictures.rotation_gradient(weight, maps.shape) * moved).sum()
+    np.testing.assert_allclose(other, one, rtol=1e-4)
 
 
 def test_the_same_seed_keeps_the_same_bytes(tuft):

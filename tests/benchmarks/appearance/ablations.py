@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,21 @@ from appearance.inverse_rendering.loop import Monitor, run
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
 from appearance.observations import Observed
-from benchmarks.appearance.cycles import AFAR, CyclesFrames, fit_cycles
+from benchmarks.appearance.cycles import AFAR, CyclesFrames, captured_by_cycles, fit_cycles
 from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
-from benchmarks.appearance.known_subjects import SUBJECTS, Captured, SmallStage, known_subject
+from benchmarks.appearance.known_subjects import (
+    RECONSTRUCTED,
+    SUBJECTS,
+    Captured,
+    SmallStage,
+    known_subject,
+    on_reconstructed,
+)
 from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
-from reconstruction import Progress, silent
+from reconstruction import Progress, read_strands, silent
 from reconstruction.arrays import Array
 
 OPTIONS = InverseRenderingOptions(
@@ -39,11 +46,21 @@ OPTIONS = InverseRenderingOptions(
 )
 STAGE = SmallStage(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
 AT_SIZE = {
-    128: SmallStage(128, cameras=10, lights=48, spp=96, judged_spp=48, truth=(12, 96, 96)),
-    256: SmallStage(256, cameras=18, lights=128, spp=96, judged_spp=48, truth=(12, 96, 96)),
+    size: SmallStage(
+        size,
+        cameras=views + 2,
+        lights=2 * lights,
+        spp=24,
+        judged_spp=32,
+        truth=(12, 96, 96),
+        clean_spp=128,
+    )
+    for size, views, lights in ((128, 8, 24), (256, 16, 64))
 }
 """By pixels a side: 8 training views and 24 lights, 16 and 64; the truth is finer than the fit."""
-AT_SIZE_OPTIONS = replace(OPTIONS, effort=Effort(pixels=600, spp=64, gradient_spp=16))
+AT_SIZE_OPTIONS = replace(
+    OPTIONS, shape=(12, 24, 24), steps=10, effort=Effort(pixels=600, spp=64, gradient_spp=16)
+)
 STARTS = (
     (0.4, 0.2, 1.45, (0.75, 1.25, 1.3)),
     (0.9, 0.9, 1.55, (1.0, 1.0, 1.0)),
@@ -51,6 +68,21 @@ STARTS = (
     (0.15, 0.6, 1.55, (8.0, 4.0, 2.0)),
 )
 """beta_m, beta_n and eta to start from, and factors on the true absorption."""
+
+
+@dataclass(frozen=True)
+class Ladders:
+    """Which tables are made at size: of `subjects`, for `seeds` seeds of the fit.
+
+    (r) needs the `strands` that a reconstruction of the subject made, "cycles" its `capture`.
+    """
+
+    subjects: Sequence[str] = ("b", "c")
+    seeds: int = 1
+    strands: Path | None = None
+    capture: Path | None = None
+
+
 PLAIN = Effort(spp=16, gradient_spp=16)
 """Paths of the plain version: as many for the picture as for its gradient."""
 
@@ -90,7 +122,7 @@ def run_bench(
                 )
                 found.append(_final(table.run(("original", "spatial"))))
             shared = [n for n in found[0] if all(n in f for f in found)]
-            result["seeds"] = {n: spread([f[n] for f in found]) for n in shared}
+            result["seeds"] = {name: {n: spread([f[n] for f in found]) for n in shared}}
             _write(out, result)
             result["time"] = error_against_time(captured, options, progress, seed)
         _write(out, result)
@@ -98,30 +130,35 @@ def run_bench(
 
 
 def run_at_size(
-    out: Path,
-    subject: Subject,
-    size: int,
-    *,
-    seeds: int = 1,
-    seed: int = 0,
-    progress: Progress = silent,
+    out: Path, subject: Subject, size: int, runs: Ladders, *, seed: int, progress: Progress = silent
 ) -> dict[str, Any]:
-    """The table of (b) and (c) at `size` of `AT_SIZE`, for `seeds`; `appearance_SIZE.json`."""
+    """The table of each of `runs.subjects` at `size` of `AT_SIZE`; `appearance_SIZE.json`."""
     rig, options = AT_SIZE[size], AT_SIZE_OPTIONS
     result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
-    captured: Captured | None = None
-    for name in ("b", "c"):
-        captured = known_subject(name, subject, rig, seed, captured)
+    begun = time.process_time()
+    frames: Captured | None = None
+    for name in runs.subjects:
+        if name == "cycles":
+            captured = captured_by_cycles(cycles_folder(runs.capture), seed)
+        elif name == RECONSTRUCTED:
+            frames = frames or known_subject("b", subject, rig, seed)
+            if runs.strands is None:
+                raise LeftOut("subject r needs --strands, which a reconstruction of it made")
+            captured = on_reconstructed(frames, read_strands(runs.strands), subject)
+        else:
+            captured = known_subject(name, subject, rig, seed, frames)
+            frames = captured if name == "b" else frames
         found = []
-        for k in range(seeds):
+        for k in range(runs.seeds):
             table = Table(captured, options, progress=within(progress, f"({name})"), seed=seed + k)
             variants = table.run()
             found.append(_final(variants))
             result["subjects"][f"{name}, seed {seed + k}"] = variants
+            result["cpu_seconds"] = time.process_time() - begun
             save(out / f"appearance_{size}.json", result)
-        result[f"seeds of {name}"] = {n: spread([f[n] for f in found]) for n in found[0]}
-    save(out / f"appearance_{size}.json", result)
-    (out / f"appearance_{size}.md").write_text(report(result))
+        result.setdefault("seeds", {})[name] = {n: spread([f[n] for f in found]) for n in found[0]}
+        save(out / f"appearance_{size}.json", result)
+        (out / f"appearance_{size}.md").write_text(report(result))
     return result
 
 
@@ -327,9 +364,11 @@ def report(result: dict[str, Any]) -> str:
             memory = f"{figures.get('memory_gb') or 0:.1f}"
             cells.append([variant, *scores, f"{train['psnr_clean']:.2f}", *off, seconds, memory])
         lines += [f"## Subject ({name})", "", markdown(head, cells)]
-    for name, found in result.get("seeds", {}).items():
-        sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
-        lines.append(f"- (b), {name}: {found['mean']:.2f}{sd} dB over {found['seeds']} seeds")
+    for subject, variants in result.get("seeds", {}).items():
+        for name, found in variants.items():
+            sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
+            mean, count = f"{found['mean']:.2f}", found["seeds"]
+            lines.append(f"- ({subject}), {name}: {mean}{sd} dB over {count} seeds")
     for case, variants in result.get("recovery", {}).items():
         for variant, found in variants.items():
             off = found.get("lights_off")
@@ -367,9 +406,8 @@ SMALL = SmallStage(size=14, cameras=3, lights=6, spp=64, max_depth=4)
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     subject = simulated(args.rig, args.subject, args.head, args.seed)
     if args.size in AT_SIZE and not args.quick:
-        return run_at_size(
-            args.out, subject, args.size, seeds=args.seeds, seed=args.seed, progress=progress
-        )
+        runs = Ladders(args.ladders.split(","), args.seeds, args.strands, args.capture)
+        return run_at_size(args.out, subject, args.size, runs, seed=args.seed, progress=progress)
     effort: dict[str, Any] = {"options": QUICK, "rig": SMALL} if args.quick else {}
     seeds = min(args.seeds, 1) if args.quick else args.seeds
     result = run_bench(args.out, subject, seeds=seeds, seed=args.seed, progress=progress, **effort)
@@ -393,6 +431,8 @@ BENCHMARK = Benchmark(
         *SUBJECT,
         CAPTURE,
         option("--size", "pixels a side: 36, or the ladder at 128 or 256", type=int, default=36),
-        option("--seeds", "of the spread on subject (b)", type=int, default=3),
+        option("--seeds", "of the spread, on (b); at size on all", type=int, default=3),
+        option("--ladders", "at size: which of b, c, r and cycles", default="b,c"),
+        option("--strands", "at size: those of a reconstruction, for r", type=Path),
     ),
 )

@@ -27,6 +27,7 @@ from appearance.observations import Observed
 from appearance.render.coverage import coverage
 from appearance.sun_fit.options import FitOptions
 from benchmarks.appearance.hair_inverse import hair_inverse
+from benchmarks.appearance.known_subjects import JUDGED_VIEW, Captured, SmallStage
 from benchmarks.subjects import Subject, cycles_subject
 from reconstruction import Camera, Capture, Progress, Stage, import_folder, silent
 from reconstruction.arrays import AnyFloats
@@ -38,6 +39,7 @@ OPTIONS = InverseRenderingOptions(
     validation_views=6,
     effort=Effort(pixels=300, spp=384, gradient_spp=48, max_depth=12),
 )
+_PIXELS = 1500
 AFAR = HairAppearance((0.13, 0.15, 0.35), 0.42, 0.2)
 
 
@@ -80,6 +82,34 @@ class CyclesFrames:
             truth,
             seed,
         )
+
+
+def captured_by_cycles(folder: Path, seed: int = 0) -> Captured:
+    """The capture as a subject of known appearance: one colour, on its true strands.
+
+    Pictures are judged by the held-out lights, in the held-out cameras and a training one.
+    """
+    subject, _ = cycles_subject(folder)
+    scene = subject.scene()
+    with tempfile.TemporaryDirectory() as scratch:
+        capture = import_folder(folder, Path(scratch) / "capture")
+        views = [_view(capture, scene, c, "hair", _PIXELS, seed) for c in capture.rig.cameras]
+    mapped = MappedStrands.of(scene, subject.strands, scalp_coordinates(subject.strands, None))
+    held_views = set(HELD_CAMERAS)
+    return Captured(
+        mapped,
+        mapped,
+        HairMaps.of(subject.hair),
+        np.array(subject.skin),
+        tuple(views),
+        # frames are there once: their noise is taken for error
+        tuple((o.radiance, o.radiance) for o in views),
+        HELD_CAMERAS,
+        HELD_LIGHTS,
+        Exposure.of([o.radiance[::2] for i, o in enumerate(views) if i not in held_views]),
+        SmallStage(192, len(views), len(views[0].lights), judged_spp=512, max_depth=12),
+        tuple((k, i) for k in (*HELD_CAMERAS, JUDGED_VIEW) for i in HELD_LIGHTS),
+    )
 
 
 def fit_cycles(

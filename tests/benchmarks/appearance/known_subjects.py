@@ -1,28 +1,35 @@
 """Subjects of known appearance, captured by our own renderer, to judge a fit on.
 
 (a) one colour on true strands; (b) a gradient from root to tip and dyed wisps on true strands;
-(c) the frames of (b), to be fitted on strands bent by 5° RMS of tangent noise.
+(c) the frames of (b), to be fitted on strands bent by 5° RMS of tangent noise; (r) the frames of
+(b), to be fitted on strands that a reconstruction made.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from appearance import Exposure, HairAppearance, build_scene, render_olat
+from appearance import Exposure, HairAppearance, HairScene, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, root_normals, scalp_coordinates
 from appearance.bsdf.strand_coordinates import transported
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat_parts, spread_out
+from appearance.render.smoothed import SIGMA, smoothed
 from benchmarks.subjects import Subject
 from reconstruction import Camera, Light, Strands
-from reconstruction.arrays import Array, Floats
+from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.lights import dome_positions
 
 SUBJECTS = ("a", "b", "c")
+RECONSTRUCTED = "r"
 TANGENT_NOISE_DEG = 5.0
+JUDGED_VIEW = 3
+"""A training view by which pictures are judged too, where frames are clean."""
 _BEND = 0.1
 """Metres of a bend's wave along the strand."""
 
@@ -32,7 +39,9 @@ class SmallStage:
     """A small stage: cameras on a ring, lights on a dome; every other one is held out.
 
     Frames have `spp` paths a pixel, renderings that are judged against them `judged_spp`. `truth`
-    are the cells (n_c, w, h) of subject (b)'s dye.
+    are the cells (n_c, w, h) of subject (b)'s dye. With `clean_spp` all of these have their
+    indirect light smoothed over a pixel, and every fourth held-out light, in the held-out views and
+    one training view, is rendered with so many paths: pictures are judged by these.
     """
 
     size: int = 64
@@ -43,6 +52,43 @@ class SmallStage:
     judged_spp: int = 384
     max_depth: int = 10
     truth: tuple[int, int, int] = (6, 24, 24)
+    clean_spp: int = 0
+
+    def halves(
+        self,
+        scene: HairScene,
+        camera: Camera,
+        lights: Sequence[Light],
+        pixels: Ints,
+        sampling: tuple[int, int],
+    ) -> tuple[Floats, Floats]:
+        """Two independent pictures `(L, P, 3)`; `sampling`: paths a pixel of both, and a seed."""
+        spp, seed = sampling
+        one, other = (
+            self._picture(scene, camera, lights, pixels, (spp // 2, seed + h)) for h in (0, 1)
+        )
+        return one, other
+
+    def _picture(
+        self,
+        scene: HairScene,
+        camera: Camera,
+        lights: Sequence[Light],
+        pixels: Ints,
+        sampling: tuple[int, int],
+    ) -> Floats:
+        spp, seed = sampling
+        spent: dict[str, Any] = {"spp": spp, "max_depth": self.max_depth, "seed": seed}
+        if not self.clean_spp:
+            return render_olat(scene, camera, lights, pixels=pixels, **spent)
+        direct, rest = render_olat_parts(scene, camera, lights, pixels, **spent)
+        spent |= {"max_depth": 1, "seed": seed + (1 << 31)}
+        direct += render_olat(scene, camera, lights, pixels=pixels, **spent)
+        share = np.zeros((camera.height, camera.width), np.float32)
+        share.reshape(-1)[pixels] = 1
+        shares = {"hair": share, "head": np.zeros_like(share)}
+        smooth = smoothed(spread_out(rest, pixels, camera), shares, SIGMA)
+        return np.asarray(0.5 * direct + smooth.reshape(len(lights), -1, 3)[:, pixels])
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +97,7 @@ class Captured:
 
     `mapped` holds the strands to fit on; `truth` the maps behind the frames, on `true_mapped`.
     `halves` are two independent renderings of each view `(L, P, 3)`, whose means `views` hold.
+    `judged` are the numbers of views and lights by which pictures are judged.
     """
 
     mapped: MappedStrands
@@ -62,8 +109,8 @@ class Captured:
     held_views: tuple[int, ...]
     held_lights: tuple[int, ...]
     exposure: Exposure
-    judged_spp: int
-    max_depth: int
+    rig: SmallStage
+    judged: tuple[tuple[int, int], ...]
 
     @property
     def train_lights(self) -> tuple[int, ...]:
@@ -103,26 +150,22 @@ def known_subject(
     truth = HairMaps.of(hair) if name == "a" else dyed(hair, seed, rig.truth)
     shown = mapped.with_maps(truth)
     cameras, lights = ring(strands, rig), dome(rig)
+    held_views = (0, len(cameras) // 2)
+    held_lights = tuple(range(1, len(lights), 2))
+    judged_lights = held_lights[1::4] if rig.clean_spp else held_lights
     views, halves = [], []
     for k, camera in enumerate(cameras):
         pixels = np.flatnonzero((coverage(shown, camera)["hair"] > 0.7).ravel())
-        half = [
-            render_olat(
-                shown,
-                camera,
-                lights,
-                spp=rig.spp // 2,
-                max_depth=rig.max_depth,
-                pixels=pixels,
-                seed=(seed << 8) + 7777 + 2 * k + h,
-            )
-            for h in (0, 1)
-        ]
-        halves.append((half[0], half[1]))
+        half = rig.halves(shown, camera, lights, pixels, (rig.spp, (seed << 8) + 7777 + 2 * k))
+        if rig.clean_spp and k in (*held_views, JUDGED_VIEW):
+            few = [lights[i] for i in judged_lights]
+            sampling = (rig.clean_spp, (seed << 8) + 5555 + 2 * k)
+            clean = rig.halves(shown, camera, few, pixels, sampling)
+            for frames, better in zip(half, clean, strict=True):
+                frames[list(judged_lights)] = better
+        halves.append(half)
         valid = np.ones(half[0].shape[:2], bool)
         views.append(Observed(camera, tuple(lights), pixels, 0.5 * (half[0] + half[1]), valid))
-    held_views = (0, len(cameras) // 2)
-    held_lights = tuple(range(1, len(lights), 2))
     exposure = Exposure.of([o.radiance[::2] for i, o in enumerate(views) if i not in held_views])
     return Captured(
         mapped,
@@ -134,9 +177,21 @@ def known_subject(
         held_views,
         held_lights,
         exposure,
-        rig.judged_spp,
-        rig.max_depth,
+        rig,
+        tuple(
+            (k, i)
+            for k in range(len(cameras))
+            if not rig.clean_spp or k in (*held_views, JUDGED_VIEW)
+            for i in judged_lights
+        ),
     )
+
+
+def on_reconstructed(captured: Captured, strands: Strands, subject: Subject) -> Captured:
+    """The frames of `captured`, to be fitted on `strands` that a reconstruction made of it."""
+    scene = build_scene(strands, subject.head, hair=captured.truth.mean(), skin=captured.skin)
+    uv = scalp_coordinates(strands, subject.head)
+    return replace(captured, mapped=MappedStrands.of(scene, strands, uv))
 
 
 def _on_bent(captured: Captured, subject: Subject, seed: int) -> Captured:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from appearance import InverseRenderingOptions, render_olat, scores
+from appearance import InverseRenderingOptions, scores
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
 from appearance.inverse_rendering.options import Variant
-from appearance.inverse_rendering.problem import FitProblem
+from appearance.inverse_rendering.problem import FitProblem, memory_needed
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import mean_scores, scores_unavailable
 from appearance.observations import Observed
@@ -93,6 +93,11 @@ class Table:
             self.variants[variant] |= {
                 "cpu_seconds": worked,
                 "memory_gb": peak.gb,
+                "memory_told_gb": memory_needed(
+                    [len(o.pixels) for o in self.training],
+                    len(self.training[0].lights),
+                    self.options.effort,
+                ),
                 "ended": found.ended,
                 "steps": found.steps,
                 "gain_spread": float(found.lights.gain.std()),
@@ -104,29 +109,21 @@ class Table:
 
     def _truth(self) -> list[tuple[int, int]]:
         """Numbers of the views and of the held-out lights that are compared."""
-        return [(k, i) for k in range(len(self.captured.views)) for i in self.captured.held_lights]
+        return list(self.captured.judged)
 
     def score_maps(
         self, variant: str, maps: HairMaps, mapped: MappedStrands, seconds: float
     ) -> None:
         """Render `maps` on `mapped` with fresh random numbers and score them as `variant`."""
         scene = mapped.with_maps(maps).with_skin(self.captured.skin)
-        held = list(self.captured.held_lights)
+        rig, pairs = self.captured.rig, self._truth()
         pictures: list[tuple[Array, Array]] = []
-        for k, o in enumerate(self.captured.views):
-            one, other = (
-                render_olat(
-                    scene,
-                    o.camera,
-                    [o.lights[i] for i in held],
-                    spp=self.captured.judged_spp // 2,
-                    max_depth=self.captured.max_depth,
-                    pixels=o.pixels,
-                    seed=(self.seed << 8) + 31 + 2 * k + h,
-                ).astype(float)
-                for h in (0, 1)
-            )
-            pictures += list(zip(one, other, strict=True))
+        for k in dict.fromkeys(k for k, _ in pairs):
+            o = self.captured.views[k]
+            lights = [o.lights[i] for view, i in pairs if view == k]
+            sampling = (rig.judged_spp, (self.seed << 8) + 31 + 2 * k)
+            one, other = rig.halves(scene, o.camera, lights, o.pixels, sampling)
+            pictures += list(zip(one.astype(float), other.astype(float), strict=True))
         self._score(variant, pictures)
         hair, true = maps.mean(), self.captured.truth.mean()
         self.variants[variant] |= {

@@ -1,0 +1,52 @@
+"""Correctives are found where the frames show turned fibres, and left alone where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering.correctives import solve_correctives
+from appearance.inverse_rendering.options import Effort
+from appearance.inverse_rendering.unknowns import LightDeviations, decode
+
+EFFORT = Effort(pixels=100, spp=64, max_depth=6)
+TURN = np.array([0.15, -0.1])
+
+
+def solve(tufted, truth: HairMaps, **more):
+    problem = tufted.problem(truth, spp=1024)
+    start = replace(truth, rotation=np.zeros_like(truth.rotation))
+    raw = problem.encode(start, LightDeviations.calibrated(len(problem.lights)))
+    return raw, solve_correctives(problem, raw, np.ones(len(problem.lights)), EFFORT, **more)
+
+
+def test_a_turn_that_all_fibres_share_is_found(tufted):
+    rotation = np.broadcast_to(TURN, (1, 1, 1, 2))
+    truth = replace(HairMaps.of(tufted.truth), rotation=rotation)
+    raw, found = solve(tufted, truth)
+    assert found.taken
+    np.testing.assert_allclose(decode(found.raw).rotation[0, 0, 0], TURN, atol=0.08)
+    assert found.error < found.start_error
+    others = [name for name in raw if name != "rotation"]
+    assert all((found.raw[name] == raw[name]).all() for name in others)
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 1), (1, 2, 1)], ids=["layers", "cells"])
+@pytest.mark.parametrize(("lambda_r", "apart"), [(1e-4, True), (10.0, False)])
+def test_neighbours_are_held_together_by_their_weight(tufted, shape, lambda_r, apart):
+    turns = np.array([[0.2, 0.0], [-0.2, 0.0]]).reshape(*shape, 2)
+    truth = replace(HairMaps.of(tufted.truth, shape), rotation=turns)
+    _, found = solve(tufted, truth, lambda_r=lambda_r)
+    one, other = decode(found.raw).rotation[..., 0].ravel()
+    assert (one - other > 0.15) == apart
+
+
+def test_without_lights_to_judge_by_nothing_is_turned(tufted):
+    problem = tufted.problem(lights=tufted.dome(3))
+    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(3))
+    found = solve_correctives(problem, raw, np.ones(3), EFFORT)
+    assert found.raw is raw
+    assert found.taken == ()
