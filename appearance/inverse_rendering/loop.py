@@ -191,9 +191,10 @@ class _Fit:
                 raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
         if self.turns and not self.start.rotation.any():
             effort, seed = self.options.effort, (self.seed << 4) + 15
-            self.monitor.progress("correctives", 0.5)
-            raw = solve_correctives(self.problem, raw, gain, effort, seed=seed).raw
-            self._record(raw, gain, "correctives", 0.5)
+            before = self._record(raw, gain, "cells", 0.5)
+            turned = solve_correctives(self.problem, raw, gain, effort, seed=seed).raw
+            if self._record(turned, gain, "correctives", 0.5) < before:
+                raw = turned
         return raw, gain
 
     def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
