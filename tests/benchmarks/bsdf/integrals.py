@@ -116,9 +116,11 @@ def integral(case: Case, function: Callable[[Any], Any], double: bool) -> Array:
 
     `function` may return several channels; the integral has as many.
     """
-    _, vector = array_types(double)
+    number, vector = array_types(double)
     w, weights = sphere(case)
-    values = np.asarray(function(vector(w.T.astype(np.float64 if double else np.float32))), float)
+    # by columns: an array of three would compile its number of lanes into the kernel
+    columns = (for_kernels(x, np.float64 if double else np.float32) for x in w.T)
+    values = np.asarray(function(vector(*map(number, columns))), float)
     return np.asarray(values @ weights)
 
 
