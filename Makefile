@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help setup demo test test-all test-peers bench lint clean
+.PHONY: help setup demo test test-all run-tests test-peers bench lint clean
 
 help:  ## Say what the targets do
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -23,11 +23,14 @@ setup: $(BIN)/.installed  ## Make .venv, install everything, find or install lib
 demo: setup  ## Capture, reconstruct, fit and relight; SUBJECT=strands HEAD=mesh OUT=folder
 	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD))
 
-test: setup lint test-peers  ## Run the tests (under 12 minutes on 2 cores)
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+test: setup test-peers  ## Run the tests, and beside them lint (under 12 minutes on 2 cores)
+	@$(MAKE) --no-print-directory -k -j 2 lint run-tests
 
-test-all: setup lint test-peers  ## Run the slow tests too (under 60 minutes)
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow or not slow'
+test-all: setup test-peers  ## Run the slow tests too (under 60 minutes)
+	@$(MAKE) --no-print-directory -k -j 2 lint run-tests WHICH='slow or not slow'
+
+run-tests:
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(or $(WHICH),not slow)'
 
 test-peers:  ## Install the small programs that tests talk to, where that needs no password
 	@command -v mbpoll >/dev/null \

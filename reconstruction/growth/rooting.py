@@ -21,6 +21,9 @@ _NEAR, _HIGHEST = 8e-3, 40e-3
 _REACHES = (3e-3, 5e-3, 8e-3, 8e-3, 12e-3, 12e-3, 20e-3)
 """Metres within which a neighbour is looked for, round by round."""
 
+_Loose = tuple[Floats, Array]
+"""A polyline, and the heights `(2,)` of its ends above the scalp."""
+
 _LEAST_COSINE = np.cos(np.radians(45.0))
 """Of the turn from a loose strand into the neighbour that continues it."""
 
@@ -52,11 +55,10 @@ def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
     if not loose:
         return Rooted(strands, 0, 0, 0)
     below = _Below(scalp)
-    height = below.heights(_ends(loose))
-    waiting: list[Floats] = []
-    for path, h in zip(loose, height, strict=True):
+    waiting: list[_Loose] = []
+    for path, h in zip(loose, below.heights(_ends(loose)), strict=True):
         if h.min() > _NEAR:
-            waiting.append(path)
+            waiting.append((path, h))
         else:
             strands.append(below.lead_lower(path, h))
     to_scalp = len(strands) - len(rooted)
@@ -67,12 +69,8 @@ def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
         attached, waiting = _join_round(strands, waiting, reach, below)
         joined += len(attached)
         strands += attached
-    height = below.heights(_ends(waiting)) if waiting else np.zeros((0, 2))
-    for path, h in zip(waiting, height, strict=True):
-        if h.min() <= _HIGHEST:
-            strands.append(below.lead_lower(path, h))
-    led = int((height.min(axis=1) <= _HIGHEST).sum())
-    return Rooted(strands, to_scalp + led, joined, len(waiting) - led)
+    led = [below.lead_lower(path, h) for path, h in waiting if h.min() <= _HIGHEST]
+    return Rooted(strands + led, to_scalp + len(led), joined, len(waiting) - len(led))
 
 
 class _Below:
@@ -117,8 +115,8 @@ def _ends(paths: list[Floats]) -> Array:
 
 
 def _join_round(
-    strands: list[Floats], loose: list[Floats], reach: float, below: _Below
-) -> tuple[list[Floats], list[Floats]]:
+    strands: list[Floats], loose: list[_Loose], reach: float, below: _Below
+) -> tuple[list[Floats], list[_Loose]]:
     """The loose polylines that find a rooted neighbour now, rooted, and those that do not."""
     points = np.concatenate(strands)
     counts = np.array([len(s) for s in strands])
@@ -131,9 +129,9 @@ def _join_round(
     rootward = points[some - 1] - points[some]
     rootward /= np.maximum(np.linalg.norm(rootward, axis=1, keepdims=True), 1e-12)
     tree = cKDTree(points[some], balanced_tree=False, compact_nodes=False)
-    height = below.heights(_ends(loose))
-    ends = _ends(loose).reshape(-1, 3)
-    before = [[p[min(4, len(p) - 1)] for p in loose], [p[-min(5, len(p))] for p in loose]]
+    paths = [path for path, _ in loose]
+    ends = _ends(paths).reshape(-1, 3)
+    before = [[p[min(4, len(p) - 1)] for p in paths], [p[-min(5, len(p))] for p in paths]]
     out = ends - np.stack(before, axis=1).reshape(-1, 3)
     out = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
     distance, index = tree.query(ends, k=np.arange(1, 17), distance_upper_bound=reach)
@@ -145,9 +143,9 @@ def _join_round(
     cost = cost[np.arange(len(ends)), pick].reshape(-1, 2)
     target = some[index[np.arange(len(ends)), pick]].reshape(-1, 2)
     attached, left = [], []
-    for path, c, t, h in zip(loose, cost, target, height, strict=True):
+    for (path, h), c, t in zip(loose, cost, target, strict=True):
         if not np.isfinite(c.min()):
-            left.append(path)
+            left.append((path, h))
             continue
         end = int(c.argmin())
         path = path if end == 0 else path[::-1]

@@ -91,7 +91,7 @@ class TinyStage:
 
     def until(self, what: Callable[[], T], seconds: float = 60.0) -> T:
         """What `what` returns once that is true; fails after `seconds` of an idle machine."""
-        return until(what, seconds * self.slack, pause=0.05)
+        return until(what, seconds * self.slack, pause=0.1)
 
     def start(self, *words: str | Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
         """Start `hairstage …` and read the object that it prints when it is ready."""

@@ -65,17 +65,17 @@ def test_the_baseline_runs_on_the_same_capture(shot: Capture, fibres: Any, tmp_p
 
 
 def test_no_light_beside_a_camera_is_said(
-    make_fibres: Any, fibre_lamps: Any, tmp_path: Path
+    make_fibres: Any, fibre_lamps: Any, fibre_cameras: Any, tmp_path: Path
 ) -> None:
-    stage = make_fibres()
-    lights = [replace(x, position=x.position * [1, 1, -1]) for x in fibre_lamps(20)]
-    report = run(make_fibres(lights=lights).shoot(tmp_path / "capture"), tmp_path / "model")
+    lights = [replace(x, position=x.position * [1, 1, -1]) for x in fibre_lamps(36)]
+    stage = make_fibres(cameras=fibre_cameras(4), lights=lights)
+    report = run(stage.shoot(tmp_path / "capture"), tmp_path / "model")
     assert report["lightcodes"].figures["cameras_with_a_light_beside"] < len(stage.cameras)
     assert any("no light stands beside" in w for w in report["lightcodes"].warnings)
 
 
 def test_one_light_is_enough_for_lines(shot: Capture, tmp_path: Path) -> None:
-    report = run(part_of(shot, lights=1), tmp_path)
+    report = run(part_of(shot, cameras=4, lights=1), tmp_path)
     assert report["lightcodes"].figures["lights"] == 1
 
 
@@ -101,12 +101,10 @@ def test_what_cannot_be_done_without_is_named(fibres: Any, tmp_path: Path) -> No
 
 
 def test_cameras_that_look_away_leave_no_volume(
-    make_fibres: Any, fibre_cameras: Any, tmp_path: Path
+    make_fibres: Any, fibre_cameras: Any, fibre_lamps: Any, tmp_path: Path
 ) -> None:
-    stage = make_fibres()
     turned = [c.moved(np.eye(3), c.R[0] * 0.5) for c in fibre_cameras(4)]
-    capture = make_fibres(cameras=turned).shoot(tmp_path / "capture")
-    assert len(stage.cameras) == 8
+    capture = make_fibres(cameras=turned, lights=fibre_lamps(8)).shoot(tmp_path / "capture")
     for camera in turned:  # masks of what is not there: the cameras' rays do not meet
         mask = np.full((camera.height, camera.width), 255, np.uint8)
         cv2.imwrite(str(tmp_path / "capture" / "masks" / f"{camera.name}.png"), mask)
