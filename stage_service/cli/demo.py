@@ -50,6 +50,8 @@ FILES = (
     "appearance.json",
     "report.json",
 )
+READY_S = 300.0
+"""Seconds until a process of the demo must be ready: a busy machine takes its time."""
 
 
 def add(commands: Commands) -> None:
@@ -179,7 +181,7 @@ def _start(children: Children, args: argparse.Namespace) -> str:
     simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed).command(
         *("--state", out / "simulated", "--truth", out / "truth", "--ports", "auto")
     )
-    devices = children.ready("simulators", simulated, 300)["devices"]
+    devices = children.ready("simulators", simulated, READY_S)["devices"]
     serve = own_command(
         *("serve", "--json", "--rig", args.rig, "--devices", devices),
         *("--root", out, "--port", "0"),
@@ -187,8 +189,8 @@ def _start(children: Children, args: argparse.Namespace) -> str:
     # Ended the latest first: the service, whose lamps must not wait for the worker.
     worker = children.start("worker", own_command("worker", "--json", "--root", out), answers=True)
     service = children.start("service", serve, answers=True)
-    url: str = children.first_line("service", service, 60)["url"]
-    children.first_line("worker", worker, 60)
+    url: str = children.first_line("service", service, READY_S)["url"]
+    children.first_line("worker", worker, READY_S)
     return url
 
 

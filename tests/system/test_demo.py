@@ -80,12 +80,17 @@ def test_ctrl_c_ends_the_demo_in_order_and_its_folder_may_be_used_again(stage):
             command(stage, out, "straight"), stdout=subprocess.PIPE, text=True
         ) as begun:
             try:
-                stage.until(lambda: not old.exists() and list(out.glob("captures/*/frames/*/*")))
+                stage.until(
+                    lambda: (
+                        begun.poll() is not None
+                        or (not old.exists() and list(out.glob("captures/*/frames/*/*")))
+                    )
+                )
                 begun.send_signal(signal.SIGINT)
                 answer, _ = begun.communicate(timeout=300)
             finally:
                 begun.kill()
-        assert begun.returncode == 130
+        assert begun.returncode == 130, answer
         assert json.loads(answer)["error"]["type"] == "Interrupted"
         assert processes_of(out) == []
         (manifest,) = out.glob("captures/*/manifest.json")
