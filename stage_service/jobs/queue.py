@@ -264,6 +264,7 @@ class JobQueue:
             serializer=DBOSPortableJSONSerializer(),
             application_name=names.application,
             retry_connection_errors=False,
+            observability_query_timeout_sec=STATEMENT_S,  # of lists, which have one of their own
         )
 
     def _job(self, status: WorkflowStatus) -> Job:
