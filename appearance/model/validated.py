@@ -63,9 +63,10 @@ def fit_validated(
         if found <= sun:
             rendered = "sun_fit"
             model.reject("hair_maps.npz", "lights.json")
+            better = "is better" if found < sun - 0.005 else "is as good"
             stage.warn(
-                f"on frames that neither was fitted to Sun's fit is better, {sun:.2f} dB against "
-                f"{found:.2f}: it is what is rendered"
+                f"Sun's fit {better} on frames that neither was fitted to, {sun:.2f} dB against "
+                f"{found:.2f}: it is rendered"
             )
     else:
         stage.warn("too few lights to leave some out: nothing says whether the maps are better")
