@@ -88,7 +88,7 @@ def test_a_capture_becomes_relit_hair(running, captured, finished):
 
 def test_inverse_rendering_goes_on_where_its_worker_was_killed(running, captured, finished):
     effort = {"pixels": 60, "spp": 4, "gradient_spp": 2}
-    fit = {"variant": "correctives", "shape": [2, 2, 2], "steps": 40, "check_every": 5}
+    fit = {"variant": "lights", "shape": [2, 2, 2], "steps": 40, "check_every": 5}
     asked = {
         "capture": captured["id"],
         "model": Path(finished[0]["model"]).name,

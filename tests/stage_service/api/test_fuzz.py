@@ -21,6 +21,12 @@ from stage_service.records.tokens import Tokens
 schemathesis = pytest.importorskip("schemathesis", reason="pip install 'hairstage[dev]'")
 openapi_checks = pytest.importorskip("schemathesis.specs.openapi.checks")
 
+
+@schemathesis.serializer("model/obj", "application/octet-stream")  # type: ignore[misc, unused-ignore]
+def as_it_is(context: Any, value: Any) -> bytes:
+    return value if isinstance(value, bytes) else str(value).encode()
+
+
 OWN = "own token of the tests"
 CHECKS = [
     schemathesis.checks.not_a_server_error,
