@@ -284,10 +284,10 @@ def devices(ports: list[int], paths: list[str], slack: int) -> str:
 living_subject = false
 [devices]
 heartbeat_s = 0.05
-watchdog_s = {0.5 * slack:g}
+watchdog_s = {1.0 * slack:g}
 [devices.lights]
 port = {ports[0]}
-timeout_s = {0.3 * slack:g}
+timeout_s = {0.8 * slack:g}
 [devices.trigger]
 port = "{paths[0]}"
 timeout_s = {0.3 * slack:g}
