@@ -6,7 +6,7 @@ All of it on the event loop, so that a blackout waits for no thread here.
 from __future__ import annotations
 
 import asyncio
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,8 @@ ANYBODY = Identity(name="", scopes=SCOPES)
 MOST_BODY = 1 << 20
 BODY_S = 20.0
 """A request's body is there within this time."""
+LINGER_S = 10.0
+"""How long a request that is refused may go on sending."""
 UPLOADS, MOST_UPLOAD, UPLOAD_S = "/uploads/", 32 << 20, 120.0
 """Where a `PUT` may be larger, and take longer: two at a time, each of them in memory."""
 
@@ -87,10 +89,10 @@ class Gate:
             return
         slug, detail, status = refusal
         response = problem_response(scope["path"], slug, detail, status=status)
-        response.headers["connection"] = "close"  # what it still sends is not read
+        response.headers["connection"] = "close"
         if slug == "unauthorized":
             response.headers["www-authenticate"] = "Bearer"
-        await response(scope, receive, send)
+        await response(scope, receive, _lingering(headers, receive, send))
 
     async def _with_body(
         self, scope: Scope, receive: Receive, send: Send, upload: bool
@@ -130,6 +132,31 @@ async def _body(headers: Headers, receive: Receive, most: int) -> Message:
             raise OverflowError
         if not message.get("more_body", False):
             return {"type": "http.request", "body": bytes(body), "more_body": False}
+
+
+def _lingering(headers: Headers, receive: Receive, send: Send) -> Send:
+    """Sends an answer, then takes and forgets what the client still sends before the last word.
+
+    A connection that is closed with unread bytes is reset, and the answer is lost with it.
+    """
+
+    async def rest() -> None:
+        while True:
+            message = await receive()
+            if message["type"] != "http.request" or not message.get("more_body", False):
+                return
+
+    async def send_then_wait(message: Message) -> None:
+        last = message["type"] == "http.response.body" and not message.get("more_body", False)
+        if last and "expect" not in headers:  # who expects to be asked sends nothing yet
+            await send({**message, "more_body": True})
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LINGER_S):
+                    await rest()
+            message = {"type": "http.response.body", "body": b""}
+        await send(message)
+
+    return send_then_wait
 
 
 def _not_json(headers: Headers, message: Message) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import io
 import json
+import socket
 import tarfile
 import time
 from collections.abc import Iterator
@@ -249,6 +250,20 @@ def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
     assert slug(http.post("/plans:validate", content=large)) == "too-large"
     assert http.delete("/uploads/anna").json()["files"] == ["head.obj", "masks/cam_1.png"]
     assert http.get("/uploads").json() == []
+
+
+def test_a_refusal_reaches_a_client_that_sends_on(http):
+    """What a connection was told is lost where it is closed before all was read."""
+    size = 4 * gate.MOST_BODY
+    host, port = http.base_url.host, http.base_url.port
+    head = f"POST /plans:validate HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: {size}\r\n\r\n"
+    with socket.create_connection((host, port), timeout=60) as connection:
+        connection.sendall(head.encode())
+        connection.recv(1, socket.MSG_PEEK)  # the refusal is there
+        connection.sendall(size * b" ")
+        answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
+    assert answer.startswith(b"HTTP/1.1 413")
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["type"].endswith("too-large")
 
 
 def test_the_command_line_of_the_store(http, tmp_path, capsys):
