@@ -45,3 +45,8 @@ def serving(rig_file: RigFile, root: Path, access: Access | None = None) -> Iter
         server.should_exit = True
         thread.join(60)
         listener.close()
+
+
+def slug(response: httpx.Response) -> str:
+    """What a problem document says is wrong."""
+    return str(response.json()["type"]).partition("#")[2]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance.export.groom import Groom, upwards
+from appearance.export.groom import Groom
 from appearance.export.maps import SCALARS
 from reconstruction.files.durable import write_whole, writing
 
@@ -45,8 +45,8 @@ def export_blender(groom: Groom, folder: Path) -> list[Path]:
     if groom.head is not None:
         arrays["head_vertices"] = groom.head.vertices.astype(np.float32)
         arrays["head_faces"] = groom.head.faces.astype(np.int32)
-        if groom.head_uv is not None:
-            arrays["head_uv"] = np.nan_to_num(upwards(groom.head_uv), nan=-1.0)
+        if groom.head_st is not None:
+            arrays["head_uv"] = groom.head_st
     with writing(folder / "groom.npz") as part:
         np.savez(part, allow_pickle=False, **arrays)
     script = Path(__file__).with_name("in_blender.py").read_bytes()

@@ -93,6 +93,14 @@ class Groom:
         """`root_uv (S, 2)` as others have it: t upwards on the pictures of `layer_image`."""
         return upwards(self.root_uv)
 
+    @property
+    def head_st(self) -> Floats | None:
+        """`head_uv (V, 2)` as others have it: t upwards, and (-1, -1) off the scalp."""
+        if self.head_uv is None:
+            return None
+        off = np.isnan(self.head_uv)
+        return np.where(off, np.float32(-1), upwards(self.head_uv))
+
     @cached_property
     def looked_up(self) -> tuple[Array, Array]:
         """Absorption `(N, 3)` and correctives `(N, 2)` at the points."""

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from appearance.export.groom import Groom, upwards
+from appearance.export.groom import Groom
 from appearance.export.maps import SCALARS, layer_image
 from reconstruction import write_exr
 from reconstruction.arrays import AnyFloats, Array, Ints
@@ -189,8 +189,8 @@ def _head(groom: Groom, stage: Any, turn: Array) -> None:
     _primvar(
         api, "displayColor", TYPES.Color3fArray, UsdGeom.Tokens.constant, np.array([groom.skin])
     )
-    if groom.head_uv is not None:
-        uv = np.nan_to_num(upwards(groom.head_uv), nan=-1.0)
+    uv = groom.head_st
+    if uv is not None:
         _primvar(api, "st", TYPES.TexCoord2fArray, UsdGeom.Tokens.vertex, uv)
     if head.scalp is not None:
         which = Vt.IntArray.FromNumpy(np.flatnonzero(head.scalp).astype(np.int32))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import random
 import select
 import signal
@@ -75,7 +74,7 @@ class Soak:
         kilobytes = int(status.partition("VmRSS:")[2].split()[0])
         return {
             "rss_bytes": kilobytes * 1024,
-            "descriptors": len(os.listdir(f"/proc/{self._child.pid}/fd")),  # noqa: PTH208
+            "descriptors": sum(1 for _ in Path(f"/proc/{self._child.pid}/fd").iterdir()),
         }
 
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
-from serving import Client, serving
+from serving import Client, serving, slug
 from waiting import until
 
 from stage_service.acquisition import capture_queue
 from stage_service.acquisition.captures import Busy, CaptureManager
 from stage_service.cli import main
-from stage_service.config import RigFile, SafetyLimits
+from stage_service.config import SafetyLimits
 from stage_service.plan.capture_plan import CapturePlan
 
 LONG = {"projectors": [], "lights": [f"light_{i:03d}" for i in range(60)]}
@@ -27,16 +25,6 @@ CONSENT = "N. N., 3 May 2026, flashes of 14 Hz for ten seconds"
 def plan(light: int) -> dict[str, Any]:
     """One that only its light tells from others."""
     return {"plan": {"lights": [f"light_{light:03d}"], "projectors": []}}
-
-
-@pytest.fixture
-def http(rig_file: RigFile, tmp_path: Path) -> Iterator[Client]:
-    with serving(rig_file, tmp_path / "root") as client:
-        yield client
-
-
-def slug(response: Any) -> str:
-    return response.json()["type"].partition("#")[2]
 
 
 def add(http: Client, body: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,6 @@ from stage_service.devices.device_set import DeviceSet
 SHORT = {"lights": ["light_003", "light_000"], "projectors": []}
 IN_BAND = {**SHORT, "lights": "all", "exposure": {"olat": 0.05}}
 CONSENT = "N. N., 3 May 2026, flashes of 14 Hz for ten seconds"
-
-
-@pytest.fixture
-def http(rig_file: RigFile, tmp_path: Path) -> Iterator[Client]:
-    with serving(rig_file, tmp_path / "root") as client:
-        yield client
 
 
 def refused(response: httpx.Response, slug: str) -> dict[str, Any]:

@@ -8,35 +8,22 @@ import json
 import socket
 import tarfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import pytest
-from serving import Client, serving
+from serving import Client, serving, slug
 from waiting import until
 
 from reconstruction import Capture, Model, verify
 from stage_service.api import gate
 from stage_service.api.gate import Access
 from stage_service.cli import main
-from stage_service.config import RigFile
 from stage_service.records.tokens import Tokens
 
 SHORT = {"lights": ["light_003"], "projectors": []}
 HEAD = b"v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\ng scalp\nf 1 2 3\n"
-
-
-@pytest.fixture
-def http(rig_file: RigFile, tmp_path: Path) -> Iterator[Client]:
-    with serving(rig_file, tmp_path / "root") as client:
-        yield client
-
-
-def slug(response: Any) -> str:
-    return response.json()["type"].partition("#")[2]
 
 
 def shot(http: Client, **more: Any) -> dict[str, Any]:
