@@ -424,6 +424,11 @@ class Service:
         self._control.do(by, "lease.end", work, detail=detail, steers=False)
         return self.lease()
 
+    def record_login(self, name: str, address: tuple[str, int] | None) -> None:
+        """Note in the audit log who logged in, and from where."""
+        where = "" if address is None else f"{address[0]}:{address[1]}"
+        self._control.audit.record(str(Caller(where, name=name)), "login", "service")
+
     def audit(self, limit: int) -> list[Action]:
         """The newest actions on the stage, refused ones too; the oldest of them first."""
         return self._control.audit.latest(limit)

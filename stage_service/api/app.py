@@ -16,7 +16,7 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
-from stage_service.api import event_stream, queueing, routes, steering, store
+from stage_service.api import event_stream, login, queueing, routes, steering, store
 from stage_service.api.connections import LOOPBACK, limits, listening
 from stage_service.api.downloads import Heads
 from stage_service.api.gate import OWN_NAMES, Access, Gate
@@ -51,12 +51,15 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
             }
         },
     )
+    access = access or Access()
     app.state.service, app.state.lanes, app.state.streams = service, Lanes(), 0
+    app.state.access = access
     install_problems(app)
     for part in (routes, steering, queueing, store, event_stream):
         app.include_router(part.reading)
-    for more in (routes, steering, queueing, store):
+    for more in (routes, steering, queueing, store, login):
         app.include_router(more.router)
+    app.include_router(login.open_to_all)
 
     @app.get(PAGE, include_in_schema=False)
     def errors() -> PlainTextResponse:
@@ -64,7 +67,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
 
     app.add_middleware(Faults)
     app.add_middleware(Heads)
-    app.add_middleware(Gate, access=access or Access())
+    app.add_middleware(Gate, access=access)
     return app
 
 

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from reconstruction.reading import parse_json
+from stage_service.api.login import LOGIN, Logins
 from stage_service.api.problems import PAGE, problem_response
-from stage_service.records.tokens import SCOPES, Identity, Tokens
+from stage_service.records.tokens import SCOPES, Identity, Tokens, UnknownToken
 
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 OPEN = {PAGE, "/docs", "/openapi.json"}
@@ -32,10 +33,12 @@ UPLOADS, MOST_UPLOAD, UPLOAD_S = "/uploads/", 32 << 20, 120.0
 
 @dataclass(frozen=True)
 class Access:
-    """Who gets in: by host names that are this service's, and by `tokens`; None: everybody."""
+    """Who gets in: by host names that are this service's, and by `tokens`, sent with each request
+    or once to log in; None: everybody."""
 
     tokens: Tokens | None = None
     names: frozenset[str] = OWN_NAMES
+    logins: Logins = field(default_factory=Logins)
 
     def refusal(self, headers: Headers) -> tuple[str, str, int | None] | None:
         """Why a browser may have been made to send this, as a problem's kind, detail, status.
@@ -52,11 +55,21 @@ class Access:
         return None
 
     def identity(self, headers: Headers) -> Identity | None:
-        """Who asks."""
+        """Who asks; a token that is sent counts alone, not the cookie beside it."""
         if self.tokens is None:
             return ANYBODY
-        kind, _, token = headers.get("authorization", "").partition(" ")
-        return self.tokens.find(token.strip()) if kind.lower() == "bearer" else None
+        if "authorization" in headers:
+            kind, _, token = headers["authorization"].partition(" ")
+            return self.tokens.find(token.strip()) if kind.lower() == "bearer" else None
+        behind = self.logins.token_of(headers)
+        return None if behind is None else self.tokens.behind(behind)
+
+    def of_token(self, token: str) -> Identity:
+        """Whose token this is. Raises `UnknownToken`."""
+        identity = ANYBODY if self.tokens is None else self.tokens.find(token)
+        if identity is None:
+            raise UnknownToken("there is no such token; 'hairstage token' shows and makes them")
+        return identity
 
 
 class Gate:
@@ -78,8 +91,11 @@ class Gate:
             identity = self._access.identity(headers)
             state = scope.setdefault("state", {})
             state["identity"], state["identify"] = identity, self._access.identity
-            if identity is None and scope["path"] not in OPEN:
-                detail = "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown"
+            if identity is None and not _open(scope):
+                detail = (
+                    "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown, or "
+                    "the login is over"
+                )
                 refusal = "unauthorized", detail, None
         if refusal is None:
             upload = scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
@@ -179,6 +195,11 @@ def _again(message: Message, receive: Receive) -> Receive:
         return waiting.pop() if waiting else await receive()
 
     return next_message
+
+
+def _open(scope: Scope) -> bool:
+    """Whether it may be asked by somebody unknown."""
+    return scope["path"] in OPEN or (scope["method"], scope["path"]) == ("POST", LOGIN)
 
 
 def _name(host: str) -> str:

@@ -33,6 +33,7 @@ from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
+from stage_service.records.tokens import UnknownToken
 from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
 from stage_service.storage import BadUpload, InUse, NotThere
 from stage_service.watching import NotReady
@@ -53,8 +54,9 @@ class Kind:
 
 TABLE = """
 unauthorized 401 Who asks is not known
-    Every request but those for /docs and /openapi.json carries `Authorization: Bearer TOKEN`.
-    `hairstage token` makes tokens; docs/safety.md says who may do what.
+    Every request but those for /docs and /openapi.json carries `Authorization: Bearer TOKEN`, or
+    the cookie that `POST /login` sets. `hairstage token` makes tokens; docs/safety.md says who may
+    do what.
 forbidden 403 This token does not allow that
     `scope` is what it lacks. Abort and blackout are open to every token.
 foreign-origin 403 A web page of another site asked
@@ -160,6 +162,7 @@ BY_ERROR: dict[type[Exception], str] = {
     Leased: "leased",
     NoLease: "no-lease",
     Forbidden: "forbidden",
+    UnknownToken: "unauthorized",
     WrongState: "wrong-state",
     NotFinished: "not-finished",
     ModelInUse: "model-in-use",

@@ -29,6 +29,10 @@ class TokenError(ValueError):
     """A token that cannot be made or revoked, or a file of tokens that cannot be read."""
 
 
+class UnknownToken(PermissionError):
+    """There is no such token, or not any more."""
+
+
 class Identity(BaseModel):
     """Whose token it is, and what it opens."""
 
@@ -54,16 +58,19 @@ class Tokens:
 
     def __init__(self, path: Path, own: str | None = None) -> None:
         self._path = path
-        self._own = None if own is None else _hash(own)
+        self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
         self._read: tuple[tuple[int, int, int] | None, dict[str, Identity]] = (None, {})
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""
-        hashed = _hash(token)
-        if hashed == self._own:
+        return self.behind(hashed(token))
+
+    def behind(self, hash: str) -> Identity | None:
+        """Whose token has this hash."""
+        if hash == self._own:
             return Identity(name=_user(), scopes=SCOPES)
-        return self._known().get(hashed)
+        return self._known().get(hash)
 
     def entries(self) -> list[Entry]:
         """All of the file, the oldest first. Raises `TokenError`."""
@@ -83,7 +90,7 @@ class Tokens:
             if not is_file_name(name) or name in [e.name for e in entries]:
                 raise TokenError(f"{name!r}: not a name, or there is a token of that name already")
             token = secrets.token_urlsafe(32)
-            new = Entry(name=name, scopes=scopes, sha256=_hash(token), made=utc_now())
+            new = Entry(name=name, scopes=scopes, sha256=hashed(token), made=utc_now())
             self._write([*entries, new])
             return token
 
@@ -159,5 +166,6 @@ def _user() -> str:
         return f"user {os.getuid()}"
 
 
-def _hash(token: str) -> str:
+def hashed(token: str) -> str:
+    """What is kept of a token."""
     return hashlib.sha256(token.encode()).hexdigest()
