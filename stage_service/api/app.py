@@ -52,8 +52,8 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
         },
     )
     access = access or Access()
-    app.state.service, app.state.lanes, app.state.streams = service, Lanes(), 0
-    app.state.access = access
+    app.state.service, app.state.lanes, app.state.access = service, Lanes(), access
+    app.state.feed = event_stream.Feed(service.events)
     install_problems(app)
     for part in (routes, steering, queueing, store, event_stream):
         app.include_router(part.reading)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from reconstruction.capture.writer import utc_now
@@ -27,6 +29,11 @@ class EventLog:
         self._events: deque[Event] = deque(maxlen=capacity)
         self._changed = threading.Condition()
         self._last = 0
+        self._told: list[Callable[[], object]] = []
+
+    def tell(self, told: Callable[[], object]) -> None:
+        """Have `told` called after each event, by whoever published it: it must not wait."""
+        self._told.append(told)
 
     @property
     def last(self) -> int:
@@ -41,10 +48,21 @@ class EventLog:
             event = Event(self._last, kind, utc_now(), data)
             self._events.append(event)
             self._changed.notify_all()
-            return event
+        for told in self._told:
+            told()
+        return event
 
     def wait(self, number: int, timeout: float) -> list[Event]:
         """The kept events after `number`, oldest first; waits up to `timeout` seconds for one."""
         with self._changed:
             self._changed.wait_for(lambda: self._last > number, timeout)
-            return [e for e in self._events if e.number > number]
+            return self._after(number, len(self._events))
+
+    def after(self, number: int, most: int) -> list[Event]:
+        """The first `most` kept events after `number`, oldest first; waits for none."""
+        with self._changed:
+            return self._after(number, most)
+
+    def _after(self, number: int, most: int) -> list[Event]:
+        seen = max(0, number - (self._last - len(self._events)))  # of those that are kept
+        return list(islice(self._events, seen, seen + most))

@@ -8,8 +8,9 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -238,3 +239,23 @@ def test_it_darkens_first_and_starts_whatever_lies_in_its_folder(
         assert "set aside" in health["problems"][0]
         assert http.get("/jobs").json() == []
         assert http.get("/audit").status_code == 200
+
+
+def test_listeners_hold_no_thread_and_are_all_told(rig_file, tmp_path):
+    with serving(rig_file, tmp_path) as http, ExitStack() as links:
+        address = (http.base_url.host, http.base_url.port)
+        lines = []
+        for _ in range(60):
+            link = links.enter_context(socket.create_connection(address))
+            link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            lines.append(links.enter_context(link.makefile("rb")))
+        for line in lines:
+            assert b"200" in line.readline()
+        threads = {thread.name for thread in threading.enumerate()}
+        assert not any(name.startswith("asyncio_") for name in threads), threads
+        for number in range(700):  # more than one piece
+            http.service.events.publish("test", {"n": number})
+        for line in lines:
+            told = (json.loads(x[6:]) for x in line if x.startswith(b"data: "))
+            numbers = (e["data"]["n"] for e in told if e["kind"] == "test")
+            assert list(islice(numbers, 700)) == list(range(700))
