@@ -86,6 +86,7 @@ def test_a_capture_becomes_relit_hair(running, captured, finished):
     assert len(running.get("/devices")["cameras"]) == running.CAMERAS
 
 
+@pytest.mark.slow  # a killed worker and a killed fit each have a smaller test
 def test_inverse_rendering_goes_on_where_its_worker_was_killed(running, captured, finished):
     effort = {"pixels": 60, "spp": 4, "gradient_spp": 2}
     fit = {"variant": "lights", "shape": [2, 2, 2], "steps": 40, "check_every": 5}

@@ -29,7 +29,7 @@ from reconstruction import (
 REQUEST = parse_options(
     InverseRenderingRequest,
     {
-        "judged_spp": 256,
+        "judged_spp": 64,
         "max_depth": 5,
         "fit": {
             "variant": "lights",
