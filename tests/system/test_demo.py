@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -75,24 +76,24 @@ def test_ctrl_c_ends_the_demo_in_order_and_its_folder_may_be_used_again(stage):
     old = out / "captures" / "old"
     # Large enough that the rendering of the first lamp takes its time.
     stage.rig.write_text(stage.rig.read_text().replace("= 24\n", "= 96\n"))
-    for _ in range(2):
-        with subprocess.Popen(
-            command(stage, out, "straight"), stdout=subprocess.PIPE, text=True
-        ) as begun:
-            try:
-                stage.until(
-                    lambda: (
-                        begun.poll() is not None
-                        or (not old.exists() and list(out.glob("captures/*/frames/*/*")))
-                    )
-                )
-                begun.send_signal(signal.SIGINT)
-                answer, _ = begun.communicate(timeout=300)
-            finally:
-                begun.kill()
-        assert begun.returncode == 130, answer
-        assert json.loads(answer)["error"]["type"] == "Interrupted"
-        assert processes_of(out) == []
-        (manifest,) = out.glob("captures/*/manifest.json")
-        assert json.loads(manifest.read_text())["outcome"] == "aborted"
-        manifest.parent.rename(old)  # what an earlier demo left is to be replaced
+    interrupt(stage, out, lambda: bool(list(out.glob("captures/*/frames/*/*"))))
+    (manifest,) = out.glob("captures/*/manifest.json")
+    assert json.loads(manifest.read_text())["outcome"] == "aborted"
+    manifest.parent.rename(old)  # what an earlier demo left is to be replaced
+    interrupt(stage, out, lambda: not old.exists())
+
+
+def interrupt(stage, out: Path, when: Callable[[], bool]) -> None:
+    """Ctrl-C to a demo in `out` once `when` says so: it ends in order."""
+    with subprocess.Popen(
+        command(stage, out, "straight"), stdout=subprocess.PIPE, text=True
+    ) as begun:
+        try:
+            stage.until(lambda: begun.poll() is not None or when())
+            begun.send_signal(signal.SIGINT)
+            answer, _ = begun.communicate(timeout=300)
+        finally:
+            begun.kill()
+    assert begun.returncode == 130, answer
+    assert json.loads(answer)["error"]["type"] == "Interrupted"
+    assert processes_of(out) == []
