@@ -25,12 +25,16 @@ from numpy.typing import NDArray
 
 from reconstruction.arrays import Floats
 from reconstruction.capture.folder import Capture, CaptureError, Step
+from reconstruction.capture.import_geometry import Geometry
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.containment import is_file_name
 from reconstruction.files.exr import read_exr
 from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lens import Lens
+from reconstruction.geometry.lens_models import LensModelCamera
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.placement import resized
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
 
@@ -39,20 +43,36 @@ class ImportProblem(CaptureError):
     """A folder that cannot be imported; the message names the file and the field."""
 
 
-def import_folder(folder: str | Path, out: str | Path, progress: Progress = silent) -> Capture:
+def import_folder(
+    folder: str | Path,
+    out: str | Path,
+    progress: Progress = silent,
+    geometry: Geometry | None = None,
+) -> Capture:
     """Turn `folder` (see the module's docstring) into the capture `out`, a new or empty folder.
 
-    The capture's plan is one OLAT step per light, at level 1 and an exposure of 1 s. All files
-    are looked for before anything is written; nothing is left behind when one is broken.
+    `geometry` stands for the folder's cameras.json, and for lights.json where it has lights;
+    pictures through lenses that a rig cannot hold are resampled. The capture's plan is one OLAT
+    step per light, at level 1 and an exposure of 1 s. All files are looked for before anything is
+    written; nothing is left behind when one is broken.
 
     Raises `ImportProblem` naming the file and field that are wrong or missing.
     """
     folder, out = Path(folder), Path(out)
     if not folder.is_dir():
         raise ImportProblem(f"{folder}: no such folder")
-    cameras = _cameras(folder / "cameras.json")
-    lights = _lights(folder / "lights.json", {id_: c.name for id_, c in cameras.items()})
-    rig = Rig(folder.name, tuple(cameras.values()), tuple(lights))
+    if geometry is None:
+        geometry = Geometry(_cameras(folder / "cameras.json"))
+    lights = geometry.lights or _lights(
+        folder / "lights.json", {id_: c.name for id_, c in geometry.cameras.items()}
+    )
+    cameras = [
+        _sized(c, folder / "images" / c.name / f"{lights[0].name}.exr")
+        for c in geometry.cameras.values()
+    ]
+    lenses = {c.name: Lens.of(c) for c in cameras if isinstance(c, LensModelCamera)}
+    kept = [lenses[c.name].undistorted if c.name in lenses else c for c in cameras]
+    rig = Rig(folder.name, tuple(kept), tuple(lights))
     pictures = {
         (light.name, camera.name): folder / "images" / camera.name / f"{light.name}.exr"
         for light in rig.lights
@@ -62,7 +82,9 @@ def import_folder(folder: str | Path, out: str | Path, progress: Progress = sile
     if absent:
         more = f", and {len(absent) - 1} more" if len(absent) > 1 else ""
         raise ImportProblem(f"{absent[0]}: no such file{more}; every camera needs every light")
-    masks, head = _masks(folder / "masks", rig), _head(folder / "head.obj")
+    masks, head = _masks(folder / "masks", cameras), _head(folder / "head.obj")
+    masks |= {n: lens.undistort_mask(masks[n]) for n, lens in lenses.items() if n in masks}
+    shot = {c.name: c for c in cameras}
 
     steps = [Step(i, "olat", 1.0, light=light.name) for i, light in enumerate(rig.lights)]
     plan = {"steps": steps, "imported_from": folder.name}
@@ -70,7 +92,10 @@ def import_folder(folder: str | Path, out: str | Path, progress: Progress = sile
     try:
         for k, (step, camera) in enumerate([(s, c) for s in steps for c in rig.cameras]):
             path = pictures[str(step.light), camera.name]
-            writer.write_frame(step, camera.name, _picture(path, camera))
+            picture = _picture(path, shot[camera.name])
+            if camera.name in lenses:
+                picture = lenses[camera.name].undistort(picture)
+            writer.write_frame(step, camera.name, picture)
             progress("importing pictures", (k + 1) / len(pictures))
         writer.finish("completed", {"imported_from": folder.name})
     except BaseException:
@@ -186,10 +211,19 @@ def _lights(path: Path, cameras: dict[str | int, str]) -> list[Light]:
     return out
 
 
-def _masks(folder: Path, rig: Rig) -> dict[str, NDArray[Any]]:
+def _sized(camera: Camera, picture: Path) -> Camera:
+    """`camera` for the size that `picture` has; as it is where there is none."""
+    try:
+        height, width = read_exr(picture)[0].shape[:2] if picture.is_file() else (0, 0)
+        return resized(camera, width, height) if width else camera
+    except ValueError as error:
+        raise ImportProblem(f"{picture}: {error}") from error
+
+
+def _masks(folder: Path, cameras: list[Camera]) -> dict[str, NDArray[Any]]:
     """The masks that are there, half grey and above."""
     out: dict[str, NDArray[Any]] = {}
-    for camera in rig.cameras:
+    for camera in cameras:
         path = folder / f"{camera.name}.png"
         if not path.is_file():
             continue

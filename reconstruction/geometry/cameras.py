@@ -184,6 +184,10 @@ class Camera(Pinhole):
         """Whether the lens bends lines."""
         return bool(self.distortion.any())
 
+    def pinhole(self) -> Camera:
+        """The same camera without its lens."""
+        return replace(self, distortion=np.zeros(5))
+
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready description that `Rig.from_dict` reads back exactly."""
         out = super().to_dict()

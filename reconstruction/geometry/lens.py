@@ -34,7 +34,7 @@ class Lens:
         The undistorted picture is the largest upright one without a pixel that the shot one lacks.
         Its scale is that of the shot picture's middle, so that no detail there is lost.
         """
-        pinhole = replace(bent, distortion=np.zeros(5))
+        pinhole = bent.pinhole()
         x, y = np.arange(bent.width), np.arange(bent.height)
         x0 = int(np.ceil(_moved(bent, pinhole, 0, y)[0].max()))
         x1 = int(np.floor(_moved(bent, pinhole, bent.width - 1, y)[0].min()))

@@ -13,6 +13,8 @@ import pytest
 
 from reconstruction import Capture, CaptureError, import_folder, read_exr, verify, write_exr
 from reconstruction.capture.import_folder import ImportProblem
+from reconstruction.capture.import_geometry import GeometryFiles, read_geometry
+from reconstruction.geometry.placement import PlacementOptions
 
 CAMERAS = ("cam_00", "left")
 LIGHTS = ("light_00", "light_07")
@@ -171,6 +173,34 @@ def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
     (folder / "masks" / "left.png").unlink()
     with pytest.raises(ImportProblem, match=r"head\.obj: no faces"):
         import_folder(folder, tmp_path / "out")
+
+
+def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
+    """A COLMAP model in millimetres for pictures of twice the size, lights as directions."""
+    sparse = folder / "sparse"
+    sparse.mkdir()
+    (sparse / "cameras.txt").write_text("3 PINHOLE 16 12 100 100 8 6\n")
+    images = ["1 1 0 0 0 0 0 1000 3 cam_00/all.jpg", "", "2 1 0 1 0 10 0 1000 3 left/all.jpg", ""]
+    (sparse / "images.txt").write_text("\n".join(images))
+    directions = {"light_00": [0, -1, 0], "light_07": [0, 0, 1]}
+    (folder / "lights.json").write_text(json.dumps(directions))
+    where = PlacementOptions(unit="mm", up="-y")
+    files = GeometryFiles(
+        cameras=sparse, lights=folder / "lights.json", light_distance=1.5, placement=where
+    )
+    capture = import_folder(folder, tmp_path / "out", geometry=read_geometry(files))
+    first, left = capture.rig.cameras
+    assert [first.name, left.name] == list(CAMERAS)
+    np.testing.assert_allclose(first.K, [[50, 0, 3.5], [0, 50, 2.5], [0, 0, 1]])
+    np.testing.assert_allclose(first.center, [0, -1, 0], atol=1e-12)  # z, ahead, becomes y
+    np.testing.assert_allclose(left.center, [1, -0.01, 0], atol=1e-12)
+    np.testing.assert_allclose(left.R[1], [0, 0, -1], atol=1e-12)
+    above, ahead = capture.rig.lights
+    point = above.position - [0, 0, 1.5]
+    np.testing.assert_allclose(ahead.position - point, [0, 1.5, 0], atol=1e-9)
+    assert np.linalg.norm(point) < 0.02
+    assert above.intensity.tolist() == [1, 1, 1]
+    assert capture.olat("left")[:, 0, 0, 0].tolist() == [10, 11]
 
 
 def test_never_writes_over_something(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,96 @@
+"""Cameras and lights of a capture made elsewhere: read, brought into our world, and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from reconstruction.files.cameras import read_cameras
+from reconstruction.files.lights import from_directions, read_lights
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.placement import (
+    FURTHEST,
+    PlacementError,
+    PlacementOptions,
+    Sight,
+    check_cameras,
+    check_lights,
+    placed,
+    placed_lights,
+)
+from reconstruction.options import options
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Cameras by the id that a file gives them, and lights, in our world; `notes` for the user."""
+
+    cameras: Mapping[str | int, Camera]
+    lights: list[Light] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@options
+class GeometryFiles:
+    """The files of cameras and lights that a user names, and what there is to know of them.
+
+    `light_distance` in metres is where lights stand that are given as directions.
+    """
+
+    cameras: Path | None = None
+    lights: Path | None = None
+    light_distance: Annotated[float, Field(gt=0, le=FURTHEST)] | None = None
+    placement: PlacementOptions = PlacementOptions()
+
+
+def read_geometry(files: GeometryFiles) -> Geometry:
+    """Read, place and check; without cameras nothing is checked.
+
+    Raises `ValueError` that says what is wrong and which option or file would mend it.
+    """
+    cameras: list[Camera] = []
+    notes: list[str] = []
+    if files.cameras is not None:
+        read = read_cameras(files.cameras)
+        cameras = placed(read.cameras, files.placement, read.axes)
+        notes += read.notes
+        try:
+            notes += check_cameras(cameras, files.placement, read.axes)
+        except PlacementError as error:
+            raise PlacementError(f"{files.cameras}: {error}") from error
+    lights: list[Light] = []
+    if files.lights is not None:
+        found = read_lights(files.lights)
+        lights, more = _lights(files, found.directions, found.lights, cameras)
+        notes += found.notes + more
+    return Geometry({c.name: c for c in cameras}, lights, notes)
+
+
+def _lights(
+    files: GeometryFiles, directions: bool, lights: list[Light], cameras: list[Camera]
+) -> tuple[list[Light], list[str]]:
+    where = files.placement
+    if files.light_distance is not None:
+        if not directions:
+            raise PlacementError(
+                f"{files.lights}: --light-distance is for directions, of length 1; these are places"
+            )
+        turned = placed_lights(lights, PlacementOptions(up=where.up))
+        center = Sight.of(cameras).point
+        return from_directions(turned, center, files.light_distance), []
+    out = placed_lights(lights, where)
+    try:
+        check_lights(cameras, out, where.light_unit or where.unit)
+    except PlacementError as error:
+        raise PlacementError(f"{files.lights}: {error}") from error
+    if not directions:
+        return out, []
+    return out, [
+        f"{files.lights}: all lights are 1 from the origin: taken for places; where they are "
+        "directions, give --light-distance"
+    ]

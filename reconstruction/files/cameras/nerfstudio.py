@@ -1,0 +1,141 @@
+"""`transforms.json` as nerfstudio, Instant NGP and Blender's NeRF scenes write it.
+
+`transform_matrix` takes the camera to the world, x right, y up, z backwards; the corner of the
+top-left pixel is at (0, 0) (docs.nerf.studio, "Data conventions", and its ray generator).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+
+from reconstruction.arrays import Array
+from reconstruction.files.cameras.errors import (
+    CameraFile,
+    CameraFileError,
+    camera_names,
+    camera_of,
+    pinhole_K,
+)
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lens_models import LensModel
+
+_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "w", "h")
+_OPENCV = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE = ("k1", "k2", "k3", "k4")
+_PLAIN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+
+
+def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
+    """Cameras of a `transforms.json`; frames of one pose and lens (one for each light) are one.
+
+    Raises `CameraFileError` naming the frame and the field.
+    """
+    frames = data["frames"]
+    if isinstance(frames, dict):
+        frames = list(frames.values())
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise CameraFileError(f"{path}: frames: expected a list with at least one object")
+    groups: dict[bytes, list[str]] = {}
+    found: dict[bytes, tuple[str, dict[str, Any], Array]] = {}
+    for i, frame in enumerate(frames):
+        where = f"{path}: frames[{i}]"
+        matrix = _matrix(frame, where)
+        fields = {**data, **frame}
+        lens = [fields.get(f) for f in (*_INTRINSICS, *_OPENCV, "k4")]
+        key = matrix.tobytes() + repr(lens).encode()
+        picture = frame.get("file_path")
+        if not isinstance(picture, str) or not picture:
+            raise CameraFileError(
+                f"{where}.file_path: expected the picture's path, got {picture!r}"
+            )
+        groups.setdefault(key, []).append(picture)
+        found.setdefault(key, (where, fields, matrix))
+    shared = [_shared(pictures) for pictures in groups.values()]
+    names = camera_names(shared, str(path))
+    cameras = [
+        _camera(path, name, groups[key][0], *found[key])
+        for key, name in zip(found, names, strict=True)
+    ]
+    return CameraFile(cameras, ["transforms.json has no unit of its own"], axes="opengl")
+
+
+def _shared(pictures: list[str]) -> str:
+    """One picture's path, or what the paths of one camera's pictures have in common."""
+    if len(pictures) == 1:
+        return pictures[0]
+    parts = [PurePosixPath(p).parts for p in pictures]
+    if len({PurePosixPath(p).stem for p in pictures}) == 1:
+        return pictures[0]
+    common: list[str] = []
+    for words in zip(*parts, strict=False):
+        if len(set(words)) > 1:
+            break
+        common.append(words[0])
+    return "/".join(common)
+
+
+def _matrix(frame: dict[str, Any], where: str) -> Array:
+    try:
+        matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise CameraFileError(f"{where}.transform_matrix: expected 4x4 finite numbers")
+    return matrix[:3]
+
+
+def _number(fields: dict[str, Any], name: str, where: str, default: float | None = None) -> float:
+    value = fields.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CameraFileError(f"{where}: the field {name!r} must be a number, got {value!r}")
+    return float(value)
+
+
+def _size(path: Path, picture: str, fields: dict[str, Any], where: str) -> tuple[int, int]:
+    """Width and height from the file, else of the picture itself."""
+    if "w" in fields and "h" in fields:
+        return int(_number(fields, "w", where)), int(_number(fields, "h", where))
+    for suffix in ("", ".png", ".jpg", ".exr"):
+        there = path.parent / (picture + suffix)
+        image = cv2.imread(str(there), cv2.IMREAD_UNCHANGED) if there.is_file() else None
+        if image is not None:
+            return image.shape[1], image.shape[0]
+    raise CameraFileError(
+        f"{where}: neither the fields 'w' and 'h' nor a picture {picture} say how large it is: "
+        "add w and h"
+    )
+
+
+def _camera(
+    path: Path, name: str, picture: str, where: str, fields: dict[str, Any], matrix: Array
+) -> Camera:
+    model = fields.get("camera_model", "OPENCV")
+    fisheye = model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True
+    if not fisheye and model not in _PLAIN:
+        raise CameraFileError(f"{where}: camera_model {model!r} is neither OPENCV nor a fisheye")
+    size = width, height = _size(path, picture, fields, where)
+    if "fl_x" in fields:
+        fx = _number(fields, "fl_x", where)
+    else:
+        angle = _number(fields, "camera_angle_x", where)
+        if not 0 < angle < np.pi:
+            raise CameraFileError(f"{where}: camera_angle_x must lie in (0, π), got {angle}")
+        fx = 0.5 * width / np.tan(angle / 2)
+    fy = _number(fields, "fl_y", where, fx)
+    K = pinhole_K(
+        fx, fy, _number(fields, "cx", where, width / 2), _number(fields, "cy", where, height / 2)
+    )
+    order = (
+        ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    )
+    lens = LensModel(
+        "fisheye" if fisheye else "opencv",
+        np.array([_number(fields, k, where, 0.0) for k in order]),
+    )
+    R = _TO_OPENCV @ matrix[:, :3].T
+    return camera_of(where, name, size, K, (R, -R @ matrix[:, 3]), lens)

@@ -1,0 +1,168 @@
+"""Cameras as others write them, read back: the same pixels, or a sentence that says what to do."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction import Camera
+from reconstruction.files.cameras import CameraFileError, read_cameras
+from reconstruction.geometry.lens import Lens
+from reconstruction.geometry.lens_models import LensModel, LensModelCamera
+
+_spec = importlib.util.spec_from_file_location(
+    "camera_writers", Path(__file__).with_name("camera_writers.py")
+)
+assert _spec is not None
+assert _spec.loader is not None
+writers = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(writers)
+
+POINTS = np.random.default_rng(3).uniform(-0.12, 0.12, (200, 3))
+LENS = np.array([-0.12, 0.03, 2e-3, -1e-3, 0.01])
+
+
+def stage() -> list[Camera]:
+    """Six cameras about the origin, tilted, one upright, half of them through a lens."""
+    out = []
+    for i in range(6):
+        angle = 1.1 * i
+        position = [np.cos(angle), np.sin(angle), 0.3 * np.sin(2 * angle)]
+        camera = Camera.look_at(f"cam_{i:02d}", 640, 480, position, [0, 0, 0.01], 30, 17.0 * i)
+        K = camera.K * [[1, 1, 1], [1, 1.01, 1], [1, 1, 1]] + [[0, 0, 4.2], [0, 0, -7.3], [0, 0, 0]]
+        out.append(replace(camera, K=K, distortion=LENS * (i % 2)))
+    return out
+
+
+def assert_same_pixels(found: list[Camera], truth: list[Camera]) -> None:
+    by_name = {c.name: c for c in found}
+    assert sorted(by_name) == sorted(c.name for c in truth)
+    for camera in truth:
+        got = by_name[camera.name]
+        assert (got.width, got.height) == (camera.width, camera.height)
+        expected = cv2.projectPoints(
+            POINTS, cv2.Rodrigues(camera.R)[0], camera.t, camera.K, camera.distortion
+        )[0][:, 0]
+        np.testing.assert_allclose(got.project(POINTS)[0], expected, atol=1e-6)
+
+
+WRITERS: dict[str, Callable[[Path, list[Camera]], object]] = {
+    "sparse": writers.write_colmap_text,
+    "binary": writers.write_colmap_binary,
+    "transforms.json": writers.write_transforms,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_of_others_give_the_same_pixels(name: str, tmp_path: Path) -> None:
+    WRITERS[name](tmp_path / name, stage())
+    assert_same_pixels(read_cameras(tmp_path / name).cameras, stage())
+
+
+@pytest.mark.parametrize(
+    ("kind", "coefficients"),
+    [
+        ("opencv", [-0.2, 0.1, 1e-3, -2e-3, 0.05, 0.02, -0.03, 0.01]),
+        ("opencv", [-0.2, 0.1, 1e-3, -2e-3, 0.05, 0, 0, 0, 1e-3, -2e-3, 3e-3, 1e-3]),
+        ("opencv", [-0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.02, -0.03]),
+        ("fisheye", [0.05, -0.02, 0.01, -0.003]),
+    ],
+)
+def test_lenses_are_opencvs(kind, coefficients) -> None:
+    camera = stage()[1]
+    found = LensModelCamera(
+        "c", 640, 480, camera.K, camera.R, camera.t, lens=LensModel(kind, np.array(coefficients))
+    )
+    rotation = cv2.Rodrigues(camera.R)[0]
+    if kind == "fisheye":
+        expected = cv2.fisheye.projectPoints(
+            POINTS[:, None], rotation, camera.t, camera.K, np.array(coefficients)
+        )[0][:, 0]
+    else:
+        expected = cv2.projectPoints(POINTS, rotation, camera.t, camera.K, np.array(coefficients))[
+            0
+        ][:, 0]
+    np.testing.assert_allclose(found.project(POINTS)[0], expected, atol=1e-6)
+    towards = POINTS - camera.center
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    np.testing.assert_allclose(found.rays(expected), towards, atol=1e-9)
+
+
+def test_a_picture_through_another_lens_is_resampled_to_a_pinhole() -> None:
+    """A straight edge that a fisheye bends is straight again, and where the pinhole sees it."""
+    camera = Camera.look_at("c", 160, 120, [0, -1, 0], [0, 0, 0], 60)
+    fish = LensModelCamera(
+        "c", 160, 120, camera.K, camera.R, camera.t, lens=LensModel("fisheye", np.zeros(0))
+    )
+    rays = fish.rays(np.stack(np.meshgrid(np.arange(160), np.arange(120)), axis=-1))
+    x = rays[..., 0] / rays[..., 1]  # slope to the side, of a wall one metre ahead
+    picture = np.repeat((x[..., None] > 0.3).astype(np.float32), 3, axis=2)
+    lens = Lens.of(fish)
+    straight = lens.undistort(picture)[..., 0]
+    edge = (straight < 0.5).sum(axis=1) - 0.5
+    expected = lens.undistorted.project(np.add(camera.center, [0.3, 1, 0]))[0][0]
+    assert np.abs(edge - expected).max() < 1
+    assert lens.undistorted.distortion.tolist() == [0] * 5
+
+
+def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
+    """As files have it that list a frame for each camera and light."""
+    path = tmp_path / "transforms.json"
+    writers.write_transforms(path, stage())
+    data = json.loads(path.read_text())
+    data["frames"] = {
+        f"{i}_{k}": {**frame, "file_path": f"images/{frame['file_path'][7:13]}/{k:03d}.png"}
+        for i, frame in enumerate(data["frames"])
+        for k in range(3)
+    }
+    path.write_text(json.dumps(data))
+    assert_same_pixels(read_cameras(path).cameras, stage())
+
+
+def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
+    folder = tmp_path / "sparse"
+    writers.write_colmap_text(folder, stage())
+    images, cameras = folder / "images.txt", folder / "cameras.txt"
+    good, lenses = images.read_text(), cameras.read_text()
+
+    def refused(words: str, path: Path = folder) -> None:
+        with pytest.raises(CameraFileError, match=words):
+            read_cameras(path)
+
+    images.write_text(good.replace(" 12 cam", " 77 cam"))
+    refused(r"images\.txt, line 7: no camera 77")
+    images.write_text(good.replace("cam_03.jpg", ""))
+    refused("line 9: expected IMAGE_ID .* got 9 words")
+    images.write_text(good.replace("cam_03.jpg", "cam_02.jpg"))
+    refused("no part of the pictures' names differs")
+    images.write_text(good)
+    cameras.write_text(lenses.replace("12 FULL_OPENCV 640", "12 FULL_OPENCV 6x40"))
+    refused(r"cameras\.txt, line 4: expected a whole number, got '6x40'")
+    cameras.write_text(lenses.replace("12 FULL_OPENCV", "12 FOV"))
+    refused("FOV has 5 parameters, got 12")
+    cameras.unlink()
+    refused("neither a COLMAP model nor")
+    refused("no such file", tmp_path / "nowhere")
+    binary = tmp_path / "binary"
+    writers.write_colmap_binary(binary, stage())
+    whole = (binary / "images.bin").read_bytes()
+    (binary / "images.bin").write_bytes(whole[:-20])
+    refused(r"images\.bin: ends at byte .* is cut off", binary)
+    (binary / "images.bin").write_bytes(whole[:83] + b"\xff" * 8 + whole[91:])
+    refused(r"images\.bin: .*cut off", binary)
+    transforms = tmp_path / "transforms.json"
+    writers.write_transforms(transforms, stage())
+    data = json.loads(transforms.read_text())
+    del data["frames"][2]["w"]
+    transforms.write_text(json.dumps(data))
+    refused(r"frames\[2\]: .*add w and h", transforms)
+    data["frames"][1]["transform_matrix"] = [[1, 2], [3]]
+    transforms.write_text(json.dumps(data))
+    refused(r"frames\[1\]\.transform_matrix: expected 4x4", transforms)
