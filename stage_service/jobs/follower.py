@@ -21,6 +21,9 @@ log = logging.getLogger("hairstage.jobs")
 POLL_S = 0.5
 COUNT_S = 5.0
 """How old the count of jobs that wait may be."""
+JOB_END = "job.end"
+MOST_ENDS = 1000
+"""Jobs, and lines of the audit log, that are looked at for ends that nobody has recorded."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,8 @@ class JobFollower:
         self._wake = threading.Event()
         self._closed = False
         self._told: str | None = None
-        self._seen: dict[str, Job] = {}
+        self._seen: dict[str, Job] = {}  # the newest, and whatever is not done
+        self._audited: set[str] | None = None  # jobs that had ended before
         self._thread = threading.Thread(target=self._run, name="job-events", daemon=True)
 
     def start(self) -> None:
@@ -134,15 +138,32 @@ class JobFollower:
         return job
 
     def _tell(self) -> None:
-        for job in self._queue.all(limit=50):
+        """Publish what has changed; ends are audited, those since the service last looked, too."""
+        if self._audited is None:
+            ends = [a for a in self._audit.latest(MOST_ENDS) if a.action == JOB_END]
+            self._audited = {action.subject for action in ends}
+        newest = self._queue.all(limit=50 if self._seen else MOST_ENDS)
+        found = {job.id: job for job in reversed(newest)}
+        older = [i for i, job in self._seen.items() if job.state != "done" and i not in found]
+        if older:
+            found.update({job.id: job for job in self._queue.several(older)})
+        for job in found.values():
             before = self._seen.get(job.id)
-            self._seen[job.id] = job
             if before is None or (before.state, before.outcome) != (job.state, job.outcome):
+                if job.state == "done" and job.id not in self._audited:
+                    self._audited.add(job.id)
+                    self._audit.record(SERVICE, JOB_END, job.id, str(job.outcome), _end(job))
                 data = {"job": job.id, "state": job.state, "outcome": job.outcome}
                 self._events.publish("job.state", data)
             if job.progress is not None and (before is None or before.progress != job.progress):
                 data = {"job": job.id, **job.progress.model_dump(mode="json")}
                 self._events.publish("job.progress", data)
+        self._seen = found
+
+
+def _end(job: Job) -> str:
+    why = "" if job.error is None else f": {job.error.type}: {job.error.detail}"
+    return f"{job.pipeline} on {Path(job.capture).name}, at {job.finished}{why}"
 
 
 def job_of(capture_id: str) -> str:

@@ -9,7 +9,7 @@ import secrets
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -171,6 +171,12 @@ class JobQueue:
         """The latest `limit` jobs after the `offset` newest, newest first."""
         with self._database() as client:
             found = client.list_workflows(name=WORKFLOW, sort_desc=True, limit=limit, offset=offset)
+        return [self._job(w) for w in found]
+
+    def several(self, jobs: Collection[str]) -> list[Job]:
+        """Those of these jobs that there are, in any order."""
+        with self._database() as client:
+            found = client.list_workflows(workflow_ids=[self.names.workflow(job) for job in jobs])
         return [self._job(w) for w in found]
 
     def ids(self) -> set[str]:

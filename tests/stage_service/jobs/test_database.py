@@ -162,3 +162,25 @@ def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_pat
     finally:
         follower.close()
         queue.close()
+
+
+def test_the_audit_has_the_end_of_every_job_once(tmp_path):
+    """Of those too that ended while no service ran, and of older ones than the newest fifty."""
+    queue, audit = JobQueue(tmp_path), AuditLog(tmp_path / "audit.jsonl")
+    for number in range(60):
+        submit(queue, tmp_path, f"job-{number:02d}", f"m{number}")
+    queue.cancel("job-00")
+
+    def ends() -> list[str]:
+        return [f"{a.subject} {a.result}" for a in audit.latest(100) if a.action == "job.end"]
+
+    for before, job in enumerate(("job-01", "job-59"), 1):
+        follower = JobFollower(tmp_path, queue, EventLog(), audit)
+        follower.start()
+        until(lambda n=before: len(ends()) == n)
+        queue.cancel(job)
+        until(lambda n=before: len(ends()) == n + 1)
+        follower.close()
+    assert ends() == ["job-00 cancelled", "job-01 cancelled", "job-59 cancelled"]
+    assert audit.latest(1)[0].detail.startswith("reconstruct on capture, at 20")
+    queue.close()
