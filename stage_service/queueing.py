@@ -117,6 +117,8 @@ class Queueing:
 
     def _stage_waits_for(self) -> str | None:
         reason = self._captures.waits_for()
+        if unread := self._captures.catalogue.unread:
+            reason = f"the captures on the disk are still being read: {unread:,} to come"
         ended = self._captures.ended
         if ended is not None and ended is not self._judged:
             self._judged = ended

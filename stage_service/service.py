@@ -15,7 +15,8 @@ import cv2
 
 from reconstruction import Capture, CaptureError, Model, Rig, read_obj
 from reconstruction.containment import inside, is_file_name, plain_file
-from stage_service.acquisition.captures import CaptureManager, UnknownCapture
+from stage_service.acquisition.captures import CaptureManager
+from stage_service.acquisition.catalogue import UnknownCapture
 from stage_service.acquisition.control import Caller, Control
 from stage_service.acquisition.states import CaptureStatus, Outcome
 from stage_service.config import RigFile
@@ -49,6 +50,8 @@ from stage_service.verification import Verification, Verifier
 from stage_service.watching import NotReady, Watching
 
 T = TypeVar("T")
+READ_S = 1.0
+"""A start waits for so long for the captures on the disk; the others are read beside it."""
 
 
 class BadInput(ValueError):
@@ -117,21 +120,34 @@ class Service:
         return self._captures.events
 
     def start(self) -> None:
-        """Lights off; then what is on the disk; then, beside all else, the jobs: what a crash kept
-        from being enqueued, and what becomes of them.
+        """Lights off; then, beside all else, what is on the disk, and the jobs: what a crash kept
+        from being enqueued, and what becomes of them. What waits for the stage begins when all
+        captures have been read.
 
         Raises `StageInUse`, and touches nothing, where another service has the stage.
         """
         if not self._has_stage:
             self.take_stage()
         self._captures.darken()
-        known = self._captures.list()
-        for status in known:
-            if status.outcome == "completed":
-                self._follower.owe(status, fresh=False)
         self._follower.start()
-        self.queue.start(known)
+        self._captures.catalogue.begin(
+            self._read, self._all_read, lambda: self._captures.running is not None, READ_S
+        )
         self._verifier.start()
+
+    def _read(self, status: CaptureStatus) -> None:
+        if status.outcome == "completed":
+            self._follower.owe(status, fresh=False)
+
+    def _all_read(self) -> None:
+        known = self._captures.list()
+        self.queue.start(known)
+        self.events.publish("captures.read", {"count": len(known)})
+
+    @property
+    def unread(self) -> int:
+        """Captures on the disk that are not listed yet."""
+        return self._captures.catalogue.unread
 
     def take_stage(self) -> None:
         """Have the stage for this service alone. Raises `StageInUse`."""
@@ -448,6 +464,7 @@ class Service:
             root=str(self.root),
             worker=worker_is_alive(self.root),
             capture=self._captures.running,
+            unread=self.unread,
             lamps=lamps["state"],
             problems=problems,
         )

@@ -162,8 +162,8 @@ class Health(BaseModel):
     """How the service is, as far as it knows without asking a device or the job database.
 
     `status`: "unsafe" while nobody knows whether the lamps are off, "degraded" where something else
-    is wrong; `problems` has a sentence for each. `worker`: whether one runs; `lamps`: "dark", "in
-    use" or "unknown, unsafe".
+    is wrong; `problems` has a sentence for each. `worker`: whether one runs; `unread`: captures on
+    the disk that are not listed yet; `lamps`: "dark", "in use" or "unknown, unsafe".
     """
 
     status: Literal["ok", "degraded", "unsafe"]
@@ -172,5 +172,6 @@ class Health(BaseModel):
     root: str
     worker: bool
     capture: str | None
+    unread: int
     lamps: str
     problems: list[str]

@@ -170,7 +170,7 @@ class Storage:
             flush(to.parent)
             shutil.rmtree(self._trash / name)
             if found.kind == "capture":
-                self._captures.adopt(found.id)
+                self._captures.catalogue.adopt(found.id)
             return found
 
         return self._control.do(by, f"{found.kind}.restore", work, found.id, steers=False)

@@ -71,6 +71,7 @@ class Watching:
         yield _one("latched", "1 while nobody knows whether the lamps are off", _latched(safety))
         yield _per("lamps", "1 for what is known of the lamps", "state", {safety["state"]: 1.0})
         yield _per("capture", "1 for the state that the capture is in", "state", {running: 1.0})
+        yield _one("captures_unread", "on the disk and not listed yet", captures.catalogue.unread)
         counts = captures.counts()
         for name, (label, text) in _COUNTED.items():
             yield _per(f"{name}_total", text, label, counts[name], "counter")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import httpx
 import uvicorn
+from waiting import until
 
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
@@ -24,8 +25,10 @@ class Client(httpx.Client):
 
 
 @contextmanager
-def serving(rig_file: RigFile, root: Path, access: Access | None = None) -> Iterator[Client]:
-    """The application, started and closed as the server does."""
+def serving(
+    rig_file: RigFile, root: Path, access: Access | None = None, *, all_read: bool = True
+) -> Iterator[Client]:
+    """The application, started and closed as the server does; it has read what is on the disk."""
     service = Service(rig_file, root)
     config = uvicorn.Config(
         create_app(service, access), log_level="critical", ws="none", timeout_graceful_shutdown=1
@@ -40,6 +43,7 @@ def serving(rig_file: RigFile, root: Path, access: Access | None = None) -> Iter
         with Client(base_url=url, timeout=60, trust_env=False) as client:
             client.service = service
             client.get("/health")
+            until(lambda: not (all_read and service.unread))
             yield client
     finally:
         server.should_exit = True

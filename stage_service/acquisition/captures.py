@@ -7,7 +7,7 @@ import secrets
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +17,8 @@ from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import RESERVE
-from reconstruction.reading import printable
 from stage_service.acquisition.capture_run import CaptureRun, plan_of
+from stage_service.acquisition.catalogue import Catalogue
 from stage_service.acquisition.latch import Latch, Unsafe
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
 from stage_service.acquisition.states import (
@@ -27,9 +27,7 @@ from stage_service.acquisition.states import (
     State,
     WrongState,
     possible,
-    read_status,
 )
-from stage_service.acquisition.status_index import FILES, read_statuses
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.last_seen import LastSeen
@@ -60,19 +58,12 @@ class Busy(RuntimeError):
         self.running = running
 
 
-class UnknownCapture(LookupError):
-    """No capture has this id."""
-
-    def __init__(self, capture_id: str) -> None:
-        super().__init__(f"there is no capture {capture_id!r}; GET /captures lists those there are")
-
-
 class CaptureManager:
     """Makes captures under `root/captures/<id>`, one at a time, each on a thread of its own.
 
     `on_complete(status)` is called on that thread when a capture is done with outcome "completed".
-    Folders found at the first look are listed: without a manifest as interrupted, unreadable ones
-    as damaged. Constructing connects to nothing and reads no capture; `start`, `devices`,
+    What lies there already is in its `catalogue`, without a manifest as interrupted, unreadable as
+    damaged. Constructing connects to nothing and reads no capture; `start`, `devices`,
     `blackout` and `darken` talk to the stage, all through one `DeviceSet`. Raises `RootInUse` while
     another manager has this root, `StageInUse` while one on this machine has the stage; `take_over`
     says that one on another machine has it no more.
@@ -113,7 +104,7 @@ class CaptureManager:
         self.blackouts = 0  # begun since the start
         self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
-        self._found: dict[str, CaptureStatus] | None = None
+        self.catalogue = Catalogue(self.folder, root / "captures.index")
         self._counts: dict[str, Counter[str]] = {
             "captures": Counter(dict.fromkeys(OUTCOMES.values(), 0)),
             "frames": Counter(written=0, missing=0, again=0),
@@ -128,18 +119,6 @@ class CaptureManager:
     @cached_property
     def _seen(self) -> LastSeen:
         return LastSeen(self._look, self._devices.unseen())
-
-    @property
-    def _done(self) -> dict[str, CaptureStatus]:
-        """What nobody is shooting, by id; the folders are read when it is first asked for."""
-        with self._lock:
-            if self._found is None:
-                index = self.folder.with_name("captures.index")
-                self._found = read_statuses(_folders(self.folder), index)
-                for status in self._found.values():
-                    if status.outcome == "damaged":
-                        log.warning("%s is damaged: %s", status.path, status.error)
-            return self._found
 
     def start(
         self,
@@ -229,14 +208,14 @@ class CaptureManager:
             with self._lock:
                 if self._closed or self.blackouts != blackouts:
                     raise Busy("none, but the stage was put dark meanwhile")
-                self._done.pop(capture_id, None)
+                self.catalogue.take(capture_id)
                 self._running = run
                 assert run.thread is not None
                 run.thread.start()
         except BaseException:
             if run is not None:
                 run.give_up()
-                self._done[capture_id] = read_status(self.folder / capture_id)
+                self.catalogue.adopt(capture_id)
             raise
         finally:
             with self._lock:
@@ -283,17 +262,17 @@ class CaptureManager:
 
     def get(self, capture_id: str) -> CaptureStatus:
         """What is known about a capture. Raises `UnknownCapture`."""
+        self.catalogue.read(capture_id)
         with self._lock:
             if self._running is not None and self._running.id == capture_id:
                 return _not_yet_over(self._running.status())
-            if capture_id not in self._done:
-                raise UnknownCapture(capture_id)
-            return self._done[capture_id]
+            return self.catalogue.get(capture_id)
 
     def list(self) -> list[CaptureStatus]:
-        """All captures, oldest first."""
+        """All captures that the catalogue has read, oldest first."""
+        self.catalogue.read_all()
         with self._lock:
-            known = list(self._done.values())
+            known = self.catalogue.list()
             if self._running is not None:
                 known.append(_not_yet_over(self._running.status()))
             return sorted(known, key=lambda c: c.id)
@@ -314,18 +293,13 @@ class CaptureManager:
         """`move(folder)`, after which there is no such capture. Raises as `check_idle`."""
         with self._lock:
             self.check_idle(capture_id)
-            status = self._done.pop(capture_id)
+            status = self.get(capture_id)
+            self.catalogue.take(capture_id)
         try:
             return move(Path(status.path))
         except BaseException:
-            with self._lock:
-                self._done[capture_id] = status
+            self.catalogue.put(status)
             raise
-
-    def adopt(self, capture_id: str) -> None:
-        """List a capture whose folder has come back."""
-        with self._lock:
-            self._done[capture_id] = read_status(self.folder / capture_id)
 
     def wait(self, capture_id: str, timeout: float) -> CaptureStatus:
         """Wait until it is done, at most `timeout` seconds; returns the status either way."""
@@ -458,6 +432,7 @@ class CaptureManager:
             if run.thread.is_alive():  # it is stuck somewhere
                 self._learn(result)
         self._stay_on_exit()
+        self.catalogue.close()
         if self._ownership is not None:
             self._ownership.release(self._devices.lights)
         self._root_lock.release()
@@ -507,7 +482,8 @@ class CaptureManager:
             self._counts["captures"][result] += 1
             self._counts["frames"].update(run.frames())
             self._counts["device_faults"].update(run.sequencer.faults)
-            self._done[run.id] = self.ended = status
+            self.ended = status
+            self.catalogue.put(status)
             self._running = None
 
     def _learn(self, result: Blackout) -> None:
@@ -520,25 +496,6 @@ class CaptureManager:
         if change is not None:
             self.audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
             self.events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
-
-
-def _folders(folder: Path) -> Iterator[Path]:
-    """The captures in a folder, whole or damaged; what is none of it is left out."""
-    for path in sorted(folder.iterdir()):
-        if printable(path.name) != path.name:
-            log.warning("%s: the folder's name is not UTF-8: left out", printable(str(path)))
-        elif not path.name.startswith(".") and any(_there(path / name) for name in FILES):
-            yield path
-
-
-def _there(path: Path) -> bool:
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError:  # it cannot be looked at: that is for `read_status` to say
-        return True
-    return True
 
 
 def _not_yet_over(status: CaptureStatus) -> CaptureStatus:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,28 +18,37 @@ is the same."""
 Stamp = list[list[int] | None]
 
 
-def read_statuses(folders: Iterable[Path], index: Path) -> dict[str, CaptureStatus]:
-    """Each folder's status by its name, as `read_status` has it; what `index` knows is not read
-    again. `index` is written where it lacked any; one that cannot be used is made anew."""
-    known, lines, found, anew = _known(index), [], {}, False
-    for folder in folders:
+class StatusIndex:
+    """The statuses that `file` knows; one that cannot be used is made anew."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._known: dict[str, tuple[Stamp, Any]] | None = None
+        self._lines: list[str] = []
+        self._anew = False
+
+    def status(self, folder: Path) -> CaptureStatus:
+        """A folder's status, as `read_status` has it; read again only where it has changed."""
+        if self._known is None:
+            self._known = _known(self._file)
         stamp = [_stamp(folder / name) for name in FILES]
-        stamped, told = known.get(folder.name, (None, None))
-        status = None
-        if stamped == stamp:
-            status = _status(told, folder)
+        stamped, told = self._known.get(folder.name, (None, None))
+        status = _status(told, folder) if stamped == stamp else None
         if status is None:
-            status, anew = read_status(folder), True
+            status, self._anew = read_status(folder), True
             told = status.model_dump(mode="json")
-        found[folder.name] = status
         if status.outcome != "damaged":  # that is looked at again
-            lines.append(json.dumps([folder.name, stamp, told]))
-    if anew:
+            self._lines.append(json.dumps([folder.name, stamp, told]))
+        return status
+
+    def save(self) -> None:
+        """Keep what was asked for, where the file lacked any of it."""
+        if not self._anew:
+            return
         try:
-            write_whole(index, "\n".join(lines).encode())
+            write_whole(self._file, "\n".join(self._lines).encode())
         except OSError as error:  # a full disk: the next start takes longer
-            log.warning("%s: %s", index, error)
-    return found
+            log.warning("%s: %s", self._file, error)
 
 
 def _known(index: Path) -> dict[str, tuple[Stamp, Any]]:

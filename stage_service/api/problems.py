@@ -24,7 +24,8 @@ from reconstruction.containment import NotContained
 from reconstruction.files.durable import DiskFull
 from reconstruction.reading import printable
 from stage_service.acquisition.capture_queue import QueueFull, UnknownEntry
-from stage_service.acquisition.captures import Busy, UnknownCapture
+from stage_service.acquisition.captures import Busy
+from stage_service.acquisition.catalogue import UnknownCapture
 from stage_service.acquisition.control import Forbidden
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState

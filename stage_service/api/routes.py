@@ -50,11 +50,15 @@ def start_capture(
 @reading.get("/captures", tags=["captures"])
 def list_captures(
     service: OnService,
+    response: Response,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
     offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones left out")] = 0,
     outcome: Annotated[Outcome | None, Query(description="only these")] = None,
 ) -> list[CaptureView]:
-    """The latest captures, the oldest of them first."""
+    """The latest captures, the oldest of them first. After a start the folders are read, the newest
+    first: the header `Hairstage-Unread` says how many are to come, and the event "captures.read"
+    that none is."""
+    response.headers["Hairstage-Unread"] = str(service.unread)
     return service.captures(limit, offset, outcome)
 
 

@@ -135,6 +135,8 @@ def run_list_captures(args: argparse.Namespace, output: Output, service: Service
         for c in captures
     ]
     output.result({"captures": captures}, "\n".join(lines) or "no captures")
+    if unread := service.get("/health")["unread"]:
+        output.note(f"{unread:,} more are still being read: the service has just started")
 
 
 def run_capture_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:

@@ -33,16 +33,18 @@ TIMES = 20
 
 
 def measure(root: Path, rig_file: RigFile, count: int) -> dict[str, Any]:
-    """Seconds from nothing to the first page: of a root that no service has seen, and of one that
-    one has; and of a page after that, the median of some."""
+    """Seconds from nothing to the first page, and until all captures are read: of a root that no
+    service has seen, and of one that one has; and of a page after that, the median of some."""
     fill(root / "captures", rig_file, count)
-    first, _ = _start(root, rig_file)
-    again, pages = _start(root, rig_file)
+    first, first_read, _ = _start(root, rig_file)
+    again, read, pages = _start(root, rig_file)
     return {
         "captures": count,
         "page": min(PAGE, count),
         "first_start_s": first,
+        "first_read_s": first_read,
         "start_s": again,
+        "read_s": read,
         "start_goal_s": START_S,
         "page_s": statistics.median(pages),
         "page_slowest_s": max(pages),
@@ -68,7 +70,7 @@ def fill(folder: Path, rig_file: RigFile, count: int) -> None:
             os.link(template / file, made / file)
 
 
-def _start(root: Path, rig_file: RigFile) -> tuple[float, list[float]]:
+def _start(root: Path, rig_file: RigFile) -> tuple[float, float, list[float]]:
     begin = time.perf_counter()
     service = Service(rig_file, root)
     service.start()
@@ -78,8 +80,9 @@ def _start(root: Path, rig_file: RigFile) -> tuple[float, list[float]]:
         service.close()
 
 
-async def _pages(service: Service, begin: float) -> tuple[float, list[float]]:
-    """Seconds since `begin` when the first page is there, and those of more pages."""
+async def _pages(service: Service, begin: float) -> tuple[float, float, list[float]]:
+    """Seconds since `begin` when the first page is there, and all captures are read; and those of
+    more pages."""
     transport, seconds = httpx.ASGITransport(create_app(service)), []
     async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
 
@@ -89,11 +92,14 @@ async def _pages(service: Service, begin: float) -> tuple[float, list[float]]:
 
         await page()
         first = time.perf_counter() - begin
+        while service.unread:
+            await asyncio.sleep(0.02)
+        read = time.perf_counter() - begin
         for _ in range(TIMES):
             start = time.perf_counter()
             await page()
             seconds.append(time.perf_counter() - start)
-    return first, seconds
+    return first, read, seconds
 
 
 def run_listing(args: argparse.Namespace, _progress: Progress) -> dict[str, Any]:

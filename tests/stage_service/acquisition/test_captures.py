@@ -19,7 +19,8 @@ from waiting import until as waited
 
 from reconstruction import CaptureError, verify
 from reconstruction.geometry.rig import RigError
-from stage_service.acquisition.captures import Busy, CaptureManager, UnknownCapture
+from stage_service.acquisition.captures import Busy, CaptureManager
+from stage_service.acquisition.catalogue import UnknownCapture
 from stage_service.acquisition.states import WrongState
 from stage_service.config import RigFile
 from stage_service.plan.capture_plan import CapturePlan

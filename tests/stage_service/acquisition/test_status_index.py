@@ -11,8 +11,8 @@ import pytest
 
 from reconstruction import Camera, CaptureWriter, Light, Rig, Step
 from stage_service.acquisition import status_index
-from stage_service.acquisition.states import read_status
-from stage_service.acquisition.status_index import read_statuses
+from stage_service.acquisition.states import CaptureStatus, read_status
+from stage_service.acquisition.status_index import StatusIndex
 
 STEPS = (Step(0, "dark", 0.01), Step(1, "olat", 0.01, light="light_000"))
 
@@ -27,6 +27,14 @@ def capture(folder: Path, outcome: str | None = "completed") -> Path:
     else:
         writer.finish(outcome)
     return folder
+
+
+def read_statuses(folders: list[Path], file: Path) -> dict[str, CaptureStatus]:
+    """As a start does: each is asked for, then the index is kept."""
+    index = StatusIndex(file)
+    found = {folder.name: index.status(folder) for folder in folders}
+    index.save()
+    return found
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ class Server:
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
-        until(lambda: self.server.started)
+        until(lambda: self.server.started and not self.service.unread)
         port = self.server.servers[0].sockets[0].getsockname()[1]
         self.http = httpx.Client(base_url=f"http://{LOOPBACK}:{port}", timeout=20, trust_env=False)
 

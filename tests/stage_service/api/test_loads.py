@@ -19,9 +19,10 @@ import pytest
 from serving import Client, serving
 from waiting import until
 
-from reconstruction import CaptureWriter
+from reconstruction import CaptureWriter, Step
 from stage_service.acquisition import captures as manager_module
 from stage_service.acquisition import status_index
+from stage_service.acquisition.catalogue import Catalogue
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
@@ -259,3 +260,43 @@ def test_listeners_hold_no_thread_and_are_all_told(rig_file, tmp_path):
             told = (json.loads(x[6:]) for x in line if x.startswith(b"data: "))
             numbers = (e["data"]["n"] for e in told if e["kind"] == "test")
             assert list(islice(numbers, 700)) == list(range(700))
+
+
+def test_a_start_waits_for_no_capture_on_the_disk(rig_file, world, tmp_path, monkeypatch):
+    """The newest are listed, what is asked for is read at once, and what waits waits for all."""
+    names = [f"2026010{day}-120000-0000" for day in range(1, 5)]
+    for name in names:
+        step = Step(0, "dark", 0.01)
+        CaptureWriter.create(tmp_path / "captures" / name, rig_file.rig, {"steps": [step]}).close()
+    waits = {"plan": {"lights": ["light_000"], "projectors": [], "sentinels": False}}
+    with serving(rig_file, tmp_path) as http:
+        assert [c["id"] for c in http.get("/captures").json()] == names
+        http.post("/queue:hold")
+        assert http.post("/queue", json=waits).is_success
+    (tmp_path / "captures.index").unlink()
+    free, real = threading.Event(), Catalogue._read
+
+    def slow(self: Catalogue, folder: Path) -> None:
+        if folder.name == names[1] and threading.current_thread().name == "catalogue":
+            free.wait()
+        real(self, folder)
+
+    monkeypatch.setattr(Catalogue, "_read", slow)
+    with serving(rig_file, tmp_path, all_read=False) as http:
+        try:
+            assert_it_can_be_darkened(http, world, None)
+            until(lambda: http.get("/health").json()["unread"] == 2)
+            answer = http.get("/captures")
+            assert [c["id"] for c in answer.json()] == names[2:]
+            assert answer.headers["hairstage-unread"] == "2"
+            assert http.get(f"/captures/{names[0]}").json()["outcome"] == "interrupted"
+            assert http.get("/health").json()["unread"] == 1
+            http.post("/queue:go-on")
+            waiting = http.get("/queue").json()
+            assert (len(waiting["waiting"]), "1 to come" in waiting["waits_for"]) == (1, True)
+        finally:
+            free.set()
+        until(lambda: [c["id"] for c in http.get("/captures").json()][:4] == names)
+        until(lambda: http.get("/queue/history").json())
+        read = [e for e in http.service.events.wait(0, 0) if e.kind == "captures.read"]
+        assert [e.data for e in read] == [{"count": 4}]

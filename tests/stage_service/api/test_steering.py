@@ -31,7 +31,7 @@ def refused(response: httpx.Response, slug: str) -> dict[str, Any]:
 
 
 def done(http: Client, capture: str) -> dict[str, Any]:
-    http.service._captures.wait(capture, 20)
+    http.service._captures.wait(capture, 120)
     status: dict[str, Any] = http.get(f"/captures/{capture}").json()
     assert status["state"] == "done"
     return status

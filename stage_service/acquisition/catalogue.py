@@ -1,0 +1,162 @@
+"""The captures that lie on the disk: read in the background, the newest first."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from reconstruction.reading import printable
+from stage_service.acquisition.states import CaptureStatus, read_status
+from stage_service.acquisition.status_index import FILES, StatusIndex
+
+log = logging.getLogger("hairstage.captures")
+PAUSE_S = 0.2
+
+
+class UnknownCapture(LookupError):
+    """No capture has this id."""
+
+    def __init__(self, capture_id: str) -> None:
+        super().__init__(f"there is no capture {capture_id!r}; GET /captures lists those there are")
+
+
+class Catalogue:
+    """The captures in `folder` that nobody is shooting, by id; `index` has the statuses of those
+    that have not changed since they were read.
+
+    Their names are looked up once. Each is then read by itself, by `begin`'s thread or when it is
+    asked for; what is unreadable is listed as damaged. Without that thread `list` reads all.
+    """
+
+    def __init__(self, folder: Path, index: Path) -> None:
+        self._folder, self._index = folder, StatusIndex(index)
+        self._lock = threading.Lock()  # for moments
+        self._reading = threading.Lock()  # held while a capture is read
+        self._found: dict[str, CaptureStatus] = {}
+        self._unread: dict[str, Path] | None = None
+        self._each: Callable[[CaptureStatus], object] = lambda _: None
+        self._thread: threading.Thread | None = None
+        self._closed = threading.Event()
+
+    @property
+    def unread(self) -> int:
+        """How many have not been read yet."""
+        return len(self._names())
+
+    def begin(
+        self,
+        each: Callable[[CaptureStatus], object],
+        then: Callable[[], object],
+        busy: Callable[[], bool],
+        within_s: float,
+    ) -> None:
+        """Read all on a thread of its own, which stands still while `busy()`; waits for so long.
+
+        `each` is told of every capture that is read, by whoever reads it, and `then` is called
+        after the last one.
+        """
+        self._each = each
+        self._names()
+
+        def run() -> None:
+            self._read_all(busy)
+            if not self._closed.is_set():
+                then()
+
+        self._thread = threading.Thread(target=run, name="catalogue", daemon=True)
+        self._thread.start()
+        self._thread.join(within_s)
+
+    def close(self) -> None:
+        """Read no more."""
+        self._closed.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5)
+
+    def read(self, name: str) -> None:
+        """Read a capture now, where that is still to be done."""
+        folder = self._names().get(name)
+        if folder is not None:
+            self._read(folder)
+
+    def read_all(self) -> None:
+        """Read all now, where no thread does."""
+        if self._thread is None:
+            self._read_all(lambda: False)
+
+    def get(self, name: str) -> CaptureStatus:
+        """What is known of a capture that was read. Raises `UnknownCapture`."""
+        with self._lock:
+            if name not in self._found:
+                raise UnknownCapture(name)
+            return self._found[name]
+
+    def list(self) -> list[CaptureStatus]:
+        """Those that were read, in no order."""
+        with self._lock:
+            return list(self._found.values())
+
+    def put(self, status: CaptureStatus) -> None:
+        """Nobody is shooting this one any more."""
+        with self._lock:
+            self._found[status.id] = status
+
+    def adopt(self, name: str) -> None:
+        """List a capture whose folder is new here, or has changed."""
+        self.put(read_status(self._folder / name))
+
+    def take(self, name: str) -> None:
+        """List it no more: it is being shot, or moved away."""
+        unread = self._names()
+        with self._lock:
+            unread.pop(name, None)
+            self._found.pop(name, None)
+
+    def _names(self) -> dict[str, Path]:
+        """The folders that are still to be read, the newest first."""
+        with self._lock:
+            if self._unread is None:
+                self._unread = {}
+                for path in sorted(self._folder.iterdir(), reverse=True):
+                    if printable(path.name) != path.name:
+                        name = printable(str(path))
+                        log.warning("%s: the folder's name is not UTF-8: left out", name)
+                    elif not path.name.startswith("."):
+                        self._unread[path.name] = path
+            return self._unread
+
+    def _read_all(self, busy: Callable[[], bool]) -> None:
+        for folder in list(self._names().values()):
+            while busy() and not self._closed.is_set():
+                self._closed.wait(PAUSE_S)
+            if self._closed.is_set():
+                break
+            self._read(folder)
+        self._index.save()
+
+    def _read(self, folder: Path) -> None:
+        unread = self._names()
+        with self._reading:
+            if folder.name not in unread:
+                return
+            status = self._index.status(folder) if any(_there(folder / f) for f in FILES) else None
+            with self._lock:
+                del unread[folder.name]
+                if status is None:  # it is no capture
+                    return
+                self._found[folder.name] = status
+        if status.outcome == "damaged":
+            log.warning("%s is damaged: %s", status.path, status.error)
+        self._each(status)
+
+
+def _there(path: Path) -> bool:
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:  # it cannot be looked at: that is for `read_status` to say
+        return True
+    return True
