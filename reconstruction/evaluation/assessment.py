@@ -10,14 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Ints
-from reconstruction.evaluation.connectivity import (
-    Followed,
-    connectivity_figures,
-    length_figures,
-    spread,
-)
-from reconstruction.evaluation.matching import StrandComparison, draw, scores
-from reconstruction.evaluation.oriented_points import Block, Drawn, OrientedPoints
+from reconstruction.evaluation.connectivity import spread
+from reconstruction.evaluation.matching import StrandComparison, scores
+from reconstruction.evaluation.oriented_points import Block, Drawn
 from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.cameras import Camera
@@ -93,7 +88,6 @@ def assess_strands(
 
     - `errors.{pred,true}`: distance and angle between each point and the nearest of the other set
       (mean and percentiles), and the share whose nearest point runs the other way;
-    - `lengths` (`length_figures`), `connectivity` (`connectivity_figures`);
     - `roots.{pred,true}`: the share of strands whose root is within 5 mm of the scalp (`rooted`)
       and of those whose tip is and the root is not (`upside_down`). The scalp is what the head
       marks as such, or else the true roots (`roots.scalp` says which);
@@ -104,28 +98,23 @@ def assess_strands(
 
     Raises as `compare_strands` does.
     """
-    predicted, truth = OrientedPoints(pred), OrientedPoints(true)
     progress("what the cameras see", 0.0)
     visibility = Visibility(cameras, true, head) if cameras is not None and len(true) else None
-    comparison = draw(predicted, truth, seed=seed, samples=samples, visibility=visibility)
+    comparison = StrandComparison(pred, true, seed=seed, samples=samples, visibility=visibility)
     of_pred, of_true = (Nearest(matches.drawn) for matches in comparison.all)
-    follow_pred = Followed(predicted, seed) if len(pred) else None
-    follow_true = Followed(truth, seed)
     progress("predicted points among the true ones", 0.2)
-    truth.show(*comparison.of_predicted, of_pred, *([follow_pred] if follow_pred else []))
+    comparison.look_at_truth(of_pred)
     progress("true points among the predicted ones", 0.5)
-    predicted.show(*comparison.of_truth, of_true, follow_true)
+    comparison.look_at_prediction(of_true)
     warnings = input_warnings(pred, true)
     sphere = HeadSphere.of(true)
     if sphere is None:
         warnings.append("the true roots do not lie on a head: there are no figures by scalp region")
     progress("parts of the hair", 0.8)
-    regions = _region_figures(true, truth, comparison, of_pred, head, sphere)
+    regions = _region_figures(comparison, of_pred, head, sphere)
     figures = {
         **comparison.figures(),
         "errors": {"pred": of_pred.figures(), "true": of_true.figures()} if len(pred) else {},
-        "lengths": length_figures(pred, true),
-        "connectivity": connectivity_figures(follow_pred, follow_true),
         "roots": root_figures(pred, true, head),
         "regions": regions,
         "warnings": warnings,
@@ -173,18 +162,16 @@ def root_figures(pred: Strands, true: Strands, head: Mesh | None = None) -> dict
 
 
 def _region_figures(
-    true: Strands,
-    truth: OrientedPoints,
     comparison: StrandComparison,
     of_pred: Nearest,
     head: Mesh | None,
     sphere: HeadSphere | None,
 ) -> dict[str, Any]:
     precision, recall = comparison.all
-    depth = HairDepth(truth, head if head is not None else sphere)
+    depth = HairDepth(comparison.truth, head if head is not None else sphere)
     kinds: dict[str, tuple[Sequence[str], Ints, Ints]] = {}
     if sphere is not None:
-        grows = sphere.scalp_regions(true.roots)
+        grows = sphere.scalp_regions(comparison.true.roots)
         kinds["scalp"] = SCALP, grows[of_pred.strand], grows[recall.drawn.strand]
     mine, theirs = (depth.regions(matches.drawn.points) for matches in (precision, recall))
     kinds["depth"] = DEPTHS, mine, theirs

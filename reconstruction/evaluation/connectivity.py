@@ -8,8 +8,12 @@ from typing import Any
 import numpy as np
 
 from reconstruction.arrays import Array, Ints
-from reconstruction.evaluation.matching import THRESHOLDS
-from reconstruction.evaluation.oriented_points import Block, OrientedPoints, near_pairs
+from reconstruction.evaluation.oriented_points import (
+    THRESHOLDS,
+    Block,
+    OrientedPoints,
+    near_pairs,
+)
 from reconstruction.geometry.strands import Strands
 
 LIES_ON = THRESHOLDS[1]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from reconstruction.arrays import AnyFloats
 from reconstruction.evaluation.assessment import Assessment, Nearest
-from reconstruction.evaluation.matching import THRESHOLDS
+from reconstruction.evaluation.oriented_points import THRESHOLDS
 from reconstruction.report.plots import COLOURS, INK, QUIET, TITLE, WIDTH, clean_axes, save_figure
 
 VIEWS = {

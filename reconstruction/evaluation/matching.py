@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from reconstruction.arrays import Bools
-from reconstruction.evaluation.oriented_points import Block, Drawn, OrientedPoints, near_pairs
+from reconstruction.evaluation.connectivity import Followed, connectivity_figures, length_figures
+from reconstruction.evaluation.oriented_points import (
+    THRESHOLDS,
+    Block,
+    Drawn,
+    Looker,
+    OrientedPoints,
+    near_pairs,
+)
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.strands import Strands
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """A point matches within `distance` metres and under `angle` degrees."""
-
-    distance: float
-    angle: float
-
-    @property
-    def name(self) -> str:
-        """As in `1mm_10deg`."""
-        return f"{self.distance * 1e3:g}mm_{self.angle:g}deg"
-
-
-# ascending in both: whoever matches one matches all that follow
-THRESHOLDS = (Threshold(1e-3, 10.0), Threshold(2e-3, 20.0), Threshold(3e-3, 30.0))
 
 
 class Matches:
@@ -86,53 +76,85 @@ def _share(matches: Matches, k: int, directed: bool, among: Bools | None) -> tup
     return share, float(np.sqrt(share * (1 - share) / (n - 1))) if sampled else 0.0
 
 
-@dataclass(frozen=True)
 class StrandComparison:
-    """Matches of both sets: points drawn from all, and from what cameras see."""
+    """Matches of two sets, of points drawn from `all` and from what cameras see (`visible`).
 
-    all: tuple[Matches, Matches]
-    visible: tuple[Matches, Matches] | None
+    Beside them which strands lie along which of those that were followed, and the prediction at
+    equal length: what true points match of the strands that `equal_length` keeps. Nothing is
+    matched before `look_at_truth` and `look_at_prediction`. Raises as `compare_strands` does.
+    """
 
-    @property
-    def of_predicted(self) -> list[Matches]:
-        """Those that have to be shown the truth."""
-        return [pair[0] for pair in (self.visible, self.all) if pair]
+    def __init__(
+        self,
+        pred: Strands,
+        true: Strands,
+        *,
+        seed: int = 0,
+        samples: int | None = 40_000,
+        visibility: Visibility | None = None,
+    ) -> None:
+        self.pred, self.true = pred, true
+        self.predicted, self.truth = OrientedPoints(pred), OrientedPoints(true)
+        if self.truth.count == 0:
+            raise ValueError("there are no true strands to compare with")
+        rng = np.random.default_rng(seed)
 
-    @property
-    def of_truth(self) -> list[Matches]:
-        """Those that have to be shown the prediction."""
-        return [pair[1] for pair in (self.visible, self.all) if pair]
+        def drawn(sees: Visibility | None) -> tuple[Matches, Matches]:
+            theirs = self.truth.draw(samples, rng, sees)
+            if not len(theirs.points):
+                raise ValueError("no camera sees any of the true strands: are they in one frame?")
+            return Matches(self.predicted.draw(samples, rng, sees)), Matches(theirs)
+
+        self.visible = None if visibility is None else drawn(visibility)
+        self.all = drawn(None)
+        parts = {"visible": self.visible, "all": self.all}
+        self._parts = {name: pair for name, pair in parts.items() if pair}
+        self._kept = equal_length(pred, true, seed)
+        self._kept_recall = {k: Matches(pair[1].drawn) for k, pair in self._parts.items()}
+        self._followed = Followed(self.predicted, seed) if len(pred) else None
+        self._true_followed = Followed(self.truth, seed)
+
+    def look_at_truth(self, *more: Looker) -> None:
+        """Match the predicted points; `more` is shown the truth as well."""
+        mine = [self._followed] if self._followed else []
+        self.truth.show(*(pair[0] for pair in self._parts.values()), *mine, *more)
+
+    def look_at_prediction(self, *more: Looker) -> None:
+        """Match the true points; `more` is shown the prediction as well."""
+        recalls = [pair[1] for pair in self._parts.values()]
+        self.predicted.show(*recalls, self._true_followed, *more)
+        if self._kept.all():
+            self._kept_recall = dict(zip(self._parts, recalls, strict=True))
+        else:
+            OrientedPoints(self.pred.subset(self._kept)).show(*self._kept_recall.values())
 
     def figures(self) -> dict[str, Any]:
         """What `compare_strands` returns."""
-        parts = {"visible": self.visible, "all": self.all}
-        there = {name: pair for name, pair in parts.items() if pair}
         return {
-            **{name: scores(*pair) for name, pair in there.items()},
-            "directed": {name: scores(*pair, directed=True) for name, pair in there.items()},
+            **{name: scores(*pair) for name, pair in self._parts.items()},
+            "directed": {k: scores(*pair, directed=True) for k, pair in self._parts.items()},
+            "equal_length": {
+                k: scores(mine, self._kept_recall[k], predicted=self._kept[mine.drawn.strand])
+                for k, (mine, _) in self._parts.items()
+            },
+            "lengths": length_figures(self.pred, self.true),
+            "connectivity": connectivity_figures(self._followed, self._true_followed),
         }
 
 
-def draw(
-    predicted: OrientedPoints,
-    truth: OrientedPoints,
-    *,
-    seed: int = 0,
-    samples: int | None = 40_000,
-    visibility: Visibility | None = None,
-) -> StrandComparison:
-    """Draw the points to compare; nothing is matched yet. Raises as `compare_strands` does."""
-    if truth.count == 0:
-        raise ValueError("there are no true strands to compare with")
-    rng = np.random.default_rng(seed)
-    visible = None
-    if visibility is not None:
-        seen = truth.draw(samples, rng, visibility)
-        if not len(seen.points):
-            raise ValueError("no camera sees any of the true strands: are they in one frame?")
-        visible = Matches(predicted.draw(samples, rng, visibility)), Matches(seen)
-    everything = Matches(predicted.draw(samples, rng)), Matches(truth.draw(samples, rng))
-    return StrandComparison(everything, visible)
+def equal_length(pred: Strands, true: Strands, seed: int = 0) -> Bools:
+    """Which predicted strands `(S,)` to keep, whole and drawn by `seed`, for the true metres.
+
+    All of them where they are no longer than the truth in all.
+    """
+    lengths, wanted = pred.lengths(), float(true.lengths().sum())
+    kept = np.ones(len(pred), bool)
+    if lengths.sum() > wanted:
+        order = np.random.default_rng(seed).permutation(len(pred))
+        # up to the last one whose middle still fits: no other number of them comes nearer
+        middle = np.cumsum(lengths[order]) - lengths[order] / 2
+        kept[order[max(1, int(np.searchsorted(middle, wanted))) :]] = False
+    return kept
 
 
 def compare_strands(
@@ -150,12 +172,18 @@ def compare_strands(
     share of predicted points that match a true one, recall the share of true points that match a
     predicted one, F their harmonic mean.
 
-    Returns `{"visible": scores, "all": scores, "directed": {"visible": scores, "all": scores}}`,
-    without the visible ones where no `visibility` of the true strands is given. Visible precision
-    scores the visible predictions against all of the truth, visible recall the visible truth
-    against all predictions; visible is what is not hidden from every camera by the true strands or
-    the head by more than 1 mm. Directed ones compare tangents as arrows from root to tip. `scores`
-    maps `1mm_10deg`, `2mm_20deg`, `3mm_30deg` to
+    Returns
+
+    - `visible` and `all`: scores; the visible ones only where the `visibility` of the true strands
+      is given. Visible precision scores the visible predictions against all of the truth, visible
+      recall the visible truth against all predictions; visible is what is not hidden from every
+      camera by the true strands or the head by more than 1 mm;
+    - `directed.{visible,all}`: with tangents as arrows from root to tip;
+    - `equal_length.{visible,all}`: of the prediction cut to the true metres (`equal_length`): many
+      strands side by side buy recall;
+    - `lengths` (`length_figures`), `connectivity` (`connectivity_figures`).
+
+    Scores map `1mm_10deg`, `2mm_20deg`, `3mm_30deg` to
     `{"precision", "recall", "f", "precision_error", "recall_error"}`.
 
     At most `samples` points of each set are scored (all of them for None), drawn by `seed`, always
@@ -165,8 +193,7 @@ def compare_strands(
     Raises `ValueError` when there is no true strand, no camera sees a true point, or strands are
     so long that they cannot be in metres.
     """
-    predicted, truth = OrientedPoints(pred), OrientedPoints(true)
-    comparison = draw(predicted, truth, seed=seed, samples=samples, visibility=visibility)
-    truth.show(*comparison.of_predicted)
-    predicted.show(*comparison.of_truth)
+    comparison = StrandComparison(pred, true, seed=seed, samples=samples, visibility=visibility)
+    comparison.look_at_truth()
+    comparison.look_at_prediction()
     return comparison.figures()

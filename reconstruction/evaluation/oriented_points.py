@@ -31,6 +31,23 @@ MOST_PAIRS = 4_000_000
 OVERSAMPLING = 5  # points that are tested for visibility, for each visible one that is wanted
 
 
+@dataclass(frozen=True)
+class Threshold:
+    """A point matches within `distance` metres and under `angle` degrees."""
+
+    distance: float
+    angle: float
+
+    @property
+    def name(self) -> str:
+        """As in `1mm_10deg`."""
+        return f"{self.distance * 1e3:g}mm_{self.angle:g}deg"
+
+
+# ascending in both: whoever matches one matches all that follow
+THRESHOLDS = (Threshold(1e-3, 10.0), Threshold(2e-3, 20.0), Threshold(3e-3, 30.0))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """`points (N, 3)`, the `strand (N,)` of each, and its unit `tangents (N, 3)`, root to tip.

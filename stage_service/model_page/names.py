@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 GROUPS = ("held_out_lights", "held_out_camera")
 STRANDS = {
@@ -9,6 +12,15 @@ STRANDS = {
     "hull_smooth_field": "hull + smooth field",
     "hull_vertical": "hull + vertical",
 }
+STRAND_FIGURES: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    ("strands", ",.0f", "", ("lengths", "pred", "strands")),
+    ("metres", ",.0f", " m", ("lengths", "pred", "total_m")),
+    ("most of a strand on one true strand", ".2f", "", ("connectivity", "pred", "on_one", "mean")),
+    ("most of a true strand by one", ".2f", "", ("connectivity", "true", "by_one", "mean")),
+)
+"""How long and how whole strands are: title, form, unit, and the figure's place in the scores."""
+
+OF_TRUTH = {"strands": ("lengths", "true", "strands"), "metres": ("lengths", "true", "total_m")}
 PICTURES = {
     "ours": "ours",
     "inverse_rendering": "inverse rendering",
@@ -25,3 +37,25 @@ PICTURES = {
 def threshold(name: str) -> str:
     """`1mm_10deg` as in print."""
     return name.replace("mm_", " mm/").replace("deg", "°")
+
+
+def strand_figure(scores: Mapping[str, Any], place: Sequence[str]) -> float | None:
+    """The figure at `place` of what `compare_strands` returns; None where there is none."""
+    found: Any = scores
+    for key in place:
+        found = found.get(key, {})
+    return float(found) if place and not isinstance(found, Mapping) else None
+
+
+def strand_cells(
+    scores: Mapping[str, Any], places: Sequence[Sequence[str]] | None = None
+) -> list[str]:
+    """The `STRAND_FIGURES` in print, or those at `places`; a dash where there is none."""
+    values = [
+        strand_figure(scores, place) for place in places or [place for *_, place in STRAND_FIGURES]
+    ]
+    forms = [(form, unit) for _, form, unit, _ in STRAND_FIGURES]
+    return [
+        "–" if value is None else f"{value:{form}}{unit}"
+        for value, (form, unit) in zip(values, forms, strict=True)
+    ]

@@ -22,7 +22,15 @@ from stage_service.model_page.html import (
     words,
 )
 from stage_service.model_page.html import seconds as time_text
-from stage_service.model_page.names import GROUPS, PICTURES, STRANDS, threshold
+from stage_service.model_page.names import (
+    GROUPS,
+    OF_TRUTH,
+    PICTURES,
+    STRAND_FIGURES,
+    STRANDS,
+    strand_cells,
+    threshold,
+)
 from stage_service.model_page.plots import error_plots, time_bars
 
 PAGE = "index.html"
@@ -235,14 +243,27 @@ def _strand_table(found: Mapping[str, Any]) -> Html:
     heads = [threshold(t) for t in next(iter(first[p] for p in ("visible", "all") if p in first))]
     rows = []
     for over in ("visible", "all"):
-        for name, figures in found.items():
-            if over in figures:
-                cells = [
-                    " / ".join(f"{100 * s[k]:.1f}" for k in ("precision", "recall", "f"))
-                    for s in figures[over].values()
-                ]
-                rows.append([f"{over} points", _ours(name, STRANDS), *cells])
-    return table(["", "", *heads], rows, "figures")
+        for at, how in (("", ""), ("equal_length", ", at equal length")):
+            for name, figures in found.items():
+                scores = figures.get(at, {}) if at else figures
+                if over in scores:
+                    cells = [
+                        " / ".join(f"{100 * s[k]:.1f}" for k in ("precision", "recall", "f"))
+                        for s in scores[over].values()
+                    ]
+                    rows.append([f"{over} points{how}", _ours(name, STRANDS), *cells])
+    scored = table(["", "", *heads], rows, "figures")
+    if "lengths" not in first:
+        return scored  # of an earlier version
+    rows = [[_ours(name, STRANDS), *strand_cells(figures)] for name, figures in found.items()]
+    truth = strand_cells(first, [OF_TRUTH.get(title, ()) for title, *_ in STRAND_FIGURES])
+    heads = [title for title, *_ in STRAND_FIGURES]
+    whole = table(["", *heads], [*rows, ["the truth", *truth]], "figures")
+    note = (
+        "Many strands side by side buy recall: at equal length the prediction is cut at random, "
+        "whole strands, to the true metres."
+    )
+    return joined([scored, whole, element("p", note, class_="quiet")])
 
 
 def _picture_table(images: Mapping[str, Any]) -> Html:

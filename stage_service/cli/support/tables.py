@@ -12,7 +12,17 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
-from stage_service.model_page.names import GROUPS, PICTURES, STRANDS, THRESHOLDS, threshold
+from stage_service.model_page.names import (
+    GROUPS,
+    OF_TRUTH,
+    PICTURES,
+    STRAND_FIGURES,
+    STRANDS,
+    THRESHOLDS,
+    strand_cells,
+    strand_figure,
+    threshold,
+)
 
 _HEADS = [threshold(t) for t in THRESHOLDS]
 _SCORES = ("psnr", "ssim")
@@ -110,9 +120,16 @@ def _rows() -> dict[str, list[_Part]]:
     """The README's rows by title."""
     rows: dict[str, list[_Part]] = {}
     for over in ("visible", "all"):
-        for name, title in STRANDS.items():
-            read = partial(_f, over=over, name=name)
-            rows[f"F at 1 mm/10°, {over} points: {title}"] = [(read, ".1f", " %")]
+        for at, how in (("", ""), ("equal_length", ", at equal length")):
+            for name, title in STRANDS.items():
+                read = partial(_f, at=at, over=over, name=name)
+                rows[f"F at 1 mm/10°, {over} points{how}: {title}"] = [(read, ".1f", " %")]
+    for title, form, unit, read in STRAND_FIGURES:
+        for name, who in STRANDS.items():
+            rows[f"{title}: {who}"] = [(partial(_strand_figure, read=read, name=name), form, unit)]
+        if title in OF_TRUTH:
+            truth = partial(_strand_figure, read=OF_TRUTH[title], name="ours")
+            rows[f"{title}: the truth"] = [(truth, form, unit)]
     for group in GROUPS:
         for name, title in PICTURES.items():
             decibels, ssim = (partial(_score, group=group, name=name, score=s) for s in _SCORES)
@@ -131,9 +148,20 @@ def _cell(figures: Sequence[Mapping[str, float]], parts: Sequence[_Part]) -> Ite
         yield f"{one['mean']:{form}}{spread}{unit}"
 
 
-def _f(results: Mapping[str, Any], over: str, name: str) -> float:
-    scores = results["geometry"] if name == "ours" else results["baselines"][name]
-    return 100 * float(scores[over][THRESHOLDS[0]]["f"])
+def _f(results: Mapping[str, Any], at: str, over: str, name: str) -> float | None:
+    scores = _scores_of(results, name)
+    if at and at not in scores:
+        return None  # of an earlier version
+    return 100 * float((scores[at] if at else scores)[over][THRESHOLDS[0]]["f"])
+
+
+def _strand_figure(results: Mapping[str, Any], read: tuple[str, ...], name: str) -> float | None:
+    return strand_figure(_scores_of(results, name), read)
+
+
+def _scores_of(results: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = results["geometry"] if name == "ours" else results["baselines"][name]
+    return found
 
 
 def _score(results: Mapping[str, Any], group: str, name: str, score: str) -> float | None:
@@ -162,16 +190,29 @@ def _numbers(value: Any) -> str:
     return ", ".join(f"{x:.3g}" for x in values)
 
 
-def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
-    """A table of precision, recall and F in per cent, a row for each name in `rows`."""
+def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Group:
+    """Precision, recall and F in per cent, as it is and at equal length, rows for each of `rows`;
+    and how long and how whole the strands are."""
     table = Table(
         "strands", "over", *_HEADS, title="Strands against the true ones: precision / recall / F, %"
     )
+    for over in ("visible", "all"):
+        for at, how in (("", ""), ("equal_length", ", at equal length")):
+            for name, figures in rows.items():
+                scores = figures.get(at, {}) if at else figures
+                if over in scores:
+                    table.add_row(name, over + how, *_cells(scores[over]))
+    more = Table("strands", *(title for title, *_ in STRAND_FIGURES))
     for name, figures in rows.items():
-        for over in ("visible", "all"):
-            if over in figures:
-                table.add_row(name, over, *_cells(figures[over]))
-    return table
+        if any(strand_figure(figures, read) is not None for *_, read in STRAND_FIGURES):
+            more.add_row(name, *strand_cells(figures))
+    if more.row_count:
+        first = next(iter(rows.values()))
+        more.add_row(
+            "the truth",
+            *strand_cells(first, [OF_TRUTH.get(title, ()) for title, *_ in STRAND_FIGURES]),
+        )
+    return Group(table, more) if more.row_count else Group(table)
 
 
 def _cells(scores: dict[str, dict[str, float]]) -> list[str]:

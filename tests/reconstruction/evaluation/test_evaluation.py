@@ -10,7 +10,7 @@ import pytest
 
 from reconstruction import Camera, Mesh, Strands
 from reconstruction.evaluation import oriented_points
-from reconstruction.evaluation.matching import compare_strands
+from reconstruction.evaluation.matching import compare_strands, equal_length
 from reconstruction.evaluation.oriented_points import OrientedPoints
 from reconstruction.evaluation.visibility import Visibility
 
@@ -97,6 +97,31 @@ def test_any_point_within_reach_may_match() -> None:
     across = Strands.from_list([np.array([[-0.02, 1e-4, z], [0.02, 1e-4, z]]) for z in (-0.01, 0)])
     both = Strands.from_list([*(across[i] for i in range(2)), true[0] + np.array([5e-4, 0, 0])])
     assert compare_strands(both, true)["all"]["1mm_10deg"]["recall"] == 1.0
+
+
+def test_copies_buy_recall_and_lose_it_at_equal_length() -> None:
+    true = curtain(spacing=4e-3)
+    half = true.subset(np.arange(len(true)) < len(true) // 2)
+    rng = np.random.default_rng(0)
+    copies = Strands.from_list(
+        [s + shift for s in half for shift in rng.uniform(-1.5e-3, 1.5e-3, (10, 3))], 3e-4
+    )
+    figures = compare_strands(copies, true)
+    as_is, fair = (f["all"]["1mm_10deg"] for f in (figures, figures["equal_length"]))
+    assert figures["lengths"]["pred"]["total_m"] == pytest.approx(0.6 * len(half))
+    assert as_is["recall"] > fair["recall"] + 0.15
+    assert fair["precision"] == pytest.approx(as_is["precision"], abs=0.05)
+    # what is no longer than the truth is not cut
+    short = compare_strands(half, true)
+    assert short["equal_length"]["all"] == short["all"]
+
+
+def test_equal_length_is_the_true_metres_to_half_a_strand() -> None:
+    true = curtain(spacing=20e-3)
+    pred = Strands.from_list([s * [1, 1, k] for s in true for k in (0.3, 0.7, 1.1, 1.9)])
+    for seed in range(20):
+        left = pred.subset(equal_length(pred, true, seed)).lengths().sum()
+        assert abs(left - true.lengths().sum()) <= pred.lengths().max() / 2 + 1e-6
 
 
 def test_half_of_the_truth() -> None:
@@ -233,7 +258,7 @@ import subprocess
 import sys
 
 import numpy as np
-from reconstruction.evaluation.matching import compare_strands
+from reconstruction.evaluation.matching import compare_strands, equal_length
 from reconstruction.geometry.strands import Strands
 
 def hair(seed):

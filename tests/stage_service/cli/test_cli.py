@@ -183,7 +183,8 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
     assert figures["recall"] == pytest.approx(0.5, abs=0.02)
     assert main(["evaluate", "geometry", *[str(tmp_path / "true.npz")] * 2]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("100.0 / 100.0 / 100.0") >= 6
+    assert printed.count("100.0 / 100.0 / 100.0") >= 9
+    assert "equal length" in printed
     assert "root to tip" in printed
 
 
@@ -253,7 +254,15 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     results = {
         "subject": "curly",
         "seed": 3,
-        "geometry": strands(0.253),
+        "geometry": {
+            **strands(0.253),
+            "equal_length": strands(0.204),
+            "lengths": {
+                "pred": {"strands": 107000, "total_m": 4581.2},
+                "true": {"strands": 10500, "total_m": 1771.0},
+            },
+            "connectivity": {"pred": {"on_one": {"mean": 0.171}}},
+        },
         "baselines": {"hull_vertical": strands(0.022), "hull_smooth_field": strands(0.032)},
         "images": {
             "held_out_lights": pictures,
@@ -271,6 +280,10 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     head, _, *rest = capsys.readouterr().out.splitlines()
     assert head == "|  | curly, seed 3 [1] |"
     assert "| F at 1 mm/10°, visible points: ours | 25.3 % |" in rest
+    assert "| F at 1 mm/10°, visible points, at equal length: ours | 20.4 % |" in rest
+    assert {"| strands: ours | 107,000 |", "| strands: the truth | 10,500 |"} <= set(rest)
+    assert {"| metres: ours | 4,581 m |", "| metres: the truth | 1,771 m |"} <= set(rest)
+    assert "| most of a strand on one true strand: ours | 0.17 |" in rest
     own = "held-out camera: three nearest lights in that camera's own frames"
     assert f"| {own} | 21.4 dB / 0.71 |" in rest
     assert {"| β_M: ours | 0.89 |", "| β_M: the truth | 0.28 |"} <= set(rest)
