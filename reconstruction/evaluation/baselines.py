@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
 
 from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.cameras import Camera
@@ -19,15 +18,13 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import inside_mesh, mesh_depth, mesh_silhouette
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.field import solve_field
+from reconstruction.growth.field import DOWN, descent, solve_field
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 
 SPACING = np.sqrt(2) * 1e-3
 """Metres between neighbouring lines: no point between them is over 1 mm from the nearest."""
 
 RADIUS = 3.5e-4
-
-DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def baseline_hull(
@@ -81,7 +78,7 @@ def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
     inwards it is spread as measured orientations are (`solve_field`). Where the hull touches the
     `head` is no outer surface. Raises `ValueError` for an empty hull.
     """
-    points, tangents = _descent(hull, inside_mesh(hull, head) if head is not None else None)
+    points, tangents = descent(hull, inside_mesh(hull, head) if head is not None else None)
     field, _ = solve_field(hull, points, tangents)
     lattice = np.stack(np.meshgrid(*_lattice(hull)[1], indexing="ij"), axis=-1).reshape(-1, 3)
     lattice = lattice[hull.contains(lattice)]
@@ -89,17 +86,3 @@ def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
     center, half = lattice[there], direction[there] * SPACING / 2
     ends = np.stack([center - half, center + half], axis=1)
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
-
-
-def _descent(hull: VoxelGrid, head: Bools | None) -> tuple[Array, Array]:
-    """Centres `(N, 3)` of the outer surface's voxels and unit directions `(N, 3)` of descent."""
-    solid = np.pad(hull.inside if head is None else hull.inside | head, 4)
-    surface = solid & ~ndimage.binary_erosion(solid)
-    smooth = ndimage.gaussian_filter(solid.astype(np.float32), 2.0)
-    index = np.argwhere(surface[4:-4, 4:-4, 4:-4] & hull.inside)
-    normal = -np.stack([g[tuple(index.T + 4)] for g in np.gradient(smooth)], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    tangent = DOWN - (normal @ DOWN)[:, None] * normal
-    slope = np.linalg.norm(tangent, axis=1)
-    keep = slope > 0.1  # flatter than 6 degrees, the way down is the voxels' noise
-    return hull.centers(index[keep]), tangent[keep] / slope[keep, None]

@@ -133,6 +133,27 @@ LEAST_COHERENCE = 0.5
 """Difference of the two largest eigenvalues under which a voxel counts as degenerate."""
 
 
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def descent(grid: VoxelGrid, head: Bools | None = None) -> tuple[Array, Array]:
+    """Centres `(N, 3)` of the outer surface's voxels and unit directions `(N, 3)` of descent.
+
+    The steepest way down within the surface is where hair lies of which nothing else is known.
+    Where the envelope touches the `head`'s inside `(X, Y, Z)` is no outer surface.
+    """
+    solid = np.pad(grid.inside if head is None else grid.inside | head, 4)
+    surface = solid & ~ndimage.binary_erosion(solid)
+    smooth = ndimage.gaussian_filter(solid.astype(np.float32), 2.0)
+    index = np.argwhere(surface[4:-4, 4:-4, 4:-4] & grid.inside)
+    normal = -np.stack([g[tuple(index.T + 4)] for g in np.gradient(smooth)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    tangent = DOWN - (normal @ DOWN)[:, None] * normal
+    slope = np.linalg.norm(tangent, axis=1)
+    keep = slope > 0.1  # flatter than 6 degrees, the way down is the voxels' noise
+    return grid.centers(index[keep]), tangent[keep] / slope[keep, None]
+
+
 def gather(
     grid: VoxelGrid, points: AnyFloats, directions: AnyFloats, weights: AnyFloats
 ) -> tuple[Ints, Array, Array]:

@@ -124,11 +124,12 @@ def _rows() -> dict[str, list[_Part]]:
             for name, title in STRANDS.items():
                 read = partial(_f, at=at, over=over, name=name)
                 rows[f"F at 1 mm/10°, {over} points{how}: {title}"] = [(read, ".1f", " %")]
-    for title, form, unit, read in STRAND_FIGURES:
+    for title, form, unit, place in STRAND_FIGURES:
         for name, who in STRANDS.items():
-            rows[f"{title}: {who}"] = [(partial(_strand_figure, read=read, name=name), form, unit)]
+            figure = partial(_strand_figure, place=place, name=name)
+            rows[f"{title}: {who}"] = [(figure, form, unit)]
         if title in OF_TRUTH:
-            truth = partial(_strand_figure, read=OF_TRUTH[title], name="ours")
+            truth = partial(_strand_figure, place=OF_TRUTH[title], name="ours")
             rows[f"{title}: the truth"] = [(truth, form, unit)]
     for group in GROUPS:
         for name, title in PICTURES.items():
@@ -155,8 +156,8 @@ def _f(results: Mapping[str, Any], at: str, over: str, name: str) -> float | Non
     return 100 * float((scores[at] if at else scores)[over][THRESHOLDS[0]]["f"])
 
 
-def _strand_figure(results: Mapping[str, Any], read: tuple[str, ...], name: str) -> float | None:
-    return strand_figure(_scores_of(results, name), read)
+def _strand_figure(results: Mapping[str, Any], place: Sequence[str], name: str) -> float | None:
+    return strand_figure(_scores_of(results, name), place)
 
 
 def _scores_of(results: Mapping[str, Any], name: str) -> Mapping[str, Any]:
