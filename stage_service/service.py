@@ -47,6 +47,7 @@ from stage_service.service_models import (
 )
 from stage_service.storage import Removed, Storage
 from stage_service.verification import Verification, Verifier
+from stage_service.viewer import Viewed, Viewing
 from stage_service.watching import NotReady, Watching
 
 T = TypeVar("T")
@@ -103,6 +104,7 @@ class Service:
         self._follower = JobFollower(root, self._queue, self._captures.events, self._captures.audit)
         self.watching = Watching(root, self._captures, self._queue, self._follower)
         self.storage = Storage(root, self._captures, self._control, self._queue)
+        self.viewing = Viewing(lambda: [m.name for m in self.storage.models()], self._viewed)
         self._verifier = Verifier(
             root / "verified.json",
             self._captures.events,
@@ -323,6 +325,15 @@ class Service:
             if not (path / "plan.json").is_file():
                 raise
             return path.resolve()
+
+    def _viewed(self, name: str) -> Viewed:
+        """A model for the viewer, with the capture of its name or of the job that made it."""
+        model = self.storage.model(name)
+        with suppress(UnknownCapture, CaptureError):
+            return Viewed(model, Capture(self.capture_path(name)))
+        with suppress(NoSuchJob, CaptureError):
+            return Viewed(model, Capture(self._queue.get(name).capture))
+        return Viewed(model)
 
     def submit(self, request: JobRequest, by: Caller, key: str | None = None) -> Job:
         """Enqueue a pipeline on a capture; where that was done under this `key`, it is that job.

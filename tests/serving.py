@@ -10,6 +10,7 @@ from pathlib import Path
 
 import httpx
 import uvicorn
+from fastapi import FastAPI
 from waiting import until
 
 from stage_service.api.app import create_app
@@ -30,21 +31,27 @@ def serving(
 ) -> Iterator[Client]:
     """The application, started and closed as the server does; it has read what is on the disk."""
     service = Service(rig_file, root)
-    config = uvicorn.Config(
-        create_app(service, access), log_level="critical", ws="none", timeout_graceful_shutdown=1
-    )
+    # The socket takes connections before the server does: the first answer comes when it is up.
+    with (
+        listening_app(create_app(service, access)) as url,
+        Client(base_url=url, timeout=60, trust_env=False) as client,
+    ):
+        client.service = service
+        client.get("/health")
+        until(lambda: not (all_read and service.unread))
+        yield client
+
+
+@contextmanager
+def listening_app(app: FastAPI) -> Iterator[str]:
+    """The URL of an application on a socket of its own."""
+    config = uvicorn.Config(app, log_level="critical", ws="none", timeout_graceful_shutdown=1)
     server = uvicorn.Server(config)
     listener = socket.create_server(("127.0.0.1", 0))
     thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     try:
-        # The socket takes connections before the server does: the first answer comes when it is up.
-        with Client(base_url=url, timeout=60, trust_env=False) as client:
-            client.service = service
-            client.get("/health")
-            until(lambda: not (all_read and service.unread))
-            yield client
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
     finally:
         server.should_exit = True
         thread.join(60)

@@ -16,13 +16,14 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
-from stage_service.api import event_stream, login, queueing, routes, steering, store
+from stage_service.api import event_stream, login, queueing, routes, steering, store, viewing
 from stage_service.api.connections import LOOPBACK, limits, listening
 from stage_service.api.downloads import Heads
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
 from stage_service.service import Service
+from stage_service.viewer import Viewing
 
 
 def create_app(service: Service, access: Access | None = None) -> FastAPI:
@@ -53,8 +54,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     )
     access = access or Access()
     app.state.service, app.state.lanes, app.state.access = service, Lanes(), access
-    app.state.feed = event_stream.Feed(service.events)
-    install_problems(app)
+    app.state.feed, app.state.viewing = event_stream.Feed(service.events), service.viewing
     for part in (routes, steering, queueing, store, event_stream):
         app.include_router(part.reading)
     for more in (routes, steering, queueing, store, login):
@@ -65,26 +65,49 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     def errors() -> PlainTextResponse:
         return PlainTextResponse(errors_page(), media_type="text/markdown")
 
+    return _completed(app, access)
+
+
+def create_viewer(models: Viewing, access: Access) -> FastAPI:
+    """The viewer of `models` alone, without a stage."""
+    app = FastAPI(title="hairstage viewer", version=version("hairstage"))
+    app.state.viewing = models
+    return _completed(app, access)
+
+
+def _completed(app: FastAPI, access: Access) -> FastAPI:
+    """What every application of ours has: the viewer, problem documents, the gate."""
+    install_problems(app)
+    app.include_router(viewing.page)
+    app.include_router(viewing.reading)
     app.add_middleware(Faults)
     app.add_middleware(Heads)
     app.add_middleware(Gate, access=access)
     return app
 
 
-class _Server(uvicorn.Server):
-    """Puts the lights off at the signal itself, not after the last connection has closed."""
+class _Announcing(uvicorn.Server):
+    """Says when requests are answered."""
 
-    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
         super().__init__(config)
-        self._service, self._ready = service, ready
-
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        threading.Thread(target=self._service.close, name="lights-off").start()
-        super().handle_exit(sig, frame)
+        self._ready = ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         self._ready()
+
+
+class _Server(_Announcing):
+    """Puts the lights off at the signal itself, not after the last connection has closed."""
+
+    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
+        super().__init__(config, ready)
+        self._service = service
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        threading.Thread(target=self._service.close, name="lights-off").start()
+        super().handle_exit(sig, frame)
 
 
 @dataclass(frozen=True)
@@ -108,6 +131,22 @@ class Endpoint:
         if self.socket is not None:
             return f"unix:{self.socket.resolve()}"
         return f"http{'s' if self.certificate else ''}://{self.host}:{port}"
+
+
+def serve_viewer(
+    models: Viewing, access: Access, port: int, ready: Callable[[str], Any] = lambda _url: None
+) -> None:
+    """Serve the viewer of `models` to this machine until SIGINT or SIGTERM.
+
+    `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
+    """
+    with listening(LOOPBACK, port, None) as listener:
+        url = Endpoint().url(listener.getsockname()[1])
+        app = create_viewer(models, access)
+        config = uvicorn.Config(
+            app, log_level="warning", access_log=False, timeout_graceful_shutdown=1, **limits()
+        )
+        _Announcing(config, lambda: ready(url)).run(sockets=[listener])
 
 
 def serve(

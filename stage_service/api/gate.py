@@ -19,8 +19,9 @@ from stage_service.api.problems import PAGE, problem_response
 from stage_service.records.tokens import SCOPES, Identity, Tokens, UnknownToken
 
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
-OPEN = {PAGE, "/docs", "/openapi.json"}
-"""Says nothing of a stage: how to ask, for whoever may not yet."""
+VIEW, VIEW_PAGE = "/view", "/view/page/"
+OPEN = {PAGE, "/docs", "/openapi.json", VIEW}
+"""Says nothing of a stage: how to ask, for whoever may not yet. So do the parts of `VIEW_PAGE`."""
 ANYBODY = Identity(name="", scopes=SCOPES)
 MOST_BODY = 1 << 20
 BODY_S = 20.0
@@ -199,7 +200,8 @@ def _again(message: Message, receive: Receive) -> Receive:
 
 def _open(scope: Scope) -> bool:
     """Whether it may be asked by somebody unknown."""
-    return scope["path"] in OPEN or (scope["method"], scope["path"]) == ("POST", LOGIN)
+    path = scope["path"]
+    return path in OPEN or path.startswith(VIEW_PAGE) or (scope["method"], path) == ("POST", LOGIN)
 
 
 def _name(host: str) -> str:

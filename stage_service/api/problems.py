@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from reconstruction import CaptureError, MissingFrame
+from reconstruction import CaptureError, MissingFrame, ModelError
 from reconstruction.capture.writer import JournalInUse
 from reconstruction.containment import NotContained
 from reconstruction.files.durable import DiskFull
@@ -37,6 +37,7 @@ from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
 from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
 from stage_service.storage import BadUpload, InUse, NotThere
+from stage_service.viewer import NothingToView
 from stage_service.watching import NotReady
 
 log = logging.getLogger("hairstage.api")
@@ -150,6 +151,8 @@ BY_ERROR: dict[type[Exception], str] = {
     BadUpload: "bad-input",
     InUse: "in-use",
     NotThere: "not-there",
+    NothingToView: "not-there",
+    ModelError: "not-there",
     DiskFull: "disk-full",
     UnknownEntry: "unknown-entry",
     QueueFull: "queue-full",

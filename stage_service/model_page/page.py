@@ -131,7 +131,9 @@ def _result(model: Model) -> Html:
             element("dl", *rows),
             element(
                 "p",
-                "For other programs: ",
+                "To turn it under your hand, in a browser: ",
+                element("code", f"hairstage view {model.path.name}"),
+                ". For other programs: ",
                 element("code", f"hairstage export {model.path.name} --to blender --out FOLDER"),
                 class_="quiet",
             ),

@@ -1,0 +1,55 @@
+"""`hairstage view`: a model in a browser."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    view = add_command(commands, "view", run)
+    view.add_argument("model", type=Path)
+    view.add_argument("--capture", type=Path, help="the capture that it was made of")
+    view.add_argument("--truth", type=Path, help="a strand file to show beside the model's strands")
+    view.add_argument("--port", type=int, default=0, help="0 takes any free port")
+
+
+def run(args: argparse.Namespace, output: Output) -> None:
+    """A model in a browser: its strands turn under your hand.
+
+    Serve MODEL to a browser on this machine until Ctrl-C: strands by direction, confidence, root,
+    length or lit; with --capture its cameras and photographs, and any light out of captured frames.
+    The address that is printed holds a key: who has it sees the model.
+    """
+    import secrets
+
+    from reconstruction import Capture, Model, read_strands
+    from stage_service.api.app import serve_viewer
+    from stage_service.api.gate import Access
+    from stage_service.cli.stage.processes import exit_on_sigterm
+    from stage_service.records.tokens import Tokens
+    from stage_service.viewer import Viewed, Viewing
+
+    model = Model(args.model)
+    if not model.has("strands.npz"):
+        raise BadArgument(
+            f"{args.model} has no strands.npz: name a model folder, as 'hairstage reconstruct' or "
+            "'hairstage demo' makes it"
+        )
+    capture = None if args.capture is None else Capture(args.capture)
+    truth = None if args.truth is None else read_strands(args.truth)
+    name = args.model.resolve().name
+    viewing = Viewing(lambda: [name], lambda _: Viewed(model, capture, truth))
+    viewing.get(name).about()  # read now: the browser then waits for nothing
+    key = secrets.token_urlsafe(24)
+
+    def ready(url: str) -> None:
+        address = f"{url}/view#model={name}&token={key}"
+        output.result({"url": address, "model": str(args.model)}, f"{address}\n(Ctrl-C ends it)")
+
+    exit_on_sigterm()
+    access = Access(Tokens(args.model / "none", key))  # a key for this run alone
+    serve_viewer(viewing, access, args.port, ready)

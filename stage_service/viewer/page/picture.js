@@ -1,0 +1,218 @@
+// What is drawn: head, strands, cameras; once while things move, as a mean of many when they rest.
+
+import { Film, Program, buffer } from "./gl.js";
+import * as shaders from "./shaders.js";
+
+export const MODES = { direction: 0, confidence: 1, root: 2, length: 3, lit: 4 };
+const SAMPLES = 48;
+const BATCH_MS = 40;  // what a batch of strands is to take
+const NO_SLICE = [0, 0, 0, 1];
+
+export class Picture {
+  constructor(gl, canvas) {
+    Object.assign(this, { gl, canvas, sets: {}, head: null, wires: null, lighting: null });
+    this.state = {
+      mode: "direction", show: "model", slice: null, opacity: 1, head: true, wires: false,
+      exposure: 1, width: 1, quality: 1, camera: null,
+    };
+    const plain = (lighting) => new Program(
+      gl, shaders.STRAND_VERTEX(lighting), shaders.STRAND_FRAGMENT);
+    this.plain = plain(shaders.UNLIT);
+    this.skin = new Program(gl, shaders.HEAD_VERTEX(""), shaders.HEAD_FRAGMENT(shaders.UNLIT_HEAD));
+    this.wire = new Program(gl, shaders.WIRE_VERTEX, shaders.WIRE_FRAGMENT);
+    this.copy = new Program(gl, shaders.SCREEN_VERTEX, shaders.COPY_FRAGMENT);
+    this.show = new Program(gl, shaders.SCREEN_VERTEX, shaders.SHOW_FRAGMENT);
+    this.film = new Film(gl, gl.RGBA16F, true);
+    this.mean = new Film(gl, gl.RGBA32F, false);
+    this.empty = gl.createVertexArray();
+    this.samples = 0;
+    this.frames = 0;
+    this.batch = 1000;
+  }
+
+  // The programs for light: compiled when it is first wanted.
+  setLighting(lighting) {
+    if (!this.litStrands) {
+      this.litStrands = new Program(
+        this.gl, shaders.STRAND_VERTEX(lighting.strands), shaders.STRAND_FRAGMENT);
+      this.litSkin = new Program(
+        this.gl, shaders.HEAD_VERTEX(""), shaders.HEAD_FRAGMENT(lighting.skin));
+    }
+    this.lighting = lighting;
+  }
+
+  setWires(lines) {
+    const gl = this.gl;
+    this.wires = { count: lines.length / 6, array: gl.createVertexArray() };
+    gl.bindVertexArray(this.wires.array);
+    buffer(gl, gl.ARRAY_BUFFER, new Float32Array(lines));
+    for (const i of [0, 1]) {
+      gl.enableVertexAttribArray(i);
+      gl.vertexAttribPointer(i, 3, gl.FLOAT, false, 24, 12 * i);
+    }
+    gl.bindVertexArray(null);
+  }
+
+  // Draw one frame in motion: lines of a pixel, straight to the page.
+  moving(view) {
+    this.samples = 0;
+    this.sample = null;
+    this.frames++;
+    for (const _ of this.scene(view, { linear: 0, ribbon: 0, shift: [0, 0], film: null }));
+    this.mark();
+  }
+
+  // A part of one sample more of the picture at rest; false when there are enough.
+  resting(view) {
+    if (this.samples >= SAMPLES) return false;
+    this.sample ??= this.oneSample(view);
+    if (this.sample.next().done) this.sample = null;
+    this.mark();
+    return true;
+  }
+
+  *oneSample(view) {
+    const gl = this.gl, { width, height } = this.canvas, number = this.samples + 1;
+    const shift = [radical(number, 2) - 0.5, radical(number, 3) - 0.5];
+    const film = this.film.sized(width, height).frame;
+    yield* this.scene(view, { linear: 1, ribbon: this.state.width, shift, film });
+    this.samples = number;
+    gl.disable(gl.DEPTH_TEST);
+    gl.bindVertexArray(this.empty);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.mean.sized(width, height).frame);
+    gl.viewport(0, 0, width, height);
+    gl.enable(gl.BLEND);
+    gl.blendColor(0, 0, 0, 1 / number);
+    gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
+    this.copy.use({ uPicture: this.film.colour });
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.BLEND);
+    if (number >= 4 || number === SAMPLES) this.showMean();
+  }
+
+  showMean() {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.bindVertexArray(this.empty);
+    this.show.use({ uPicture: this.mean.colour, uExposure: this.exposure() });
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // The card works behind our back: nothing more is asked of it until it is `ready`.
+  mark() {
+    const gl = this.gl;
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.asked = performance.now();
+    gl.flush();
+  }
+
+  // Whether what was asked last is done; `took` is how long that was, in milliseconds.
+  ready() {
+    const gl = this.gl;
+    if (!this.fence) return true;
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost())
+      return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    this.took = performance.now() - this.asked;
+    if (this.sample) {
+      const better = this.batch * Math.min(2, Math.max(0.5, BATCH_MS / Math.max(this.took, 1)));
+      this.batch = Math.max(200, Math.min(1e6, Math.round(better)));
+    }
+    return true;
+  }
+
+  exposure() { return this.state.mode === "lit" ? this.state.exposure : 1; }
+
+  // The mean picture as it was added up: linear radiance and coverage, rows from the bottom.
+  radiance() {
+    const gl = this.gl, { width, height } = this.canvas;
+    const out = new Float32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.mean.frame);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, out);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return out;
+  }
+
+  *scene(view, how) {
+    const gl = this.gl, { width, height } = this.canvas, { state } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, how.film);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const half = Math.floor(width / 2);
+    const parts = state.show === "beside" ? [["model", 0, half], ["truth", half, width - half]]
+      : [[state.show, 0, width]];
+    for (const [what, left, wide] of parts) {
+      const begin = () => {
+        gl.bindFramebuffer(gl.FRAMEBUFFER, how.film);
+        gl.viewport(left, 0, wide, height);
+        gl.enable(gl.DEPTH_TEST);
+      };
+      const camera = view(wide, height), common = this.common(camera, how);
+      begin();
+      if (this.head && state.head) {
+        const lit = this.lit();
+        (lit ? this.litSkin : this.skin).use({ ...common, ...(lit ? this.lighting.uniforms() : {}) });
+        this.head.draw();
+      }
+      for (const name of what === "over" ? ["model", "truth"] : [what])
+        yield* this.strands(name, what === "over", { ...common, uFocal: camera.K[0][0] }, how, begin);
+      if (this.wires && state.wires) {
+        begin();
+        this.wire.use(common);
+        gl.bindVertexArray(this.wires.array);
+        gl.drawArrays(gl.LINES, 0, this.wires.count);
+      }
+    }
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  common(camera, how) {
+    const { state, box } = this;
+    const away = Math.hypot(...camera.eye.map((x, i) => x - box.middle[i]));
+    const near = Math.max(0.02 * box.reach, away - 2.2 * box.reach), far = away + 2.2 * box.reach;
+    return {
+      uMatrix: camera.matrix(near, state.wires ? Math.max(far, 2 * away + 4) : far, how.shift),
+      uEye: camera.eye, uLinear: how.linear, uExposure: this.exposure(),
+      uSlice: state.slice ?? NO_SLICE, uMode: MODES[state.mode],
+    };
+  }
+
+  lit() { return this.state.mode === "lit" && this.lighting; }
+
+  // At rest all strands, a batch at a time; in motion as many as go quickly, at once.
+  *strands(name, flat, common, how, begin) {
+    const gl = this.gl, hair = this.sets[name], { state } = this;
+    if (!hair) return;
+    const lit = this.lit() && name === "model" && !flat;
+    const quality = how.film ? 1 : state.quality;
+    const skip = quality < 1 ? 2 : 1, all = Math.ceil(hair.here * quality);
+    for (let first = 0; first < all;) {
+      const count = how.film ? Math.min(this.batch, all - first) : all;
+      begin();
+      gl.bindVertexArray(this.empty);
+      if (state.opacity < 1) {
+        gl.enable(gl.BLEND);
+        gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      }
+      (lit ? this.litStrands : this.plain).use({
+        ...common, ...hair.uniforms(), uRibbon: how.ribbon, uSkip: skip, uFirst: first, uLeast: 0,
+        uOpacity: state.opacity, ...(lit ? this.lighting.uniforms() : {}),
+        ...(flat ? { uMode: 5, uFlat: name === "truth" ? [0.25, 0.75, 1] : [1, 0.55, 0.15] } : {}),
+        ...(this.lit() && !lit && !flat ? { uMode: 0 } : {}),
+      });
+      hair.draw(how.ribbon, skip, count);
+      gl.disable(gl.BLEND);
+      first += count;
+      if (first < all) yield;
+    }
+  }
+}
+
+function radical(i, base) {  // van der Corput: well spread in [0, 1)
+  let out = 0;
+  for (let f = 1 / base; i > 0; i = Math.floor(i / base), f /= base) out += f * (i % base);
+  return out;
+}

@@ -1,0 +1,151 @@
+// The shaders. Radiance is linear until the last pass; places are in metres.
+
+const HEAD = `#version 300 es
+precision highp float; precision highp int;
+precision highp sampler2D; precision highp sampler3D; precision highp usampler2D;
+`;
+
+export const STRAND_VERTEX = (lighting) => HEAD + `
+uniform usampler2D uPoints;
+uniform sampler2D uStrand;
+uniform sampler2D uLevel;
+uniform vec3 uLow, uEye, uFlat;
+uniform float uStep, uLongest, uFocal, uLeast, uRibbon;
+uniform int uCount, uPerRow, uSkip, uFirst, uMode;
+uniform mat4 uMatrix;
+out vec3 vColour, vPlace;
+${lighting}
+ivec2 texel(int strand, int k) {
+  return ivec2((strand % uPerRow) * uCount + k, strand / uPerRow);
+}
+vec3 place(int strand, int k) { return uLow + uStep * vec3(texelFetch(uPoints, texel(strand, k), 0).xyz); }
+vec3 ramp(float x) {  // dark blue, teal, yellow: lightness grows with x
+  x = clamp(x, 0.0, 1.0);
+  vec3 c = mix(vec3(0.27, 0.0, 0.33), vec3(0.13, 0.57, 0.55), min(2.0 * x, 1.0));
+  return mix(c, vec3(0.99, 0.91, 0.14), max(2.0 * x - 1.0, 0.0));
+}
+vec3 hue(vec3 d) {
+  float a = atan(d.y, d.x);
+  vec3 c = 0.5 + 0.5 * cos(a + vec3(0.0, -2.094, 2.094));
+  return mix(c, vec3(1.0), 0.35 * clamp(d.z, 0.0, 1.0)) * (0.75 + 0.25 * d.z);
+}
+void main() {
+  int strand = uFirst + gl_InstanceID;
+  int k = min((uRibbon > 0.0 ? gl_VertexID / 2 : gl_VertexID) * uSkip, uCount - 1);
+  vec3 p = place(strand, k);
+  vec3 t = place(strand, min(k + 1, uCount - 1)) - place(strand, max(k - 1, 0));
+  t /= max(length(t), 1e-9);
+  vec2 own = texelFetch(uStrand, ivec2(strand % uPerRow, strand / uPerRow), 0).xy;
+  vec3 view = uEye - p;
+  float depth = length(view);
+  view /= depth;
+  vec3 q = p;
+  if (uRibbon > 0.0) {
+    vec3 side = cross(t, view);
+    float wide = length(side);
+    side = wide > 1e-4 ? side / wide : vec3(0.0);
+    float r = max(own.y * uRibbon, 0.5 * uLeast * depth / uFocal);
+    q += side * (gl_VertexID % 2 == 0 ? r : -r);
+  }
+  vec3 c = vec3(1.0);
+  if (uMode == 0) c = 0.5 + 0.5 * t;
+  else if (uMode == 1) c = ramp(texelFetch(uLevel, texel(strand, k), 0).x);
+  else if (uMode == 2) c = hue(normalize(place(strand, 0) - uLow - 32767.0 * uStep));
+  else if (uMode == 3) c = ramp(own.x / uLongest);
+  else if (uMode == 5) c = uFlat;
+  if (uMode == 4) c = lit(p, t, view, strand, texel(strand, k));
+  else c = pow(c, vec3(2.2)) * (0.35 + 0.65 * length(cross(t, view)));
+  vColour = c;
+  vPlace = p;
+  gl_Position = uMatrix * vec4(q, 1.0);
+}`;
+
+export const UNLIT = `
+vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) { return vec3(0.0); }`;
+
+const SHOWN = `
+uniform float uExposure;
+uniform int uLinear;
+vec3 shown(vec3 c) {
+  c = clamp(c * uExposure, 0.0, 1.0);
+  return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
+}
+`;
+
+export const STRAND_FRAGMENT = HEAD + SHOWN + `
+in vec3 vColour, vPlace;
+uniform vec4 uSlice;
+uniform float uOpacity;
+out vec4 oColour;
+void main() {
+  if (dot(uSlice.xyz, vPlace) > uSlice.w) discard;
+  vec3 c = uLinear == 1 ? vColour : shown(vColour);
+  oColour = vec4(c * uOpacity, uOpacity);
+}`;
+
+export const HEAD_VERTEX = (lighting) => HEAD + `
+layout(location = 0) in vec3 aPlace;
+layout(location = 1) in vec4 aSeen0;
+layout(location = 2) in vec4 aSeen1;
+uniform mat4 uMatrix;
+out vec3 vPlace;
+out vec4 vSeen0, vSeen1;
+void main() {
+  vPlace = aPlace; vSeen0 = aSeen0; vSeen1 = aSeen1;
+  gl_Position = uMatrix * vec4(aPlace, 1.0);
+}`;
+
+export const HEAD_FRAGMENT = (lighting) => HEAD + SHOWN + `
+in vec3 vPlace;
+in vec4 vSeen0, vSeen1;
+uniform vec3 uEye;
+uniform vec4 uSlice;
+uniform int uMode;
+out vec4 oColour;
+${lighting}
+void main() {
+  if (dot(uSlice.xyz, vPlace) > uSlice.w) discard;
+  vec3 n = normalize(cross(dFdx(vPlace), dFdy(vPlace)));
+  vec3 view = normalize(uEye - vPlace);
+  if (dot(n, view) < 0.0) n = -n;
+  vec3 c = vec3(0.11, 0.105, 0.1) * (0.25 + 0.75 * dot(n, view));
+  if (uMode == 4) c = skin(vPlace, n, vSeen0, vSeen1);
+  oColour = vec4(uLinear == 1 ? c : shown(c), 1.0);
+}`;
+
+export const UNLIT_HEAD = `
+vec3 skin(vec3 p, vec3 n, vec4 a, vec4 b) { return vec3(0.0); }`;
+
+export const WIRE_VERTEX = HEAD + `
+layout(location = 0) in vec3 aPlace;
+layout(location = 1) in vec3 aColour;
+uniform mat4 uMatrix;
+out vec3 vColour;
+void main() { vColour = aColour; gl_Position = uMatrix * vec4(aPlace, 1.0); gl_PointSize = 5.0; }`;
+
+export const WIRE_FRAGMENT = HEAD + `
+in vec3 vColour;
+out vec4 oColour;
+void main() { oColour = vec4(vColour, 1.0); }`;
+
+export const SCREEN_VERTEX = HEAD + `
+out vec2 vAt;
+void main() {
+  vAt = vec2(gl_VertexID % 2, gl_VertexID / 2) * 2.0;
+  gl_Position = vec4(2.0 * vAt - 1.0, 0.0, 1.0);
+}`;
+
+export const COPY_FRAGMENT = HEAD + `
+uniform sampler2D uPicture;
+in vec2 vAt;
+out vec4 oColour;
+void main() { oColour = texture(uPicture, vAt); }`;
+
+export const SHOW_FRAGMENT = HEAD + SHOWN + `
+uniform sampler2D uPicture;
+in vec2 vAt;
+out vec4 oColour;
+void main() {
+  vec4 c = texture(uPicture, vAt);
+  oColour = vec4(shown(c.rgb), c.a);
+}`;

@@ -1,0 +1,198 @@
+// The page: loads a model coarse to fine, turns it under the hand, and shows what there is.
+
+import { context } from "./gl.js";
+import { Hair, Head } from "./hair.js";
+import * as net from "./net.js";
+import { Controls } from "./controls.js";
+import { Picture } from "./picture.js";
+import { Orbit, Pinhole } from "./space.js";
+
+const $ = (id) => document.getElementById(id);
+const SLOW_MS = 70, FAST_MS = 25;  // fewer strands while a frame takes longer, more when shorter
+
+class Viewer {
+  constructor(about) {
+    this.about = about;
+    this.canvas = $("canvas");
+    this.gl = context(this.canvas);
+    this.picture = new Picture(this.gl, this.canvas);
+    const { low, high } = about.strands.model;
+    this.orbit = new Orbit(low, high);
+    this.picture.box = { middle: [...this.orbit.target], reach: Math.max(this.orbit.reach, 0.2) };
+    this.busy = 0;
+    this.moved = true;
+    this.marks = {};
+    new ResizeObserver(() => this.resize()).observe($("stage"));
+    this.resize();
+    this.hands();
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  resize() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const { clientWidth, clientHeight } = $("stage");
+    this.canvas.width = Math.max(1, Math.round(clientWidth * ratio));
+    this.canvas.height = Math.max(1, Math.round(clientHeight * ratio));
+    this.ratio = ratio;
+    this.draw();
+  }
+
+  // Something changed: the next frame is drawn anew.
+  draw() { this.moved = true; }
+
+  view = (width, height) => {
+    const through = this.picture.state.camera;
+    return through ? new Pinhole(through).fitted(width, height) : this.orbit.pinhole(width, height);
+  };
+
+  frame(now) {
+    requestAnimationFrame((t) => this.frame(t));
+    const { picture } = this;
+    if (!picture.ready()) return;
+    if (this.moved) {
+      if (this.turning) this.pace(picture.took);
+      this.moved = false;
+      picture.moving(this.view);
+      this.restAt = now + (this.turning ? 250 : 60);
+    } else if (now > this.restAt && !this.turning && this.complete) picture.resting(this.view);
+  }
+
+  pace(took) {
+    const { state } = this.picture;
+    if (took > SLOW_MS) state.quality = Math.max(0.1, state.quality * 0.8);
+    else if (took < FAST_MS) state.quality = Math.min(1, state.quality * 1.1);
+  }
+
+  status(text) {
+    if (text !== undefined) this.said = text;
+    const { model } = this.picture.sets;
+    const here = model && model.here < model.count
+      ? `${model.here.toLocaleString("en")} of ${model.count.toLocaleString("en")} strands` : "";
+    $("status").textContent = [here, this.said].filter(Boolean).join(" · ");
+  }
+
+  hands() {
+    const { canvas, orbit } = this;
+    const fingers = new Map();
+    let spread = 0;
+    canvas.addEventListener("pointerdown", (e) => {
+      canvas.setPointerCapture(e.pointerId);
+      fingers.set(e.pointerId, [e.clientX, e.clientY]);
+      this.pressed = [e.clientX, e.clientY];
+      this.turning = true;
+    });
+    canvas.addEventListener("pointermove", (e) => {
+      const before = fingers.get(e.pointerId);
+      if (!before) return;
+      const dx = e.clientX - before[0], dy = e.clientY - before[1];
+      fingers.set(e.pointerId, [e.clientX, e.clientY]);
+      const places = [...fingers.values()];
+      if (places.length === 2) {
+        const now = Math.hypot(places[0][0] - places[1][0], places[0][1] - places[1][1]);
+        if (spread) orbit.zoom(spread / now);
+        spread = now;
+        orbit.shift(dx / 2, dy / 2, canvas.clientHeight);
+      } else if (this.picture.state.camera) this.leave?.();
+      else if (e.shiftKey || e.buttons & 6) orbit.shift(dx, dy, canvas.clientHeight);
+      else orbit.turn(dx * 0.4, dy * 0.4);
+      this.draw();
+    });
+    const up = (e) => {
+      fingers.delete(e.pointerId);
+      spread = 0;
+      this.turning = fingers.size > 0;
+      const [x, y] = this.pressed ?? [0, 0];
+      if (e.type === "pointerup" && Math.hypot(e.clientX - x, e.clientY - y) < 4) this.click?.(e);
+    };
+    canvas.addEventListener("pointerup", up);
+    canvas.addEventListener("pointercancel", up);
+    canvas.addEventListener("contextmenu", (e) => e.preventDefault());
+    canvas.addEventListener("wheel", (e) => {
+      e.preventDefault();
+      orbit.zoom(Math.exp(0.0012 * e.deltaY));
+      this.draw();
+    }, { passive: false });
+    canvas.addEventListener("keydown", (e) => {
+      const step = e.shiftKey ? 15 : 5;
+      const turns = {
+        ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
+      if (turns[e.key]) orbit.turn(...turns[e.key]);
+      else if (e.key === "+" || e.key === "=") orbit.zoom(0.9);
+      else if (e.key === "-") orbit.zoom(1 / 0.9);
+      else return;
+      e.preventDefault();
+      this.draw();
+    });
+  }
+
+  async load() {
+    const { about, gl, picture } = this, began = performance.now();
+    const loading = Object.entries(about.strands).map(([name, told]) => {
+      const hair = picture.sets[name] = new Hair(gl, name, told);
+      return () => hair.load(() => {
+        if (name === "model") this.marks.first ??= performance.now() - began;
+        this.status();
+        this.draw();
+      });
+    });
+    await loading[0]();
+    if (about.head) picture.head = await Head.load(gl);
+    this.draw();
+    for (const load of loading.slice(1)) await load();
+    this.marks.all = performance.now() - began;
+    this.complete = true;
+    this.status();
+  }
+}
+
+async function begin() {
+  try {
+    if (!net.model) return await choose();
+    const about = await net.json(net.ofModel(""));
+    document.title = `${about.name} · hairstage`;
+    const viewer = window.viewer = new Viewer(about);
+    new Controls($("panel"), viewer);
+    await viewer.load();
+  } catch (error) {
+    if (error instanceof net.Refused) return askForToken(error.message);
+    $("status").textContent = error.message;
+    $("status").className = "wrong";
+  }
+}
+
+async function choose() {
+  const names = await net.json("/view/models"), panel = $("panel");
+  panel.replaceChildren(Object.assign(document.createElement("h1"), { textContent: "Models" }));
+  for (const name of names) {
+    const link = Object.assign(document.createElement("a"),
+      { textContent: name, href: `/view?model=${encodeURIComponent(name)}` });
+    const line = document.createElement("p");
+    line.append(link);
+    panel.append(line);
+  }
+  if (!names.length) $("status").textContent = "There is no model yet.";
+}
+
+function askForToken(why) {
+  const form = document.createElement("form");
+  const field = Object.assign(document.createElement("input"),
+    { type: "password", name: "token", autocomplete: "current-password" });
+  field.setAttribute("aria-label", "token");
+  form.append(
+    Object.assign(document.createElement("h1"), { textContent: "A token is needed" }),
+    Object.assign(document.createElement("p"),
+      { textContent: "Yours is printed by: hairstage token show" }), field,
+    Object.assign(document.createElement("button"), { textContent: "Look" }));
+  form.addEventListener("submit", async (e) => {
+    e.preventDefault();
+    try {
+      await net.login(field.value.trim());
+      location.reload();
+    } catch (error) { $("status").textContent = error.message; }
+  });
+  $("panel").replaceChildren(form);
+  $("status").textContent = why;
+  field.focus();
+}
+
+begin();

@@ -1,0 +1,84 @@
+"""What the viewer's page asks: strands, head, confidence; and who may ask."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reconstruction import Model
+from reconstruction.light_planes.point_cloud import PointCloud
+from stage_service.viewer.packing import PackedStrands
+
+STRANDS = "/view/models/bristles/strands/model"
+
+
+def test_strands_come_back_in_metres(http, model):
+    told = http.get("/view/models/bristles").json()["strands"]["model"]
+    n = told["points"]
+    data = http.get(STRANDS, params={"count": told["count"]}).content
+    packed = np.frombuffer(data, "<u2", told["count"] * n * 3).reshape(-1, n, 3)
+    places = np.array(told["low"]) + told["step"] * packed
+    strands = model.strands()
+    ends = strands.points[strands.offsets[1:] - 1]
+    nearest = np.linalg.norm(places[:, -1][:, None] - ends[None], axis=-1).min(axis=0)
+    assert len(packed) == len(strands)
+    assert nearest.max() < 1e-5
+    np.testing.assert_allclose(np.linalg.norm(places[:, 0], axis=1), 0.08, atol=1e-5)
+
+
+def test_truth_head_and_what_is_not_there(http):
+    assert len(http.get("/view/models/bristles/strands/truth").content) > 0
+    vertices, faces = np.frombuffer(http.get("/view/models/bristles/head").content[:8], "<u4")
+    assert (vertices, faces) == (288, 506)
+    for absent in (
+        "/view/models/other",
+        "/view/models/bristles/strands/x",
+    ):
+        assert http.get(absent).status_code == 404
+    assert "not made from a sweep" in http.get("/view/models/bristles/confidence").json()["detail"]
+
+
+def test_without_the_key_the_page_comes_and_the_model_does_not(http):
+    nobody = {"Authorization": ""}
+    assert http.get("/view", headers=nobody).status_code == 200
+    script = http.get("/view/page/viewer.js", headers=nobody)
+    assert script.status_code == 200
+    assert "javascript" in script.headers["content-type"]
+    assert http.get("/view/page/../../../etc/passwd", headers=nobody).status_code in (401, 404)
+    assert http.get(STRANDS, headers=nobody).status_code == 401
+    assert http.get("/view/models", headers=nobody).status_code == 401
+
+
+def test_the_page_asks_no_other_host(http):
+    policy = http.get("/view").headers["content-security-policy"]
+    assert "default-src 'self'" in policy
+    assert "http" not in policy
+
+
+def test_confidence_is_the_distance_to_measured_points(http, model: Model):
+    """Points are measured along one strand alone: full there, none elsewhere."""
+    strands = model.strands()
+    along = strands[7].astype(float)
+    points = along[0] + (along[-1] - along[0]) * np.linspace(0, 1, 200)[:, None]
+    n = len(points)
+    ones, zeros = np.ones(n), np.zeros(n)
+    cloud = PointCloud(
+        *(points, np.tile(np.eye(3) * 1e-8, (n, 1, 1)), np.tile([0.0, 0, 1], (n, 1))),
+        *(np.zeros((n, 2)), zeros, zeros, zeros, zeros, ones, ones, ("a",), ("b",)),
+    )
+    model.write_points(cloud)
+    told = http.get("/view/models/bristles").json()["strands"]["model"]
+    level = np.frombuffer(http.get("/view/models/bristles/confidence").content, np.uint8)
+    level = level.reshape(-1, told["points"])
+    order = PackedStrands.of(strands).order
+    own = level[np.flatnonzero(order == 7)[0]]
+    assert own.min() >= 240
+    tips = strands.points[strands.offsets[1:] - 1].astype(float)
+    far = np.linalg.norm(tips - along[-1], axis=1) > 0.02
+    assert level[far[order], -1].max() == 0
+
+
+@pytest.mark.parametrize("path", ["index.html", "../viewed.py", "style.css"])
+def test_only_parts_of_the_page_are_given(http, path):
+    wanted = 404 if ".." in path else 200
+    assert http.get(f"/view/page/{path}").status_code == wanted
