@@ -17,6 +17,9 @@ from reconstruction import Camera
 from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import undistorted
 
+_SQUARE = 1e-3
+"""Cosine between two axes of a shading frame from which on it is no frame."""
+
 
 def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
     """Mitsuba rays through the image points `u`, `v` (Dr.Jit floats), in scene units.
@@ -41,8 +44,22 @@ class Surface:
     scene: HairScene
 
     def interact(self, ray: Any, active: Any) -> Any:
-        """The first `SurfaceInteraction3f` along `ray`."""
-        return self.scene.mi_scene.ray_intersect(ray, active)
+        """The first `SurfaceInteraction3f` along `ray`.
+
+        Around a fibre exactly along z Mitsuba's `dp_du` points along the normal here and there, and
+        the shading frame made of it is none: such a frame is made of `dp_dv` instead.
+        """
+        si = self.scene.mi_scene.ray_intersect(ray, active)
+        if self.scene.hair_shape is None:
+            return si
+        frame = si.sh_frame
+        broken = self.is_hair(si) & (dr.abs(dr.dot(frame.n, frame.s)) > _SQUARE)
+        across = dr.normalize(dr.cross(si.dp_dv, frame.n))
+        frame.s = dr.select(broken, across, frame.s)
+        frame.t = dr.select(broken, dr.cross(frame.n, across), frame.t)
+        si.sh_frame = frame
+        si.wi = dr.select(broken, si.to_local(-ray.d), si.wi)
+        return si
 
     def is_hair(self, si: Any) -> Any:
         """Whether `si` lies on a fibre."""

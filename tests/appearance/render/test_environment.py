@@ -1,13 +1,18 @@
 """Environment maps: absolute radiance, orientation, readers."""
 
 import cv2
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from appearance import HairAppearance, Sampling, build_scene, render_environment
+from appearance.render.coverage import covered_pixels
 from appearance.render.environment import _along_curve, direct_environment
 from appearance.render.environment_maps import load_environment, sky, studio
-from reconstruction import Camera, write_exr
+from appearance.render.paths import Surface, camera_rays
+from reconstruction import Camera, Strands, write_exr
+from reconstruction.array_backend import for_kernels
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 ALBEDO = (0.5, 0.25, 0.8)
@@ -161,3 +166,31 @@ def test_files_that_are_no_maps_are_named(tmp_path):
     write_exr(tmp_path / "negative.exr", np.full((4, 8, 3), -1.0))
     with pytest.raises(ValueError, match=r"negative\.exr: radiance must be finite"):
         load_environment(tmp_path / "negative.exr")
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_white_fibre_returns_a_white_sky_whichever_way_it_runs(axis):
+    """At some 500 hits, over 1,024 directions evenly around: fibres off the middle run along an
+    axis but for rounding, where Mitsuba's shading frames are none."""
+    points = np.zeros((5, 9, 3))
+    points[:, :, axis] = np.linspace(-0.1, 0.1, 9)
+    points[:, :, (axis + 1) % 3] = 0.02 * np.arange(-2, 3)[:, None]
+    white = HairAppearance((0, 0, 0), 0.5, 0.5, tilt_deg=2)
+    scene = build_scene(Strands.from_list(list(points), radius=2e-3), None, hair=white)
+    surface, directions = Surface(scene), 1024
+    camera = Camera.look_at("cam", 96, 96, (-0.6, -0.5, 0.4), (0, 0, 0), 8)
+    seen = covered_pixels(scene, camera)
+    lane = dr.arange(mi.UInt32, len(seen) * directions)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(for_kernels(seen, np.uint32)), lane // directions)
+    row, column = pixel // 96, pixel % 96
+    ray = camera_rays(camera, mi.Float(column) + 0.5, mi.Float(row) + 0.5)
+    si = surface.interact(ray, mi.Bool(True))
+    number = mi.Float(lane % directions)  # a spiral from pole to pole
+    z, turn = 1 - (2 * number + 1) / directions, number * float(np.pi * (3 - np.sqrt(5)))
+    flat = dr.sqrt(1 - z * z)
+    world = mi.Vector3f(flat * dr.cos(turn), flat * dr.sin(turn), z)
+    value = surface.eval(si, si.to_local(world), si.is_valid())
+    met = np.array(si.is_valid()).reshape(len(seen), directions)[:, 0]
+    integral = 4 * np.pi * np.array(value.x).reshape(len(seen), directions)[met].mean(1)
+    assert met.sum() > 400
+    assert integral == pytest.approx(1, abs=0.01)
