@@ -4,6 +4,8 @@ sensor counts it."""
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
+import importlib.util
 import json
 import os
 from collections import OrderedDict
@@ -20,6 +22,9 @@ from reconstruction import Rig
 from reconstruction.arrays import AnyFloats, Array, Floats
 from simulators.frames.responses import Responder, Response
 from simulators.peers.projector_controller import Show
+
+RENDERER = ("appearance", "reconstruction", "simulators")
+"""The packages whose code a response depends on."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +163,36 @@ class FrameMaker:
 
 
 def cache_key(*parts: Any) -> str:
-    """One text for everything that responses depend on; the parts must be ready for JSON."""
-    return json.dumps(parts, sort_keys=True)
+    """One text for everything that responses depend on; the parts must be ready for JSON.
+
+    The renderer is named in it by its source and the versions of what it stands on: responses that
+    an older one made are not taken for this one's.
+    """
+    return json.dumps([*parts, renderer_digest()], sort_keys=True)
+
+
+def _folder(package: str) -> Path:
+    """Where a package lies; it is not imported, which would cost the wires' process memory."""
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        raise ValueError(f"the package {package} has no folder")
+    return Path(spec.origin).parent
+
+
+def renderer_digest(source: Callable[[str], Path] = _folder) -> str:
+    """A digest of all that renders: three packages' source, Mitsuba, Dr.Jit, NumPy and SciPy.
+
+    `source` finds a package's folder.
+    """
+    digest = hashlib.sha256()
+    for name in RENDERER:
+        folder = source(name)
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(f"{name} {file.relative_to(folder).as_posix()}\0".encode())
+            digest.update(file.read_bytes())
+    for library in ("mitsuba", "drjit", "numpy", "scipy"):
+        digest.update(f"{library} {importlib.metadata.version(library)}".encode())
+    return digest.hexdigest()
 
 
 def _store(file: Path, response: Response) -> None:
