@@ -69,6 +69,7 @@ def reconstruct(
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
     stages = _Stages(model.create(), options, progress, Report())
+    stages.imported(capture)
     whole = stages.undistorted(capture)
     capture = _without(whole, options.held_out)
     head = stages.known_head(capture)
@@ -111,6 +112,14 @@ class _Stages:
     options: ReconstructOptions
     progress: Progress
     report: Report
+
+    def imported(self, capture: Capture) -> None:
+        """What the import of a capture made elsewhere had to say."""
+        if notes := capture.plan.get("import"):
+            with self.report.stage("import") as stage:
+                stage.figures["relative_units"] = bool(notes["relative"])
+                for note in notes["notes"]:
+                    stage.warn(note)
 
     def undistorted(self, capture: Capture) -> Capture:
         """The capture through pinholes; "lenses" says how much of each picture is left."""

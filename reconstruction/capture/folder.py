@@ -7,6 +7,7 @@ capture/
                   compresses the capture holds its lock
   frames/00012/cam_00.exr    (cam_00.zip.exr once compressed)
   masks/cam_00.png    hair masks from the user, optional
+  subjects/cam_00.png masks of hair, head and body, optional
   head.obj            the digitised head, optional
   manifest.json   written last: state, outcome, counts, checksums of the small files and of the
                   journal, whose lines hold the frames' checksums
@@ -340,7 +341,14 @@ class Capture:
 
     def mask(self, camera: str) -> Bools | None:
         """The user's hair mask `(H, W)` (half grey and above), or None when there is none."""
-        path = self._own(f"masks/{camera}.png")
+        return self._given("masks", camera)
+
+    def subject(self, camera: str) -> Bools | None:
+        """Where `(H, W)` hair, head and body are, or None where nobody has said it."""
+        return self._given("subjects", camera)
+
+    def _given(self, folder: str, camera: str) -> Bools | None:
+        path = self._own(f"{folder}/{camera}.png")
         if not path.is_file():
             return None
         return self.mask_in_view(camera, read_mask(path, self._shape_as_shot(camera)))

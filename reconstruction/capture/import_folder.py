@@ -3,8 +3,11 @@
 folder/
   cameras.json      {"cameras": [{"id", "width", "height", "K", "R", "t"}, ...]}
   lights.json       {"lights": [{"id", "position", "intensity", "colocated_camera"}, ...]}
-  images/<camera>/<light>.exr    radiance under that light alone, W/(sr m²)
+  projectors.json   {"projectors": [...]} as in a capture's rig.json, where rows were swept
+  import.toml       where the pictures lie and what their numbers mean (`ImportSettings`), optional
+  images/<camera>/<light>.*      the picture under that light alone, where import.toml says nothing
   masks/<camera>.png             hair masks, optional
+  subjects/<camera>.png          masks of hair, head and body, optional
   head.obj                       the head's mesh in the same frame, optional
 
 Conventions are those of `Camera` and `Light`: OpenCV, metres, pixel centres at integers, W/sr. An
@@ -14,33 +17,40 @@ Conventions are those of `Camera` and `Light`: OpenCV, metres, pixel centres at 
 
 from __future__ import annotations
 
-import json
 import shutil
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from reconstruction.arrays import Floats
-from reconstruction.capture.folder import Capture, CaptureError, Step
+from reconstruction.arrays import Bools, Floats
+from reconstruction.capture.exposures import Merged, Unchanged, flattened, merge
+from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.import_geometry import Geometry
+from reconstruction.capture.import_settings import (
+    SETTINGS,
+    Bracket,
+    Found,
+    ImportProblem,
+    ImportSettings,
+    find,
+    read_settings,
+)
+from reconstruction.capture.import_tables import cameras_of, lights_of, projectors_of
 from reconstruction.capture.writer import CaptureWriter
-from reconstruction.containment import is_file_name
-from reconstruction.files.exr import read_exr
+from reconstruction.files.pictures import PictureError, picture_size, read_picture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
-from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.placement import resized
+from reconstruction.geometry.placement import PlacementError, resized
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
-
-
-class ImportProblem(CaptureError):
-    """A folder that cannot be imported; the message names the file and the field."""
 
 
 def import_folder(
@@ -48,193 +58,244 @@ def import_folder(
     out: str | Path,
     progress: Progress = silent,
     geometry: Geometry | None = None,
+    settings: ImportSettings | None = None,
 ) -> Capture:
     """Turn `folder` (see the module's docstring) into the capture `out`, a new or empty folder.
 
-    `geometry` stands for the folder's cameras.json, and for lights.json where it has lights;
-    pictures through lenses that a rig cannot hold are resampled. The capture's plan is one OLAT
-    step per light, at level 1 and an exposure of 1 s. All files are looked for before anything is
-    written; nothing is left behind when one is broken.
-
-    Raises `ImportProblem` naming the file and field that are wrong or missing.
+    As `Import.of(folder, geometry, settings).write(out)`. Raises `ImportProblem`.
     """
-    folder, out = Path(folder), Path(out)
-    if not folder.is_dir():
-        raise ImportProblem(f"{folder}: no such folder")
-    if geometry is None:
-        geometry = Geometry(_cameras(folder / "cameras.json"))
-    lights = geometry.lights or _lights(
-        folder / "lights.json", {id_: c.name for id_, c in geometry.cameras.items()}
-    )
-    cameras = [
-        _sized(c, folder / "images" / c.name / f"{lights[0].name}.exr")
-        for c in geometry.cameras.values()
-    ]
-    lenses = {c.name: Lens.of(c) for c in cameras if isinstance(c, LensModelCamera)}
-    kept = [lenses[c.name].undistorted if c.name in lenses else c for c in cameras]
-    rig = Rig(folder.name, tuple(kept), tuple(lights))
-    pictures = {
-        (light.name, camera.name): folder / "images" / camera.name / f"{light.name}.exr"
-        for light in rig.lights
-        for camera in rig.cameras
-    }
-    absent = [p for p in pictures.values() if not p.is_file()]
-    if absent:
-        more = f", and {len(absent) - 1} more" if len(absent) > 1 else ""
-        raise ImportProblem(f"{absent[0]}: no such file{more}; every camera needs every light")
-    masks, head = _masks(folder / "masks", cameras), _head(folder / "head.obj")
-    masks |= {n: lens.undistort_mask(masks[n]) for n, lens in lenses.items() if n in masks}
-    shot = {c.name: c for c in cameras}
-
-    steps = [Step(i, "olat", 1.0, light=light.name) for i, light in enumerate(rig.lights)]
-    plan = {"steps": steps, "imported_from": folder.name}
-    writer = CaptureWriter.create(out, rig, plan, masks=masks, head=head)
-    try:
-        for k, (step, camera) in enumerate([(s, c) for s in steps for c in rig.cameras]):
-            path = pictures[str(step.light), camera.name]
-            picture = _picture(path, shot[camera.name])
-            if camera.name in lenses:
-                picture = lenses[camera.name].undistort(picture)
-            writer.write_frame(step, camera.name, picture)
-            progress("importing pictures", (k + 1) / len(pictures))
-        writer.finish("completed", {"imported_from": folder.name})
-    except BaseException:
-        writer.close()
-        shutil.rmtree(out)
-        raise
-    return Capture(out)
+    return Import.of(Path(folder), geometry, settings).write(Path(out), progress)
 
 
-def _entries(path: Path, key: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The list of tables under `key`, and the whole document."""
-    try:
-        data = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise ImportProblem(f"{path}: no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ImportProblem(f"{path}: not JSON ({error})") from error
-    if not isinstance(data, dict) or key not in data:
-        raise ImportProblem(f"{path}: the field {key!r} is missing")
-    entries = data[key]
-    if not isinstance(entries, list) or not entries:
-        raise ImportProblem(f"{path}: {key}: expected a list with at least one entry")
-    for i, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise ImportProblem(f"{path}: {key}[{i}]: expected an object, got {entry!r}")
-    return entries, data
+def settings_of(folder: Path, file: Path | None = None) -> ImportSettings:
+    """Those of `file`, or of the folder's import.toml where it has one. Raises `ImportProblem`."""
+    own = folder / SETTINGS
+    if file is None and not own.is_file():
+        return ImportSettings()
+    return read_settings(file or own)
 
 
-def _take(entry: dict[str, Any], field: str, where: str) -> Any:
-    if field not in entry:
-        raise ImportProblem(f"{where}: the field {field!r} is missing")
-    return entry[field]
+@dataclass(frozen=True, eq=False)
+class Import:
+    """A folder as it was understood: nothing but names and sizes has been read yet.
 
+    `shot` are the cameras of the pictures, by name; `lenses` of those whose pictures are resampled,
+    as a rig cannot hold their lens; `rig` is the capture's.
+    """
 
-def _numbers(entry: dict[str, Any], field: str, shape: tuple[int, ...], where: str) -> Any:
-    """A field of finite numbers of the given shape."""
-    value = _take(entry, field, where)
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (ValueError, TypeError):
-        array = np.full(0, np.nan)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ImportProblem(f"{where}.{field}: expected {shape} finite numbers, got {value!r}")
-    return array
+    folder: Path
+    settings: ImportSettings
+    rig: Rig
+    shot: Mapping[str, Camera]
+    lenses: Mapping[str, Lens]
+    found: Found
+    head: Mesh | None
 
+    @classmethod
+    def of(
+        cls, folder: Path, geometry: Geometry | None = None, settings: ImportSettings | None = None
+    ) -> Import:
+        """Look at `folder`; `settings` stand for its import.toml.
 
-def _count(entry: dict[str, Any], field: str, where: str) -> int:
-    value = _take(entry, field, where)
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ImportProblem(f"{where}.{field}: expected a whole number above 0, got {value!r}")
-    return value
+        `geometry` stands for the folder's cameras.json, and for lights.json where it has lights.
+        Raises `ImportProblem` naming the file and field that are wrong or missing.
+        """
+        if not folder.is_dir():
+            raise ImportProblem(f"{folder}: no such folder")
+        settings = settings_of(folder) if settings is None else settings
+        if geometry is None:
+            geometry = Geometry(cameras_of(folder / "cameras.json"))
+        lights = geometry.lights or lights_of(
+            folder / "lights.json", {id_: c.name for id_, c in geometry.cameras.items()}
+        )
+        projectors = projectors_of(folder / "projectors.json")
+        given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
+        found = find(folder, settings, given)
+        cameras = {c.name: _sized(c, found) for c in given.cameras}
+        lenses = {n: Lens.of(c) for n, c in cameras.items() if isinstance(c, LensModelCamera)}
+        kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
+        lit = {s.light for s in found.steps}
+        rig = Rig(folder.name, kept, tuple(x for x in lights if x.name in lit), projectors)
+        head = _head(folder / "head.obj")
+        return cls(folder, settings, rig, cameras, lenses, found, head)
 
+    @property
+    def missing(self) -> list[tuple[Step, str]]:
+        """Frames that no file is for."""
+        return [
+            (s, c)
+            for s in self.found.steps
+            for c in self.shot
+            if (s.index, c) not in self.found.frames
+        ]
 
-def _id(entry: dict[str, Any], prefix: str, where: str) -> tuple[str | int, str]:
-    """An entry's id and the name it stands for."""
-    value = _take(entry, "id", where)
-    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
-        return value, f"{prefix}_{value:02d}"
-    if isinstance(value, str) and is_file_name(value):
-        return value, value
-    raise ImportProblem(f"{where}.id: expected a name or a number >= 0, got {value!r}")
+    @property
+    def relative(self) -> bool:
+        """Whether nothing says what the pictures' numbers are in W/(sr m²)."""
+        if self.settings.units is not None:
+            return self.settings.units == "relative"
+        files = [p for b in self.found.frames.values() for p in b.values()]
+        return any(p.suffix.lower() != ".exr" for p in files)
 
+    def counts(self) -> dict[str, Any]:
+        """What was understood, as numbers."""
+        kinds = Counter(s.kind for s in self.found.steps)
+        brackets = Counter(len(b) for b in self.found.frames.values())
+        return {
+            "cameras": len(self.shot),
+            "lights": len(self.rig.lights),
+            "steps": dict(kinds),
+            "frames": len(self.found.frames),
+            "missing": len(self.missing),
+            "exposures_per_frame": dict(sorted(brackets.items())),
+            "clean_plates": len(self.found.plates),
+            "flat_fields": len(self.found.flats),
+            "hair_masks": len(self.found.hair),
+            "subject_masks": len(self.found.subjects),
+            "relative": self.relative,
+        }
 
-def _cameras(path: Path) -> dict[str | int, Camera]:
-    """Cameras by id."""
-    out: dict[str | int, Camera] = {}
-    for i, entry in enumerate(_entries(path, "cameras")[0]):
-        where = f"{path}: cameras[{i}]"
-        id_, name = _id(entry, "cam", where)
-        if name in [c.name for c in out.values()]:
-            raise ImportProblem(f"{where}.id: {id_!r} is there twice")
-        width, height = _count(entry, "width", where), _count(entry, "height", where)
-        K, R = (_numbers(entry, f, (3, 3), where) for f in ("K", "R"))
-        t = _numbers(entry, "t", (3,), where)
-        lens = _numbers(entry, "distortion", (5,), where) if "distortion" in entry else np.zeros(5)
+    def said(self) -> list[str]:
+        """`counts`, and the sizes and first files of each camera, in lines for a person."""
+        lines = []
+        for what, count in self.counts().items():
+            text = (
+                ", ".join(f"{k}: {n}" for k, n in count.items())
+                if isinstance(count, dict)
+                else count
+            )
+            lines.append(f"{what.replace('_', ' ')}: {text}")
+        for name, camera in self.shot.items():
+            frames = [b for (_, c), b in self.found.frames.items() if c == name]
+            first = (
+                next(iter(frames[0].values())).relative_to(self.folder) if frames else "no picture"
+            )
+            size = f"{camera.width}x{camera.height}"
+            lines.append(f"{name}: {len(frames)} frames of {size}, {first}, …")
+        return lines
+
+    def masks(self, camera: str) -> tuple[Bools | None, Bools | None]:
+        """The user's masks `(H, W)` of hair and of the subject."""
+        given = self.found.hair.get(camera), self.found.subjects.get(camera)
+        hair, subject = (None if p is None else _mask(p, self.shot[camera]) for p in given)
+        return hair, subject
+
+    def write(self, out: Path, progress: Progress = silent) -> Capture:
+        """The capture `out`, a new or empty folder; nothing is left of it where a file is broken.
+
+        A frame that no file is for is missing, with its reason. Where there are clean plates they
+        tell the subject from the background, and are taken off what is not the subject.
+        """
+        subjects = self._subjects(progress)
+        masks = {n: _mask(p, self.shot[n]) for n, p in self.found.hair.items()}
+        notes = {"notes": list(self.found.notes), "relative": self.relative}
+        plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": notes}
+        writer = CaptureWriter.create(
+            out, self.rig, plan, masks=self._undistorted(masks), head=self.head,
+            subjects=self._undistorted(subjects),
+        )  # fmt: skip
+        frames = [(s, c) for s in self.found.steps for c in self.shot]
         try:
-            out[id_] = Camera(name, width, height, K, R, t, distortion=lens)
-        except ValueError as error:
-            raise ImportProblem(f"{where}: {error}") from error
-        if "center" in entry:
-            center = _numbers(entry, "center", (3,), where)
-            if not np.allclose(center, out[id_].center, atol=1e-4):
-                raise ImportProblem(
-                    f"{where}.center: {center} is not -Rᵀt = {out[id_].center}; "
-                    f"R and t must take the world to the camera"
-                )
-    return out
+            for k, (step, camera) in enumerate(frames):
+                if bracket := self.found.frames.get((step.index, camera)):
+                    merged = self.frame(bracket, camera)
+                    plate = self.found.plates.get((step.light, camera))
+                    if plate is not None and step.kind == "olat" and camera in subjects:
+                        behind = ~subjects[camera][..., None] * self.frame(plate, camera).radiance
+                        merged = Merged(**vars(merged) | {"radiance": merged.radiance - behind})
+                    image, full = self._resampled(merged, camera).marked()
+                    scales = {"full_scale": full, "count_scale": merged.quantum}
+                    writer.write_frame(step, camera, image, **scales)
+                else:
+                    writer.record_missing(step, camera, reason="no file is called after it")
+                progress("importing pictures", (k + 1) / len(frames))
+            writer.finish("completed", {"imported_from": self.folder.name})
+        except BaseException:
+            writer.close()
+            shutil.rmtree(out)
+            raise
+        return Capture(out)
+
+    def frame(self, bracket: Bracket, camera: str) -> Merged:
+        """The files of one frame, merged, in the pixels of the pictures. Raises `ImportProblem`."""
+        size = (self.shot[camera].width, self.shot[camera].height)
+        try:
+            pictures = {s: read_picture(p, self.settings.sensor, size) for s, p in bracket.items()}
+        except PictureError as error:
+            raise ImportProblem(str(error)) from error
+        merged = merge(pictures, self.settings.scale)
+        return flattened(merged, self._flats[camera]) if camera in self._flats else merged
+
+    @cached_property
+    def _flats(self) -> Mapping[str, Floats]:
+        out = {}
+        for camera, path in self.found.flats.items():
+            size = (self.shot[camera].width, self.shot[camera].height)
+            try:
+                light = read_picture(path, self.settings.sensor, size).light
+            except PictureError as error:
+                raise ImportProblem(str(error)) from error
+            mean = light.mean(axis=(0, 1))
+            if not (mean > 0).all():
+                raise ImportProblem(f"{path}: a flat field shows light in every channel")
+            out[camera] = light / mean
+        return out
+
+    def _subjects(self, progress: Progress) -> dict[str, Bools]:
+        """The subject's pixels, of the user or else by clean plates, in those of the pictures."""
+        out = {n: _mask(p, self.shot[n]) for n, p in self.found.subjects.items()}
+        for camera in {c for _, c in self.found.plates} - set(out):
+            told = Unchanged()
+            for step in self.found.steps:
+                light = step.light if step.kind == "olat" else None
+                picture = self.found.frames.get((step.index, camera))
+                plate = self.found.plates.get((light, camera))
+                if picture and plate and step.kind in ("olat", "all_on"):
+                    told.add(self.frame(picture, camera), self.frame(plate, camera))
+                progress("comparing with clean plates", step.index / len(self.found.steps))
+            out[camera] = told.subject()
+        return out
+
+    def _undistorted(self, masks: Mapping[str, Bools]) -> dict[str, Bools]:
+        return {
+            n: self.lenses[n].undistort_mask(m) if n in self.lenses else m for n, m in masks.items()
+        }
+
+    def _resampled(self, merged: Merged, camera: str) -> Merged:
+        lens = self.lenses.get(camera)
+        if lens is None:
+            return merged
+        images = {
+            "radiance": lens.undistort(merged.radiance),
+            "saturated": lens.undistort_any(merged.saturated),
+            "noise": lens.undistort(merged.noise),
+        }
+        return Merged(**vars(merged) | images)
 
 
-def _lights(path: Path, cameras: dict[str | int, str]) -> list[Light]:
-    entries, data = _entries(path, "lights")
-    for field, unit in (("position", "m"), ("intensity", "W/sr")):
-        units = data.get("units", {})
-        given = units.get(field, unit) if isinstance(units, dict) else units
-        if given != unit:
-            raise ImportProblem(f"{path}: units.{field}: expected {unit!r}, got {given!r}")
-    out: list[Light] = []
-    for i, entry in enumerate(entries):
-        where = f"{path}: lights[{i}]"
-        id_, name = _id(entry, "light", where)
-        if name in [light.name for light in out]:
-            raise ImportProblem(f"{where}.id: {id_!r} is there twice")
-        position, intensity = (_numbers(entry, f, (3,), where) for f in ("position", "intensity"))
-        if (intensity < 0).any():
-            raise ImportProblem(f"{where}.intensity: must not be negative, got {intensity}")
-        beside = entry.get("colocated_camera")
-        if beside is not None and (not isinstance(beside, str | int) or beside not in cameras):
-            raise ImportProblem(
-                f"{where}.colocated_camera: no camera has the id {beside!r}; "
-                f"there are {list(cameras)}"
-            )
-        out.append(Light(name, position, intensity, None if beside is None else cameras[beside]))
-    return out
+def _sized(camera: Camera, found: Found) -> Camera:
+    """`camera` for the size that its first picture has; as it is where there is none."""
+    for (_, name), bracket in found.frames.items():
+        if name == camera.name:
+            path = next(iter(bracket.values()))
+            try:
+                return resized(camera, *picture_size(path))
+            except PlacementError as error:
+                raise ImportProblem(f"{path}: {error}") from error
+            except PictureError as error:
+                raise ImportProblem(str(error)) from error
+    return camera
 
 
-def _sized(camera: Camera, picture: Path) -> Camera:
-    """`camera` for the size that `picture` has; as it is where there is none."""
-    try:
-        height, width = read_exr(picture)[0].shape[:2] if picture.is_file() else (0, 0)
-        return resized(camera, width, height) if width else camera
-    except ValueError as error:
-        raise ImportProblem(f"{picture}: {error}") from error
-
-
-def _masks(folder: Path, cameras: list[Camera]) -> dict[str, NDArray[Any]]:
-    """The masks that are there, half grey and above."""
-    out: dict[str, NDArray[Any]] = {}
-    for camera in cameras:
-        path = folder / f"{camera.name}.png"
-        if not path.is_file():
-            continue
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        found = None if image is None else image.shape
-        if found != (camera.height, camera.width):
-            raise ImportProblem(
-                f"{path}: expected a PNG of {(camera.height, camera.width)} pixels, got {found}"
-            )
-        out[camera.name] = np.asarray(image) >= 128
-    return out
+def _mask(path: Path, camera: Camera) -> Bools:
+    """A mask `(H, W)` in the pixels of the pictures, half grey and above."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    found = None if image is None else image.shape
+    if found != (camera.height, camera.width):
+        raise ImportProblem(
+            f"{path}: expected a PNG of {(camera.height, camera.width)} pixels, got {found}"
+        )
+    return np.asarray(image) >= 128
 
 
 def _head(path: Path) -> Mesh | None:
@@ -242,18 +303,3 @@ def _head(path: Path) -> Mesh | None:
         return read_obj(path) if path.is_file() else None
     except ValueError as error:
         raise ImportProblem(str(error)) from error
-
-
-def _picture(path: Path, camera: Camera) -> Floats:
-    try:
-        image, _ = read_exr(path)
-    except ValueError as error:
-        raise ImportProblem(str(error)) from error
-    if image.shape != (camera.height, camera.width, 3):
-        raise ImportProblem(
-            f"{path}: {image.shape[1]}x{image.shape[0]} pixels, cameras.json gives {camera.name} "
-            f"{camera.width}x{camera.height}"
-        )
-    if not np.isfinite(image).all():
-        raise ImportProblem(f"{path}: has pixels that are not finite numbers")
-    return image

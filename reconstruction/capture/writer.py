@@ -88,11 +88,13 @@ class CaptureWriter:
         *,
         masks: dict[str, NDArray[Any]] | None = None,
         head: Mesh | None = None,
+        subjects: dict[str, NDArray[Any]] | None = None,
     ) -> Self:
         """Start a capture in the new or empty folder `path`.
 
         `plan["steps"]` lists `Step.to_dict()`s (or `Step`s); what else the plan holds is kept.
-        `masks` maps camera names to hair masks `(H, W)`, boolean or 0..255. Raises `CaptureError`.
+        `masks` maps camera names to hair masks `(H, W)`, boolean or 0..255, `subjects` to masks of
+        hair, head and body. Raises `CaptureError`.
         """
         path = Path(path)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
@@ -104,17 +106,20 @@ class CaptureWriter:
         if len(set(indices)) != len(indices):
             twice = sorted({i for i in indices if indices.count(i) > 1})[:5]
             raise CaptureError(f"plan.json: step indices must be distinct, twice: {twice}")
-        images = {name: _mask(rig, name, mask) for name, mask in (masks or {}).items()}
+        images = {
+            f"{folder}/{name}.png": _mask(rig, name, mask)
+            for folder, given in (("masks", masks), ("subjects", subjects))
+            for name, mask in (given or {}).items()
+        }
 
         (path / "frames").mkdir(parents=True)
         write_json(path / "rig.json", rig.to_dict())
-        if images:
-            (path / "masks").mkdir()
-        for name, image in images.items():
+        for file, image in images.items():
             done, png = cv2.imencode(".png", image)
             if not done:
-                raise CaptureError(f"masks/{name}.png: cannot be written")
-            write_whole(path / "masks" / f"{name}.png", png.tobytes())
+                raise CaptureError(f"{file}: cannot be written")
+            (path / file).parent.mkdir(exist_ok=True)
+            write_whole(path / file, png.tobytes())
         if head is not None:
             with writing(path / "head.obj") as temporary:
                 write_obj(temporary, head)
@@ -129,7 +134,11 @@ class CaptureWriter:
         manifest, if there is one, is removed until `finish` writes it anew. Raises `CaptureError`
         where there is no capture, or another process writes or compresses it."""
         before = Capture(path)
-        for folder in ("masks", *(f"frames/{f.name}" for f in before.path.glob("frames/*"))):
+        for folder in (
+            "masks",
+            "subjects",
+            *(f"frames/{f.name}" for f in before.path.glob("frames/*")),
+        ):
             inside(before.path, folder)
         journal = open_journal(Path(path))
         capture = Capture(path)
@@ -351,7 +360,7 @@ def checksums(path: Path) -> dict[str, Any]:
     check the part that the manifest knows.
     """
     small = [path / n for n in ("rig.json", "plan.json", "head.obj")]
-    small += sorted((path / "masks").glob("[!.]*.png"))
+    small += sorted([f for name in ("masks", "subjects") for f in (path / name).glob("[!.]*.png")])
     journal = path / "journal.jsonl"
     return {
         "files": {str(f.relative_to(path)): sha256(f) for f in small if f.is_file()},

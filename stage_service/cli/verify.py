@@ -17,6 +17,17 @@ def add(commands: Commands) -> None:
     imported.add_argument("folder", type=Path)
     imported.add_argument("--out", type=Path, required=True, help="new capture folder")
     imported.add_argument(
+        "--pictures",
+        help="where pictures of single lights lie: {camera}/{light}.png; default: as import.toml "
+        "says, or images/{camera}/{light}.*",
+    )
+    imported.add_argument("--settings", type=Path, help="instead of the folder's import.toml")
+    imported.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say what was understood, and draw a contact sheet beside --out",
+    )
+    imported.add_argument(
         "--cameras",
         type=Path,
         help="instead of cameras.json: a COLMAP model's folder, transforms.json",
@@ -56,11 +67,14 @@ def run_verify(args: argparse.Namespace, output: Output) -> int:
 
 
 def run_import(args: argparse.Namespace, output: Output) -> None:
-    """Turn a folder made elsewhere into a capture.
+    """Turn pictures made elsewhere into a capture.
 
-    Read cameras.json, lights.json, images/<camera>/<light>.exr and masks/<camera>.png.
+    Read cameras, lights, pictures by the patterns of import.toml, and masks.
     """
-    from reconstruction import import_folder
+    from dataclasses import replace
+
+    from reconstruction.capture.contact_sheet import contact_sheet
+    from reconstruction.capture.import_folder import Import, settings_of
     from reconstruction.capture.import_geometry import GeometryFiles, read_geometry
     from reconstruction.options import parse_options
 
@@ -68,17 +82,29 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
     files = parse_options(GeometryFiles, {**asked, "placement": where}, "import")
     geometry = read_geometry(files) if args.cameras else None
-    for note in geometry.notes if geometry else []:
+    settings = settings_of(args.folder, args.settings)
+    if args.pictures is not None:
+        patterns = replace(settings.pictures, olat=args.pictures)
+        settings = replace(settings, pictures=patterns)
+    understood = Import.of(args.folder, geometry, settings)
+    notes = [*(geometry.notes if geometry else []), *understood.found.notes]
+    for note in notes:
         output.note(note)
+    if args.dry_run:
+        sheet = args.out.with_name(f"{args.out.name}-contact-sheet.png")
+        contact_sheet(understood, sheet)
+        text = "\n".join([*understood.said(), f"{sheet}: what the pictures look like"])
+        output.result({"sheet": str(sheet), **understood.counts(), "notes": notes}, text)
+        return
     with progress_bar("import") as progress:
-        capture = import_folder(args.folder, args.out, progress, geometry)
+        capture = understood.write(args.out, progress)
     counts = {
         "cameras": len(capture.rig.cameras),
         "lights": len(capture.rig.lights),
         "frames": sum(r.file is not None for r in capture.records.values()),
+        "missing": len(understood.missing),
     }
     text = f"{args.out}: " + ", ".join(f"{n} {what}" for what, n in counts.items())
-    notes = geometry.notes if geometry else []
     output.result({"capture": str(args.out), **counts, "notes": notes}, text)
 
 

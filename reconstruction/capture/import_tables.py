@@ -1,0 +1,137 @@
+"""cameras.json, lights.json and projectors.json of a folder to import."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reconstruction.capture.import_settings import ImportProblem
+from reconstruction.containment import is_file_name
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.lights import Light
+from reconstruction.geometry.projectors import Projector
+from reconstruction.geometry.rig import Rig, RigError
+
+
+def _entries(path: Path, key: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The list of tables under `key`, and the whole document."""
+    try:
+        data = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ImportProblem(f"{path}: no such file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ImportProblem(f"{path}: not JSON ({error})") from error
+    if not isinstance(data, dict) or key not in data:
+        raise ImportProblem(f"{path}: the field {key!r} is missing")
+    entries = data[key]
+    if not isinstance(entries, list) or not entries:
+        raise ImportProblem(f"{path}: {key}: expected a list with at least one entry")
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise ImportProblem(f"{path}: {key}[{i}]: expected an object, got {entry!r}")
+    return entries, data
+
+
+def _take(entry: dict[str, Any], field: str, where: str) -> Any:
+    if field not in entry:
+        raise ImportProblem(f"{where}: the field {field!r} is missing")
+    return entry[field]
+
+
+def _numbers(entry: dict[str, Any], field: str, shape: tuple[int, ...], where: str) -> Any:
+    """A field of finite numbers of the given shape."""
+    value = _take(entry, field, where)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        array = np.full(0, np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ImportProblem(f"{where}.{field}: expected {shape} finite numbers, got {value!r}")
+    return array
+
+
+def _count(entry: dict[str, Any], field: str, where: str) -> int:
+    value = _take(entry, field, where)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ImportProblem(f"{where}.{field}: expected a whole number above 0, got {value!r}")
+    return value
+
+
+def _id(entry: dict[str, Any], prefix: str, where: str) -> tuple[str | int, str]:
+    """An entry's id and the name it stands for."""
+    value = _take(entry, "id", where)
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return value, f"{prefix}_{value:02d}"
+    if isinstance(value, str) and is_file_name(value):
+        return value, value
+    raise ImportProblem(f"{where}.id: expected a name or a number >= 0, got {value!r}")
+
+
+def cameras_of(path: Path) -> dict[str | int, Camera]:
+    """Cameras by id."""
+    out: dict[str | int, Camera] = {}
+    for i, entry in enumerate(_entries(path, "cameras")[0]):
+        where = f"{path}: cameras[{i}]"
+        id_, name = _id(entry, "cam", where)
+        if name in [c.name for c in out.values()]:
+            raise ImportProblem(f"{where}.id: {id_!r} is there twice")
+        width, height = _count(entry, "width", where), _count(entry, "height", where)
+        K, R = (_numbers(entry, f, (3, 3), where) for f in ("K", "R"))
+        t = _numbers(entry, "t", (3,), where)
+        lens = _numbers(entry, "distortion", (5,), where) if "distortion" in entry else np.zeros(5)
+        try:
+            out[id_] = Camera(name, width, height, K, R, t, distortion=lens)
+        except ValueError as error:
+            raise ImportProblem(f"{where}: {error}") from error
+        if "center" in entry:
+            center = _numbers(entry, "center", (3,), where)
+            if not np.allclose(center, out[id_].center, atol=1e-4):
+                raise ImportProblem(
+                    f"{where}.center: {center} is not -Rᵀt = {out[id_].center}; "
+                    f"R and t must take the world to the camera"
+                )
+    return out
+
+
+def lights_of(path: Path, cameras: dict[str | int, str]) -> list[Light]:
+    """Lights; `cameras` are names by id, for those that a light is beside."""
+    entries, data = _entries(path, "lights")
+    for field, unit in (("position", "m"), ("intensity", "W/sr")):
+        units = data.get("units", {})
+        given = units.get(field, unit) if isinstance(units, dict) else units
+        if given != unit:
+            raise ImportProblem(f"{path}: units.{field}: expected {unit!r}, got {given!r}")
+    out: list[Light] = []
+    for i, entry in enumerate(entries):
+        where = f"{path}: lights[{i}]"
+        id_, name = _id(entry, "light", where)
+        if name in [light.name for light in out]:
+            raise ImportProblem(f"{where}.id: {id_!r} is there twice")
+        position, intensity = (_numbers(entry, f, (3,), where) for f in ("position", "intensity"))
+        if (intensity < 0).any():
+            raise ImportProblem(f"{where}.intensity: must not be negative, got {intensity}")
+        beside = entry.get("colocated_camera")
+        if beside is not None and (not isinstance(beside, str | int) or beside not in cameras):
+            raise ImportProblem(
+                f"{where}.colocated_camera: no camera has the id {beside!r}; "
+                f"there are {list(cameras)}"
+            )
+        out.append(Light(name, position, intensity, None if beside is None else cameras[beside]))
+    return out
+
+
+def projectors_of(path: Path) -> tuple[Projector, ...]:
+    """Those of a rig's table of projectors; none where there is no file."""
+    if not path.is_file():
+        return ()
+    entries = _entries(path, "projectors")[0]
+    anything = {"id": 0, "name": "any", "width": 1, "height": 1, "K": np.eye(3), "R": np.eye(3)}
+    camera = {**anything, "t": [0, 0, 1]}
+    camera.pop("id")
+    try:
+        return Rig.from_dict({"cameras": [camera], "projectors": entries}).projectors
+    except (RigError, ValueError, TypeError, LookupError) as error:
+        raise ImportProblem(f"{path}: {error}") from error

@@ -1,0 +1,211 @@
+"""Pictures as others' cameras write them: EXR, PNG, TIFF, JPEG and RAW, as linear light.
+
+OpenImageIO reads all but RAW, which rawpy (LibRaw) does, and EXR, whose attributes we keep. The
+size is looked at before a pixel is read: a header may claim what memory cannot hold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import rawpy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from reconstruction.arrays import Bools, Floats
+from reconstruction.files.exr import read_exr
+from reconstruction.options import options
+
+Positive = Annotated[float, Field(gt=0)]
+Size = tuple[int, int]
+"""Width and height."""
+
+RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"}
+FORMATS = {".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg"} | RAW
+LOSSY = {".jpg", ".jpeg"}
+FULL = 0.99
+"""Of the way from black to white from which on a channel of whole numbers counts as saturated:
+sensors bend before they end, and a developed picture's white is not sharp."""
+
+
+class PictureError(ValueError):
+    """A picture that cannot be used; the message names the file and says what to do."""
+
+
+@options
+class Sensor:
+    """How the numbers in a picture become light.
+
+    `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: "srgb" for 8 bits
+    and JPEG, "linear" for all else. `black` and `white` in the file's own numbers: without light,
+    and where a channel is full; None: what a RAW file says, 0 and the largest of its type (1 in
+    EXR, which never saturates unless its attribute `fullScale` or `white` says so). `bayer`: the
+    colours of the first two rows of a picture that is a sensor's mosaic.
+    """
+
+    response: Literal["linear", "srgb"] | Positive | None = None
+    black: Annotated[float, Field(ge=0)] | None = None
+    white: Positive | None = None
+    bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """`light (H, W, 3)`, linear, 1 where a channel is full; `saturated (H, W)`.
+
+    `full` is the light from which on a channel is saturated (inf: never), `quantum (H, W, 3) or ()`
+    the light of one step of the file's numbers, `clipped` whether what is darker than black became
+    0, so that its noise is lost.
+    """
+
+    light: Floats
+    saturated: Bools
+    full: float
+    quantum: Any
+    clipped: bool
+
+
+def picture_size(path: Path) -> Size:
+    """Width and height that the header gives. Raises `PictureError`."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".exr":
+            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+            return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
+        if suffix in RAW:
+            with rawpy.imread(str(path)) as raw:
+                return int(raw.sizes.width), int(raw.sizes.height)
+    except Exception as error:  # both bindings raise what they please
+        raise PictureError(_broken(path, error)) from error
+    spec = _opened(path).spec()
+    return int(spec.width), int(spec.height)
+
+
+def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
+    """Read a picture of `size`. Raises `PictureError`: another size, broken, no such format."""
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise PictureError(f"{path}: no format that is read; there are {' '.join(sorted(FORMATS))}")
+    found = picture_size(path)
+    if found != size:
+        raise PictureError(
+            f"{path}: {found[0]}x{found[1]} pixels, its camera has {size[0]}x{size[1]}: give a "
+            "picture of that size, or remove this one: a frame may be missing"
+        )
+    if suffix == ".exr":
+        return _exr(path, sensor)
+    if suffix in RAW:
+        return _raw(path, sensor)
+    source = _opened(path)
+    values = source.read_image(oiio.UNKNOWN)
+    if values is None or source.geterror(False):
+        raise PictureError(_broken(path, source.geterror()))
+    return _counts(path, np.asarray(values), sensor)
+
+
+def _opened(path: Path) -> Any:
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # colours are not multiplied by alpha
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise PictureError(_broken(path, oiio.geterror()))
+    return source
+
+
+def _broken(path: Path, error: object) -> str:
+    text = " ".join(str(error).split()) or "it is cut off or damaged"
+    return f"{path}: cannot be read ({text}): copy it anew, or remove it: a frame may be missing"
+
+
+def _exr(path: Path, sensor: Sensor) -> Picture:
+    try:
+        image, attributes = read_exr(path)
+    except ValueError as error:
+        raise PictureError(_broken(path, error)) from error
+    if not np.isfinite(image).all():
+        raise PictureError(f"{path}: has pixels that are not finite numbers")
+    white, black = sensor.white or 1.0, sensor.black or 0.0
+    full = sensor.white or float(attributes.get("fullScale", np.inf))
+    saturated = np.asarray((image >= full * (1 - 1e-5)).any(axis=-1))
+    gamma = 1.0 if sensor.response is None else sensor.response
+    light = _decoded((image - black) / (white - black), gamma)
+    quantum = float(attributes.get("countScale", 0.0)) / (white - black)
+    return Picture(light, saturated, (full - black) / (white - black), quantum, False)
+
+
+def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
+    """A picture of whole numbers `(H, W, C)`, or of floats in a TIFF."""
+    whole = np.issubdtype(values.dtype, np.integer)
+    white = sensor.white or (float(np.iinfo(values.dtype).max) if whole else 1.0)
+    black = sensor.black or 0.0
+    if not black < white:
+        raise PictureError(f"{path}: black {black:g} must be below white {white:g}")
+    colours = values.shape[-1]
+    if sensor.bayer is not None:
+        if colours != 1:
+            raise PictureError(f"{path}: a mosaic ({sensor.bayer}) has one channel, not {colours}")
+        return _mosaic(values[..., 0], sensor.bayer, black, white)
+    numbers = np.repeat(values[..., :1], 3, axis=-1) if colours < 3 else values[..., :3]
+    if not np.isfinite(numbers).all():
+        raise PictureError(f"{path}: has pixels that are not finite numbers")
+    share = (numbers.astype(np.float32) - np.float32(black)) / np.float32(white - black)
+    saturated = np.asarray((share >= FULL).any(axis=-1))
+    gamma = sensor.response
+    if gamma is None:
+        gamma = "srgb" if values.dtype == np.uint8 else "linear"
+    light = _decoded(share, gamma)
+    step = np.float32(1 / (white - black)) if whole else np.float32(0)
+    quantum = _decoded(share + step, gamma) - light if gamma != "linear" else step
+    clipped = bool(whole and black == 0)
+    return Picture(light, saturated, float(_decoded(np.float32(FULL), gamma)), quantum, clipped)
+
+
+def _raw(path: Path, sensor: Sensor) -> Picture:
+    try:
+        with rawpy.imread(str(path)) as raw:
+            values, pattern = raw.raw_image_visible.copy(), raw.raw_pattern
+            colours = raw.color_desc.decode()
+            blacks, white = list(raw.black_level_per_channel), float(raw.white_level)
+    except Exception as error:
+        raise PictureError(_broken(path, error)) from error
+    if pattern is None or pattern.shape != (2, 2) or values.ndim != 2:
+        raise PictureError(f"{path}: no Bayer mosaic: develop it to a linear 16-bit TIFF")
+    bayer = "".join(colours[i] for i in pattern.ravel())
+    black = float(np.mean(blacks)) if sensor.black is None else sensor.black
+    return _mosaic(values, bayer, black, sensor.white or white)
+
+
+def _mosaic(values: NDArray[Any], bayer: str, black: float, white: float) -> Picture:
+    """Linear light of a mosaic `(H, W)`, interpolated along edges; saturated is what drew on it."""
+    # OpenCV names a mosaic by the second row's second and third pixel, and for BGR.
+    codes = {
+        "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
+        "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
+        "GRBG": cv2.COLOR_BayerGRBG2RGB_EA,
+        "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
+    }
+    full = black + FULL * (white - black)
+    saturated = cv2.dilate((values >= full).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    deep = values.astype(np.uint16)
+    shift = max(0, 15 - int(deep.max(initial=1)).bit_length())  # finer than one count between them
+    image = cv2.demosaicing(deep << shift, codes[bayer]).astype(np.float32) / (1 << shift)
+    light = (image - np.float32(black)) / np.float32(white - black)
+    return Picture(light, saturated, FULL, 1 / (white - black), black == 0)
+
+
+def _decoded(share: Any, response: Literal["linear", "srgb"] | float) -> Any:
+    """Linear light of values that are 1 at white (IEC 61966-2-1 for sRGB); odd below 0."""
+    if response == "linear" or response == 1.0:
+        return share
+    value = np.abs(share)
+    if response == "srgb":
+        light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    else:
+        light = value ** float(response)
+    return np.asarray(np.sign(share) * light, np.float32)

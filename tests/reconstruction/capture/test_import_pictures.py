@@ -1,0 +1,320 @@
+"""Pictures as users have them: formats, names, brackets, what is missing or broken."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction import Capture, import_folder, verify
+from reconstruction.arrays import Floats
+from reconstruction.capture.contact_sheet import contact_sheet
+from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
+
+SIZE = 24  # pixels on a side
+CAMERAS, LIGHTS = ("left", "right"), ("light_000", "light_001", "light_002")
+
+
+def light_of(camera: int, light: int) -> Floats:
+    """A smooth picture (H, W, 3), up to about 0.9."""
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    grey = 0.1 + 0.35 * x + 0.25 * y * (1 + light) / 3 + 0.1 * camera
+    return np.asarray(grey[..., None] * np.array([1.0, 0.7, 0.5]), np.float32)
+
+
+def srgb(light: Floats) -> Floats:
+    """Values of linear light, IEC 61966-2-1."""
+    power = 1.055 * np.clip(light, 1e-9, None) ** (1 / 2.4) - 0.055
+    return np.asarray(np.where(light <= 0.0031308, 12.92 * light, power), np.float32)
+
+
+def save(path: Path, value: Floats, kind: type) -> None:
+    """`value (H, W, 3)` or `(H, W)`, 1 at white, as whole numbers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    white = np.iinfo(kind).max
+    counts = np.round(np.clip(value, 0, 1) * white).astype(kind)
+    assert cv2.imwrite(str(path), counts[..., ::-1] if counts.ndim == 3 else counts)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Cameras and lights, no pictures yet."""
+    root = tmp_path / "elsewhere"
+    root.mkdir()
+    K = [[30, 0, 11.5], [0, 30, 11.5], [0, 0, 1]]
+    pose = {"width": SIZE, "height": SIZE, "K": K, "R": np.eye(3).tolist()}
+    cameras = [{"id": c, **pose, "t": [i, 0, 1]} for i, c in enumerate(CAMERAS)]
+    lights = [
+        {"id": name, "position": [0, i, -1], "intensity": [1, 1, 1]}
+        for i, name in enumerate(LIGHTS)
+    ]
+    (root / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    (root / "lights.json").write_text(json.dumps({"lights": lights}))
+    return root
+
+
+def settings(folder: Path, text: str) -> None:
+    (folder / "import.toml").write_text(text)
+
+
+def everywhere(write: Callable[[str, int, Floats], Any]) -> None:
+    for c, camera in enumerate(CAMERAS):
+        for n in range(len(LIGHTS)):
+            write(camera, n, light_of(c, n))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "error"),
+    [
+        ("{}/{:03d}.png", np.uint16, 1e-5),
+        ("{}/{:03d}.tif", np.uint16, 1e-5),
+        ("{}/{:03d}.png", np.uint8, 5e-3),
+        ("{}/{:03d}.jpg", np.uint8, 4e-2),
+    ],
+)
+def test_a_format_is_read_as_linear_light(folder, tmp_path, name, kind, error):
+    """By pattern; 8 bits are sRGB and JPEG is warned of."""
+    code = srgb if kind is np.uint8 else np.asarray
+    everywhere(lambda c, n, x: save(folder / name.format(c, n), code(x), kind))
+    settings(folder, f'pictures.olat = "{{camera}}/{{light}}{Path(name).suffix}"')
+    capture = import_folder(folder, tmp_path / "out")
+    assert verify(capture.path) == []
+    for c, camera in enumerate(CAMERAS):
+        for n, light in enumerate(LIGHTS):
+            image, saturated = capture.light(light, camera)
+            np.testing.assert_allclose(image, light_of(c, n), atol=error)
+            assert not saturated.any()
+    said = capture.plan["import"]
+    assert said["relative"]
+    assert any("JPEG" in note for note in said["notes"]) == name.endswith("jpg")
+
+
+def test_brackets_are_merged_and_saturation_is_kept(folder, tmp_path):
+    """Three noisy exposures of 8 bits tell more than the best one; what all clip is saturated."""
+    rng = np.random.default_rng(0)
+    bright = 40 * light_of(0, 0)
+    bright[2:4, 3:6] = 300  # above what 1/160 s holds
+    seconds = {"1-10": 0.1, "1-40": 0.025, "1-160": 1 / 160}
+    shots = {text: rng.poisson(bright * s * 1e4) / 1e4 for text, s in seconds.items()}
+    for camera in CAMERAS:
+        for n in range(len(LIGHTS)):
+            for text, shot in shots.items():
+                save(folder / f"{camera}/{n}_{text}.png", shot.astype(np.float32), np.uint8)
+    settings(
+        folder,
+        'sensor.response = "linear"\npictures.olat = "{camera}/{light}_{exposure}.png"\n',
+    )
+    capture = import_folder(folder, tmp_path / "out")
+    image, saturated = capture.light("light_001", "left")
+    expected = np.zeros((SIZE, SIZE), bool)
+    expected[2:4, 3:6] = True
+    np.testing.assert_array_equal(saturated, expected)
+    assert capture.of_kind("olat")[0].exposure == 0.1
+    held = (bright.max(axis=-1) < 0.95 * 10) & ~expected  # by the longest exposure
+    error = np.sqrt(np.mean((image - bright)[held] ** 2))
+    longest = np.round(255 * shots["1-10"][held]) / 255 * 10
+    assert error < 0.95 * np.sqrt(np.mean((longest - bright[held]) ** 2))
+    rest = ~held & ~expected  # that only the shorter ones hold
+    assert np.abs(image - bright)[rest].max() < 0.1 * bright[rest].max()
+
+
+def test_a_mosaic_and_its_black_level(folder, tmp_path):
+    """A 12-bit Bayer mosaic in 16 bits, 256 counts at black."""
+    first = {"R": 0, "G": 1, "B": 2}
+
+    def write(camera: str, n: int, x: Floats) -> None:
+        mosaic = np.zeros((SIZE, SIZE), np.uint16)
+        for i, colour in enumerate("GBRG"):
+            at = np.s_[i // 2 :: 2, i % 2 :: 2]
+            mosaic[at] = np.round(256 + (4095 - 256) * x[at][..., first[colour]])
+        path = folder / camera / f"{n}.tif"
+        path.parent.mkdir(exist_ok=True)
+        assert cv2.imwrite(str(path), mosaic)
+
+    everywhere(write)
+    settings(
+        folder,
+        'pictures.olat = "{camera}/{light}.tif"\n'
+        "[sensor]\nbayer = 'GBRG'\nblack = 256\nwhite = 4095\n",
+    )
+    capture = import_folder(folder, tmp_path / "out")
+    image, _ = capture.light("light_002", "right")
+    inner = np.s_[2:-2, 2:-2]
+    np.testing.assert_allclose(image[inner], light_of(1, 2)[inner], atol=0.01)
+
+
+def test_missing_frames_are_values(folder, tmp_path):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    (folder / "images/left/1.png").unlink()
+    for camera in CAMERAS:
+        (folder / "images" / camera / "2.png").unlink()
+    capture = import_folder(folder, tmp_path / "out")
+    assert capture.olat_lights() == ["light_000", "light_001"]
+    assert not capture.has_light("light_001", "left")
+    assert capture.has_light("light_001", "right")
+    assert any("light_002" in note for note in capture.plan["import"]["notes"])
+
+
+def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
+    """A wall at 3 % and a subject before it, whose shadow falls on the wall under one light."""
+    rng = np.random.default_rng(0)
+    inside = np.zeros((SIZE, SIZE), bool)
+    inside[6:18, 8:16] = True
+    for camera in CAMERAS:
+        for n in range(len(LIGHTS)):
+            wall = np.full((SIZE, SIZE, 3), 0.03, np.float32)
+            shot = wall.copy()
+            if n == 0:
+                shot[2:5] = 0.003  # the shadow
+            shot[inside] = 0.01 if n == 1 else 0.6
+            for name, image in (("plate", wall), ("olat", shot)):
+                noisy = image + rng.normal(0, 2e-4, image.shape)
+                save(folder / name / camera / f"{n}.png", noisy.astype(np.float32), np.uint16)
+    settings(
+        folder,
+        'pictures.olat = "olat/{camera}/{light}.png"\n'
+        'pictures.clean_plate = "plate/{camera}/{light}.png"',
+    )
+    capture = import_folder(folder, tmp_path / "out")
+    np.testing.assert_array_equal(capture.subject("left"), inside)
+    image, _ = capture.light("light_002", "left")
+    assert abs(image[~inside].mean()) < 1e-3
+    np.testing.assert_allclose(image[inside], 0.6, atol=2e-3)
+
+
+def test_a_flat_field_evens_the_lens(folder, tmp_path):
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
+    falls = (1 - 0.4 * (x**2 + y**2) / (x**2 + y**2).max())[..., None].astype(np.float32)
+    everywhere(
+        lambda c, n, image: save(folder / "images" / c / f"{n}.png", image * falls, np.uint16)
+    )
+    for camera in CAMERAS:
+        save(folder / f"flat_{camera}.png", 0.8 * falls * np.ones(3, np.float32), np.uint16)
+    settings(folder, 'pictures.flat = "flat_{camera}.png"')
+    capture = import_folder(folder, tmp_path / "out")
+    expected = light_of(0, 1) * falls.mean()
+    np.testing.assert_allclose(capture.light("light_001", "left")[0], expected, rtol=2e-3)
+
+
+def cut_off(path: Path) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def claims_ten_gigabytes(path: Path) -> None:
+    """A whole header of 60,000 x 60,000 pixels of three bytes."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
+
+
+def is_smaller(path: Path) -> None:
+    save(path, np.zeros((SIZE, SIZE // 2, 3), np.float32), np.uint16)
+
+
+def is_text(path: Path) -> None:
+    path.write_text("no picture")
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "exr", "jpg", "dng"])
+@pytest.mark.parametrize(
+    ("break_it", "says"),
+    [
+        (cut_off, "copy it anew"),
+        (is_text, "copy it anew"),
+        (is_smaller, "12x24 pixels, its camera has 24x24: give a picture of that size"),
+        (claims_ten_gigabytes, "60000x60000 pixels|copy it anew|unexpected"),
+    ],
+)
+def test_a_broken_picture_says_what_to_do(folder, tmp_path, suffix, break_it, says):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    old, new = folder / "images/right/1.png", folder / f"images/right/1.{suffix}"
+    if suffix == "dng":
+        if break_it in (cut_off, is_smaller):
+            pytest.skip("nothing here writes RAW files")
+        old.rename(new)
+    else:
+        kind = np.uint8 if suffix == "jpg" else np.uint16
+        old.unlink()
+        if suffix == "exr":
+            from reconstruction import write_exr
+
+            shape = (SIZE, SIZE // 2, 3) if break_it is is_smaller else (SIZE, SIZE, 3)
+            write_exr(new, np.zeros(shape, np.float32))
+        else:
+            save(new, light_of(0, 0), kind)
+    if not (suffix == "exr" and break_it is is_smaller):
+        break_it(new)
+    with pytest.raises(ImportProblem, match=says) as problem:
+        import_folder(folder, tmp_path / "out")
+    assert f"1.{suffix}" in str(problem.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_files_for_one_frame(folder, tmp_path):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    save(folder / "images/left/1.tif", light_of(0, 0), np.uint16)
+    with pytest.raises(ImportProblem, match=r"1\.tif and .*1\.png are both one frame of left"):
+        import_folder(folder, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("exposure = 0", "exposure: Input should be greater than 0"),
+        ("expsure = 1", "expsure: Unexpected"),
+        ("exposure = ", "not TOML"),
+        ('pictures.olat = "{cam}/{light}.png"', "no fields"),
+        ('pictures.olat = "{camera}.png"', "must say which light"),
+        ('pictures.olat = "photos/{camera}_{light}.png"', "give --pictures a pattern"),
+    ],
+)
+def test_wrong_settings(folder, tmp_path, text, says):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    settings(folder, text)
+    with pytest.raises(ImportProblem, match=says):
+        import_folder(folder, tmp_path / "out")
+
+
+def test_what_was_understood_is_said_and_drawn(folder, tmp_path):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n + 1:04d}.png", x, np.uint16))
+    save(folder / "images/notes/x.png", light_of(0, 0), np.uint16)
+    settings(folder, "first_light = 1")
+    understood = Import.of(folder, None, settings_of(folder))
+    assert understood.counts()["frames"] == 6
+    assert "left: 3 frames of 24x24, images/left/0001.png, …" in understood.said()
+    assert any("images/notes/x.png" in note for note in understood.found.notes)
+    contact_sheet(understood, tmp_path / "sheet.png")
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape[0] == 2 * 160
+    assert not (tmp_path / "out").exists()
+
+
+def test_steps_of_all_kinds(folder, tmp_path):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    pose = {"K": [[30, 0, 11.5], [0, 30, 11.5], [0, 0, 1]], "R": np.eye(3).tolist()}
+    beam = {"name": "proj_0", "width": 8, "height": 4, **pose, "t": [0, 0, 1]}
+    (folder / "projectors.json").write_text(json.dumps({"projectors": [beam]}))
+    for camera in CAMERAS:
+        for name in ("dark", "full", "track_00001", "track_00004", "row_00002_2", "row_00003_3"):
+            save(folder / camera / f"{name}.png", light_of(0, 0), np.uint16)
+    settings(
+        folder,
+        '[pictures]\ndark = "{camera}/dark.png"\nall_on = "{camera}/full.png"\n'
+        'tracking = "{camera}/track_{number}.png"\n'
+        'scanline = "{camera}/row_{number}_{row}.png"\n',
+    )
+    capture: Capture = import_folder(folder, tmp_path / "out")
+    kinds = [(s.kind, s.row) for s in capture.steps]
+    assert kinds == [
+        ("dark", None), ("all_on", None), *[("olat", None)] * 3,
+        ("tracking", None), ("scanline", 2), ("scanline", 3), ("tracking", None),
+    ]  # fmt: skip
+    assert capture.of_kind("scanline")[0].projector == "proj_0"
