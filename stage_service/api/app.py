@@ -17,7 +17,7 @@ from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
 from stage_service.api import event_stream, login, queueing, routes, steering, store, viewing
-from stage_service.api.connections import LOOPBACK, limits, listening
+from stage_service.api.connections import LOOPBACK, QUEUED, limits, listening
 from stage_service.api.downloads import Heads
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
@@ -95,6 +95,8 @@ class _Announcing(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
+        for listener in sockets or ():
+            listener.listen(QUEUED)
         self._ready()
 
 

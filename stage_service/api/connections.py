@@ -18,6 +18,9 @@ MOST_STREAMS = 256
 HEADER_S = 5.0
 """A request's headers are there within this time."""
 MOST_HEADER_BYTES = 16 << 10
+ACCEPTED, QUEUED = 32, 1024
+"""Connections that are accepted in one turn of the event loop, some turns before they count: few,
+or the descriptors run out meanwhile. And those that the kernel lets wait for that."""
 _NO_ROOM = b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
 
 
@@ -99,6 +102,7 @@ def limits() -> dict[str, Any]:
     """What uvicorn is to be configured with."""
     return {
         "http": protocol(),
+        "backlog": ACCEPTED,
         "ws": "none",
         "timeout_keep_alive": int(HEADER_S),
         "h11_max_incomplete_event_size": MOST_HEADER_BYTES,

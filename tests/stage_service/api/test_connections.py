@@ -7,12 +7,14 @@ import json
 import os
 import resource
 import shutil
+import signal
 import socket
 import ssl
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -132,6 +134,38 @@ def test_answers_leave_at_once():
             return delay_off
 
     assert asyncio.run(accepted()) == 1
+
+
+def test_a_burst_of_connections_leaves_descriptors_too(rig_file, tmp_path):
+    """More at once than the process may have files, each with half a request."""
+    command = [sys.executable, "-m", "stage_service.cli", "serve", "--json", "--port", "0"]
+    command += ["--no-auth", "--rig", str(rig_file.path), "--root", str(tmp_path / "root")]
+    errors = tmp_path / "errors"
+    own = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if own[1] < 4096:
+        pytest.skip("this process may not open 1,224 connections")
+    with ExitStack() as stack, errors.open("w") as told:
+        few = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))"
+        service = subprocess.Popen(
+            [sys.executable, "-c", f"{few}; os.execv(sys.argv[1], sys.argv[1:])", *command],
+            stdout=subprocess.PIPE,
+            stderr=told,
+            text=True,
+        )
+        stack.callback(lambda: (service.kill(), service.wait(), service.stdout.close()))
+        url = json.loads(service.stdout.readline())["url"]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (4096, own[1]))
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, own)
+        address = (httpx.URL(url).host, httpx.URL(url).port)
+        os.kill(service.pid, signal.SIGSTOP)  # it finds them all at once
+        for _ in range(1000):
+            stack.enter_context(socket.create_connection(address)).sendall(HALF)
+        os.kill(service.pid, signal.SIGCONT)
+        for _ in range(224):
+            stack.enter_context(socket.create_connection(address)).sendall(HALF)
+        with httpx.Client(trust_env=False, timeout=60) as http:
+            assert http.get(f"{url}/health").status_code == 200
+        assert "Too many open files" not in errors.read_text()
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl here")
