@@ -6,12 +6,10 @@ prints "here" and does not return; with "after " before the name it is carried o
 
 from __future__ import annotations
 
-import functools
-import importlib
 import sys
-import threading
 from pathlib import Path
-from typing import Any
+
+from standing import stand_still
 
 from reconstruction import CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
@@ -20,30 +18,8 @@ from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
-
-def stand_still(place: str, call: int) -> None:
-    after = place.startswith("after ")
-    module, path = place.removeprefix("after ").split(":")
-    owner: Any = importlib.import_module(module)
-    *owners, name = path.split(".")
-    for part in owners:
-        owner = getattr(owner, part)
-    function, calls = getattr(owner, name), iter(range(1, sys.maxsize))
-
-    @functools.wraps(function)
-    def instead(*args: Any, **more: Any) -> Any:
-        here = next(calls) == call
-        result = function(*args, **more) if after or not here else None
-        if here:
-            print("here", flush=True)
-            threading.Event().wait()
-        return result
-
-    setattr(owner, name, instead)
-
-
 rig, devices, capture, plan, place, call = sys.argv[1:]
-stand_still(place, int(call))
+stand_still(place, int(call), lambda: print("here", flush=True))
 rig_file = load_rig_file(rig, devices)
 wanted = resolve(CapturePlan.model_validate_json(plan), rig_file)
 if (Path(capture) / "plan.json").exists():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from standing import PLACES
 from waiting import until
 
 from reconstruction import Capture, CaptureWriter, verify
@@ -22,44 +23,9 @@ from stage_service.plan.resolved import resolve
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
-STAGES = [
-    ("connecting", "after stage_service.devices.device_set:DeviceSet.connect", 1, "software"),
-    ("arming", "after stage_service.acquisition.sequencer:Sequencer._arm", 1, "software"),
-    ("a lamp lit", "after stage_service.acquisition.exposing:Exposing._light", 6, "software"),
-    ("all lamps lit", "after stage_service.acquisition.exposing:Exposing._light", 2, "software"),
-    (
-        "a scanline shown",
-        "after stage_service.acquisition.exposing:Exposing._light",
-        15,
-        "software",
-    ),
-    ("after a pulse", "stage_service.acquisition.exposing:Exposing._check_lamps", 5, "software"),
-    ("reading frames", "stage_service.acquisition.sequencer:Sequencer._account", 9, "software"),
-    ("storing a frame", "reconstruction.files.durable:_write", 9, "software"),
-    ("after storing frames", "reconstruction.capture.writer:CaptureWriter.commit", 4, "software"),
-    (
-        "after the journal",
-        "after reconstruction.capture.writer:CaptureWriter.commit",
-        4,
-        "software",
-    ),
-    ("before the manifest", "reconstruction.capture.writer:CaptureWriter.finish", 1, "software"),
-    (
-        "a table armed",
-        "after stage_service.devices.trigger.serial_box:SerialTriggerBox.load_table",
-        1,
-        "hardware",
-    ),
-    (
-        "a table running",
-        "stage_service.acquisition.hardware_run:HardwareRun._collect",
-        1,
-        "hardware",
-    ),
-]
 
 
-@pytest.mark.parametrize(("name", "place", "call", "stepping"), STAGES, ids=[s[0] for s in STAGES])
+@pytest.mark.parametrize(("name", "place", "call", "stepping"), PLACES, ids=[p[0] for p in PLACES])
 def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, tmp_path, told):
     rig_file, world = simulated()
     plan = CapturePlan(**PLAN, stepping=stepping)
@@ -76,7 +42,7 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, t
         ],
         stdout=subprocess.PIPE,
         cwd=CHECKOUT,
-        env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+        env={**os.environ, "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}"},
     )
     assert child.stdout is not None
     assert child.stdout.readline() == b"here\n"

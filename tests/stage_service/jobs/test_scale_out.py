@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import pwd
 import random
-import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
+from postgresql import Missing, running
 from waiting import until
 
 from reconstruction import Model
@@ -23,37 +21,16 @@ from stage_service.jobs.records import PipelineRequest
 from stage_service.jobs.slots import Namespace, WorkerSlot, hold_dead, workers_seen
 
 WORKER = Path(__file__).with_name("job_worker.py")
-BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
 
 
 @pytest.fixture(scope="module")
 def postgresql() -> Iterator[str]:
-    """The URL of a PostgreSQL server of Debian's packages, started for these tests."""
-    if not BINARIES:
-        pytest.skip("no PostgreSQL here (apt-get install postgresql)")
-    user = None
-    if os.getuid() == 0:  # the server refuses to be run by root
-        user = next((u.pw_uid for u in pwd.getpwall() if u.pw_name == "postgres"), None)
-        if user is None:
-            pytest.skip("PostgreSQL is here without the user postgres, and does not run as root")
-    folder = Path(tempfile.mkdtemp(prefix="hairstage-pg-"))
-    if user is not None:
-        os.chown(folder, user, -1)
-
-    def run(program: str, *arguments: str) -> None:
-        command = [str(BINARIES[-1] / program), "-D", str(folder / "data"), *arguments]
-        subprocess.run(command, check=True, user=user, cwd=folder, stdout=subprocess.DEVNULL)
-
+    """The URL of a PostgreSQL server, started for these tests."""
     try:
-        run("initdb", "--no-sync", "-A", "trust", "-U", "hairstage")
-        options = f"-c listen_addresses= -c fsync=off -k {folder}"
-        run("pg_ctl", "-w", "-l", str(folder / "log"), "-o", options, "start")
-        try:
-            yield f"postgresql://hairstage@/hairstage?host={folder}"
-        finally:
-            run("pg_ctl", "-w", "-m", "immediate", "stop")
-    finally:
-        shutil.rmtree(folder)
+        with running() as server:
+            yield server.url
+    except Missing as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -1,0 +1,180 @@
+"""A service on a simulated stage, and what others do to it meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from stage_service.cli.support.children import Children, own_command
+from stage_service.config import RigFile
+
+HURRY_S = 300.0
+"""Whatever a service is to come to, it has by then, on a busy machine too."""
+
+
+class Live:
+    """One service, begun again where it was killed; `command` runs `hairstage`, or it does."""
+
+    def __init__(
+        self, rig: RigFile, children: Children, root: Path, command: Sequence[str] = ()
+    ) -> None:
+        self.rig, self.root, self._children = rig, root, children
+        self.kills = 0
+        self.begin(command)
+
+    def words(self, root: Path) -> list[str]:
+        """The arguments of `hairstage` that serve this stage."""
+        devices = self.rig.path.parent / "devices.toml"
+        words = ("serve", "--json", "--no-auth", "--port", "0", "--rig", self.rig.path)
+        return [str(word) for word in (*words, "--root", root, "--devices", devices)]
+
+    def begin(self, command: Sequence[str] = ()) -> None:
+        """Start the service, or start it again."""
+        name = f"{self.root.name}-{self.kills}"
+        whole = (
+            [*command, *self.words(self.root)] if command else own_command(*self.words(self.root))
+        )
+        self.child: subprocess.Popen[str] = self._children.start(name, whole, answers=True)
+        url = self._children.first_line(name, self.child, HURRY_S)["url"]
+        # A connection each: one that waits for its next request makes room where there are many.
+        each = httpx.Limits(max_keepalive_connections=0)
+        self.http = httpx.Client(base_url=url, timeout=60, trust_env=False, limits=each)
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.child.send_signal(signal.SIGKILL)
+        self.child.wait()
+        self.http.close()
+        self.kills += 1
+
+    def end(self) -> None:
+        """As somebody who stops it."""
+        self.http.close()
+        self.child.terminate()
+        self.child.wait(HURRY_S)
+
+    def ask(self, method: str, path: str, body: Any = None) -> Any:
+        """The answer's JSON. Raises where it is none of success."""
+        return self.http.request(method, path, json=body).raise_for_status().json()
+
+    def until_done(self, capture: str) -> dict[str, Any]:
+        """The capture once it is done."""
+        while (status := self.ask("GET", f"/captures/{capture}"))["state"] != "done":
+            time.sleep(0.1)
+        done: dict[str, Any] = status
+        return done
+
+    def stage_pid(self) -> int:
+        """The process that is the stage's devices."""
+        rig = str(self.rig.path).encode()
+        for process in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                words = (process / "cmdline").read_bytes().split(b"\0")
+                if b"simulators" in words and rig in words:
+                    return int(process.name)
+        raise LookupError(f"no simulators of {self.rig.path} run here")
+
+    def size(self) -> dict[str, int]:
+        """Resident bytes and open descriptors of the service."""
+        status = Path(f"/proc/{self.child.pid}/status").read_text()
+        kilobytes = int(status.partition("VmRSS:")[2].split()[0])
+        return {
+            "rss_bytes": kilobytes * 1024,
+            "descriptors": sum(1 for _ in Path(f"/proc/{self.child.pid}/fd").iterdir()),
+        }
+
+
+@contextlib.contextmanager
+def _nothing(_live: Live) -> Iterator[None]:
+    yield
+
+
+@contextlib.contextmanager
+def _polls(live: Live) -> Iterator[None]:
+    """100 requests a second, where the service keeps up."""
+    over = threading.Event()
+    threads = [threading.Thread(target=_poll, args=(live, over)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    time.sleep(0.5)
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+
+
+def _poll(live: Live, over: threading.Event) -> None:
+    """25 requests a second."""
+    with httpx.Client(base_url=live.http.base_url, timeout=60, trust_env=False) as http:
+        while not over.wait(0.04):
+            with contextlib.suppress(httpx.HTTPError):
+                http.get("/captures")
+
+
+@contextlib.contextmanager
+def _listeners(live: Live) -> Iterator[None]:
+    """200 clients that follow the events, and read what comes."""
+    over = threading.Event()
+    with _connected(live, 200, b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") as links:
+
+        def read() -> None:
+            open_ones = list(links)
+            while not over.wait(0 if open_ones else 0.1):
+                for link in select.select(open_ones, [], [], 0.1)[0]:
+                    try:
+                        gone = not link.recv(1 << 16)
+                    except OSError:  # the service was killed
+                        gone = True
+                    if gone:
+                        open_ones.remove(link)
+
+        thread = threading.Thread(target=read)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+@contextlib.contextmanager
+def _connected(live: Live, number: int, sent: bytes) -> Iterator[list[socket.socket]]:
+    url, links = live.http.base_url, list[socket.socket]()
+    try:
+        for _ in range(number):
+            with contextlib.suppress(OSError):
+                link = socket.create_connection((url.host, url.port or 80), 5)
+                links.append(link)
+                link.sendall(sent)
+        yield links
+    finally:
+        for link in links:
+            link.close()
+
+
+@contextlib.contextmanager
+def _half_open(live: Live) -> Iterator[None]:
+    """1,000 connections that send half a request."""
+    with _connected(live, 1000, b"GET /health HTTP/1.1\r\n"):
+        yield
+
+
+LOADS: dict[str, Callable[[Live], AbstractContextManager[None]]] = {
+    "nothing": _nothing,
+    "100 requests a second": _polls,
+    "200 listeners": _listeners,
+    "1,000 half-open connections": _half_open,
+}
