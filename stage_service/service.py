@@ -39,11 +39,14 @@ from stage_service.service_models import (
     CaptureView,
     Health,
     JobRequest,
+    LatchView,
     LeaseGrant,
     LeaseRequest,
     LeaseView,
     QueueRequest,
     RenewRequest,
+    RigView,
+    StepView,
 )
 from stage_service.storage import Removed, Storage
 from stage_service.verification import Verification, Verifier
@@ -292,6 +295,17 @@ class Service:
         except (OSError, ValueError) as error:
             raise CaptureError(str(error)) from error
 
+    def steps(self, capture_id: str) -> list[StepView]:
+        """What a capture shoots, in order, and which frames it has. Raises `UnknownCapture`,
+        `CaptureError`."""
+        capture = Capture(self.capture_path(capture_id))
+        names = [camera.name for camera in capture.rig.cameras]
+        there = {key for key, r in capture.records.items() if r.file is not None}
+        return [
+            StepView(**step.to_dict(), lacks=[n for n in names if (step.index, n) not in there])
+            for step in capture.steps
+        ]
+
     def done_capture(self, capture_id: str) -> Path:
         """The folder of a capture that nobody shoots. Raises `UnknownCapture`, `NotFinished`."""
         path = self.capture_path(capture_id)
@@ -427,20 +441,20 @@ class Service:
         """Steer alone for some time. Raises `Leased`."""
         work = partial(self._control.leases.take, request.holder, request.seconds)
         detail = f"{request.holder}, {request.seconds:g} s"
-        return _grant(self._control.do(by, "lease.take", work, detail=detail, steers=False))
+        return self._granted(self._control.do(by, "lease.take", work, detail=detail, steers=False))
 
     def renew_lease(self, request: RenewRequest, by: Caller) -> LeaseGrant:
         """Let the caller's lease end so many seconds from now. Raises `NoLease`."""
         work = partial(self._control.leases.renew, by.token or "", request.seconds)
         detail = f"{request.seconds:g} s"
-        return _grant(self._control.do(by, "lease.renew", work, detail=detail, steers=False))
+        return self._granted(self._control.do(by, "lease.renew", work, detail=detail, steers=False))
 
     def release_lease(self, by: Caller) -> LeaseView:
         """End the caller's lease. Raises `Forbidden`, `NoLease`."""
         by.require("steer")
         work = partial(self._control.leases.release, by.token or "")
         self._control.do(by, "lease.release", work, steers=False)
-        return self.lease()
+        return self._tell_lease()
 
     def end_lease(self, by: Caller) -> LeaseView:
         """End the lease whoever holds it. Raises `Forbidden`, `NoLease`."""
@@ -449,7 +463,16 @@ class Service:
         detail = "" if held is None else f"held by {held.holder}"
         work = self._control.leases.end
         self._control.do(by, "lease.end", work, detail=detail, steers=False)
-        return self.lease()
+        return self._tell_lease()
+
+    def _granted(self, lease: Lease) -> LeaseGrant:
+        self._tell_lease()
+        return LeaseGrant(token=lease.token, holder=lease.holder, expires=lease.expires)
+
+    def _tell_lease(self) -> LeaseView:
+        view = self.lease()
+        self.events.publish("stage.lease", view.model_dump())
+        return view
 
     def record_login(self, name: str, address: tuple[str, int] | None) -> None:
         """Note in the audit log who logged in, and from where."""
@@ -477,8 +500,15 @@ class Service:
             capture=self._captures.running,
             unread=self.unread,
             lamps=lamps["state"],
+            lamps_detail=lamps["detail"],
+            latch=LatchView.of(self._captures.latch.latched),
+            disk_free_bytes=self.watching.free_bytes(),
             problems=problems,
         )
+
+    def rig(self) -> RigView:
+        """Where lights, cameras and projectors stand."""
+        return RigView.of(self.rig_file)
 
     def ready(self) -> None:
         """Raise `NotReady` where no capture could begin, but for one that runs."""
@@ -507,10 +537,6 @@ class Service:
         if not masks:
             raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
         return masks
-
-
-def _grant(lease: Lease) -> LeaseGrant:
-    return LeaseGrant(token=lease.token, holder=lease.holder, expires=lease.expires)
 
 
 def _check_names(pipeline: PipelineRequest, rig: Rig) -> None:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, Field
 
+from reconstruction import Camera, Projector
+from reconstruction.arrays import AnyFloats
+from reconstruction.capture.folder import StepKind
 from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.capture_queue import Entry
+from stage_service.acquisition.latch import Latched
 from stage_service.acquisition.states import CaptureStatus
-from stage_service.config import Strict
+from stage_service.config import CaptureDefaults, RigFile, Strict
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 
@@ -158,12 +162,32 @@ class Artifact(BaseModel):
     bytes: int
 
 
+class LatchView(BaseModel):
+    """Nothing is lit since `since`, because of `detail`; "blackout" ends it where the link can
+    tell that the lamps are off, else only a person's word: "acknowledge"."""
+
+    since: str
+    detail: str
+    ended_by: Literal["blackout", "acknowledge"]
+
+    @classmethod
+    def of(cls, latched: Latched | None) -> Self | None:
+        """That of a latch; None where nothing is latched."""
+        if latched is None:
+            return None
+        way_out: Literal["blackout", "acknowledge"]
+        way_out = "blackout" if latched.reads_back else "acknowledge"
+        return cls(since=latched.since, detail=latched.detail, ended_by=way_out)
+
+
 class Health(BaseModel):
     """How the service is, as far as it knows without asking a device or the job database.
 
     `status`: "unsafe" while nobody knows whether the lamps are off, "degraded" where something else
     is wrong; `problems` has a sentence for each. `worker`: whether one runs; `unread`: captures on
-    the disk that are not listed yet; `lamps`: "dark", "in use" or "unknown, unsafe".
+    the disk that are not listed yet; `lamps`: "dark", "in use" or "unknown, unsafe", `lamps_detail`
+    how that is known. `latch` is there while nothing may be lit. `disk_free_bytes` is the root
+    folder's, None where the disk does not answer.
     """
 
     status: Literal["ok", "degraded", "unsafe"]
@@ -174,4 +198,81 @@ class Health(BaseModel):
     capture: str | None
     unread: int
     lamps: str
+    lamps_detail: str
+    latch: LatchView | None
+    disk_free_bytes: int | None
     problems: list[str]
+
+
+class StepView(BaseModel):
+    """A commanded exposure; `light` for "olat", `projector` and `row` for "scanline". `lacks`:
+    the cameras that have no frame of it, or not yet."""
+
+    index: int
+    kind: StepKind
+    exposure: float
+    level: float
+    light: str | None = None
+    projector: str | None = None
+    row: int | None = None
+    lacks: list[str] = []
+
+
+Vector = tuple[float, float, float]
+
+
+class Standing(BaseModel):
+    """Where something stands: metres, z up, the head's centre at the origin, its face to −y."""
+
+    name: str
+    position: Vector
+
+
+class Looking(Standing):
+    """A camera or a projector: the unit vector that it looks along, and how many pixels it has."""
+
+    towards: Vector
+    width: int
+    height: int
+
+
+class RigView(BaseModel):
+    """The rig: where its lights, cameras and projectors stand, and what a plan gets where it does
+    not say otherwise. `living_subject`: flashes of 3 to 30 Hz need consent."""
+
+    name: str
+    lights: list[Standing]
+    cameras: list[Looking]
+    projectors: list[Looking]
+    defaults: CaptureDefaults
+    hardware_stepping: bool
+    living_subject: bool
+
+    @classmethod
+    def of(cls, rig_file: RigFile) -> Self:
+        """That of a rig file."""
+        rig, devices = rig_file.rig, rig_file.devices
+        return cls(
+            name=rig.name,
+            lights=[Standing(name=x.name, position=_vector(x.position)) for x in rig.lights],
+            cameras=[_looking(c) for c in rig.cameras],
+            projectors=[_looking(p) for p in rig.projectors],
+            defaults=rig_file.capture,
+            hardware_stepping=devices is not None and devices.hardware_stepping,
+            living_subject=rig_file.safety.living_subject,
+        )
+
+
+def _vector(array: AnyFloats) -> Vector:
+    x, y, z = (float(value) for value in array)
+    return x, y, z
+
+
+def _looking(device: Camera | Projector) -> Looking:
+    return Looking(
+        name=device.name,
+        position=_vector(device.center),
+        towards=_vector(device.R[2]),
+        width=device.width,
+        height=device.height,
+    )

@@ -52,6 +52,11 @@ class Watching:
         self._started = time.time()
         self._disk = LastSeen(self._look, {"free": None, "workers": []}, LONGEST_LOOK_S)
 
+    def free_bytes(self) -> int | None:
+        """What the disk of the root folder has left; None where it does not answer."""
+        free = self._disk.get()["free"]
+        return None if free is None else int(free)
+
     def problems(self) -> list[str]:
         """Why no capture could begin, a sentence each; one that runs is no reason."""
         safety, free = self.captures.safety(), self._disk.get()["free"]

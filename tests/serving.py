@@ -27,13 +27,18 @@ class Client(httpx.Client):
 
 @contextmanager
 def serving(
-    rig_file: RigFile, root: Path, access: Access | None = None, *, all_read: bool = True
+    rig_file: RigFile,
+    root: Path,
+    access: Access | None = None,
+    *,
+    all_read: bool = True,
+    port: int = 0,
 ) -> Iterator[Client]:
     """The application, started and closed as the server does; it has read what is on the disk."""
     service = Service(rig_file, root)
     # The socket takes connections before the server does: the first answer comes when it is up.
     with (
-        listening_app(create_app(service, access)) as url,
+        listening_app(create_app(service, access), port) as url,
         Client(base_url=url, timeout=60, trust_env=False) as client,
     ):
         client.service = service
@@ -43,11 +48,11 @@ def serving(
 
 
 @contextmanager
-def listening_app(app: FastAPI) -> Iterator[str]:
+def listening_app(app: FastAPI, port: int = 0) -> Iterator[str]:
     """The URL of an application on a socket of its own."""
     config = uvicorn.Config(app, log_level="critical", ws="none", timeout_graceful_shutdown=1)
     server = uvicorn.Server(config)
-    listener = socket.create_server(("127.0.0.1", 0))
+    listener = socket.create_server(("127.0.0.1", port))
     thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()
     try:

@@ -39,7 +39,6 @@ class CaptureRun:
         self._events = events
         self._writer = writer
         self._first = read_status(writer.path)
-        self._again = 0
         living = plan.rig_file.safety.living_subject
         free = not living or (plan.plan.consent is not None and consented)
         self.sequencer = Sequencer(
@@ -50,12 +49,14 @@ class CaptureRun:
         """Where it is now."""
         sequencer = self.sequencer
         written, missing = self._writer.counts()
+        progress = sequencer.progress.now()
         return self._first.model_copy(
             update={
                 "state": sequencer.state,
                 "outcome": sequencer.outcome if sequencer.state == "done" else None,
                 "error": sequencer.error,
-                "step": sequencer.steps_done,
+                "step": progress.step,
+                "progress": None if sequencer.state == "done" else progress,
                 "frames_written": written,
                 "frames_missing": missing,
                 "seconds": sequencer.seconds,
@@ -66,15 +67,15 @@ class CaptureRun:
         """What this run made of frames: "written", "missing" and shot "again"."""
         written, missing = self._writer.counts()
         before = self._first.frames_written
-        return Counter(written=written - before, missing=missing, again=self._again)
+        return Counter(
+            written=written - before, missing=missing, again=self.sequencer.progress.again
+        )
 
     def give_up(self) -> None:
         """Let go of the folder without having begun."""
         self._writer.close()
 
     def _notify(self, kind: str, data: dict[str, Any]) -> None:
-        if kind == "capture.frame_missing" and data["shot_again"]:
-            self._again += len(data["cameras"])
         self._events.publish(kind, {"id": self.id, **data})
 
 

@@ -485,6 +485,7 @@ class CaptureManager:
             self.ended = status
             self.catalogue.put(status)
             self._running = None
+        self.events.publish("capture.over", {"id": run.id, "outcome": result})
 
     def _learn(self, result: Blackout) -> None:
         """Keep what a blackout came to, and latch or unlatch."""
@@ -496,6 +497,7 @@ class CaptureManager:
         if change is not None:
             self.audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
             self.events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
+        self.events.publish("stage.lamps", self.darkness())
 
 
 def _not_yet_over(status: CaptureStatus) -> CaptureStatus:

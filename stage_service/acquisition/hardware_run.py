@@ -9,6 +9,7 @@ from itertools import accumulate, groupby
 from typing import Literal
 
 from reconstruction import Step
+from stage_service.acquisition.progress import RunProgress
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import CameraDevice, Frame
 from stage_service.devices.device_set import DeviceSet
@@ -49,8 +50,10 @@ class HardwareRun:
         lamp: dict[str, int],
         *,
         rate_hz: float | None,
+        progress: RunProgress,
     ) -> None:
         self._devices, self._steps, self._lamp = devices, steps, lamp
+        self._progress = progress
         settle = devices.config.lights.settle_s
         each = [
             TableRow(1, _gate(s), settle, s.exposure, period_s(s, devices.config, rate_hz))
@@ -108,6 +111,7 @@ class HardwareRun:
             frame = camera.read(cancel)
             if frame is not None:
                 frames.append(frame)
+                self._progress.came(camera.name)
             elif last_look:
                 return frames
             elif cancel.is_set():

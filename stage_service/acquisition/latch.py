@@ -22,11 +22,8 @@ class Unsafe(RuntimeError):
     """Captures are refused: the last blackout could not be verified."""
 
     def __init__(self, latched: Latched) -> None:
-        way_out = "until somebody has looked and says so with POST /devices/acknowledge"
-        if latched.reads_back:
-            way_out = "until POST /devices/blackout reads it back dark"
         detail = latched.detail.rstrip(".")
-        super().__init__(f"since {latched.since}: {detail}. Nothing is lit {way_out}.")
+        super().__init__(f"since {latched.since}: {detail}. Nothing is lit {latched.way_out}.")
 
 
 class CannotAcknowledge(RuntimeError):
@@ -40,6 +37,13 @@ class Latched:
     since: str
     detail: str
     reads_back: bool
+
+    @property
+    def way_out(self) -> str:
+        """What ends it."""
+        if self.reads_back:
+            return "until POST /devices/blackout reads it back dark"
+        return "until somebody has looked and says so with POST /devices/acknowledge"
 
 
 class Latch:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -13,6 +14,7 @@ from stage_service.acquisition.accounting import FrameAccount, PulseAccount
 from stage_service.acquisition.exposing import Exposing, Pulse
 from stage_service.acquisition.frame_queue import FrameWriter, Shot
 from stage_service.acquisition.hardware_run import HardwareRun, Shots
+from stage_service.acquisition.progress import RunProgress
 from stage_service.acquisition.safety import Blackout, blackout, check_interlocks
 from stage_service.acquisition.sentinels import check_sentinels
 from stage_service.acquisition.states import Machine, Outcome, State, WrongState
@@ -51,8 +53,8 @@ class Sequencer:
 
     `plan` is the writer's. `watch` is called before the service lights a step, and raises what
     forbids it; what the box clocks keeps to the plan's prediction. `notify(kind, data)` hears
-    "capture.state", "capture.step" and "capture.frame_missing". Whatever ends the run, lamps and
-    projectors are put off and read back.
+    "capture.state", "capture.progress", "capture.step", "capture.frame_missing". Whatever ends the
+    run, lamps and projectors are put off and read back. `progress` is asked by any thread.
     """
 
     def __init__(
@@ -69,6 +71,12 @@ class Sequencer:
         self.faults: list[str] = []  # the names of devices that failed
         self.blackout: Blackout | None = None
         self.steps_done = 0
+        shot = Counter(camera for (_, camera), r in writer.records.items() if r.file is not None)
+        self.progress = RunProgress(
+            writer.steps,
+            {c.name: shot[c.name] for c in devices.cameras},
+            lambda now: self._notify("capture.progress", now.model_dump(mode="json")),
+        )
         self._began: float | None = None
         self._ended: float | None = None
         self._writer = writer
@@ -121,13 +129,15 @@ class Sequencer:
             if self._clocked:
                 raise CannotPause(self._clocked)
             self._pause_asked = True
+            self._move("pause")
 
     def resume(self) -> None:
         """Go on, or take back a pause that has not begun. Raises `WrongState`."""
         with self._changed:
-            if not self._pause_asked:
-                self._require("resume")
+            self._require("resume")
             self._pause_asked = False
+            if self.state == "pausing":
+                self._move("resume")
             self._changed.notify_all()
 
     def abort(self) -> None:
@@ -135,6 +145,8 @@ class Sequencer:
         with self._changed:
             self._require("abort")
             self._abort_asked = True
+            if self.state != "aborting":
+                self._move("abort")
             self._changed.notify_all()
 
     def stop_now(self) -> None:
@@ -142,6 +154,8 @@ class Sequencer:
         with self._changed:
             self._abort_asked = True
             self._cancel.set()
+            if self.state != "aborting" and self._machine.allows("abort"):
+                self._move("abort")
             self._changed.notify_all()
 
     def darken(self, within_s: float) -> Blackout:
@@ -164,12 +178,14 @@ class Sequencer:
         """
         self._began = time.monotonic()
         leave: BaseException | None = None
-        self._move("start")
+        with self._changed:
+            if self.state == "idle":  # nobody has asked to abort it yet
+                self._move("start")
         try:
             self._session()
             self._move("complete")
         except Cancelled:
-            self._move("abort")
+            self._move("stop")
         except BaseException as error:
             self._fail(error)
             leave = None if isinstance(error, Exception) else error
@@ -229,15 +245,18 @@ class Sequencer:
             for run in self._runs:
                 todo = {s: w for s in run.steps if (w := self._wanted(s))}
                 self.steps_done += len(run.steps) - len(todo)  # shot before this run
+                self.progress.skip(s for s in run.steps if s not in todo)
                 if run.stepping == "hardware" and len(todo) >= SHORTEST_RUN:
                     self._boundary(beats)
                     self._clock(todo, cameras, frames)
                 for step, wanted in todo.items():
                     self._boundary(beats)
                     if wanted:
+                        self.progress.begin(step)
                         with self._timings.step():
                             self._shoot(step, wanted, cameras, frames)
                     self.steps_done += 1
+                    self.progress.done(step)
                     self._notify("capture.step", {"steps_done": self.steps_done, **step.to_dict()})
             cameras(self._drain)
             cameras(lambda camera: camera.disarm())
@@ -251,8 +270,10 @@ class Sequencer:
     def _clock(self, todo: dict[Step, set[str]], cameras: FanOut, frames: FrameWriter) -> None:
         """Let the trigger box clock these steps; what arrived is taken off `todo`'s cameras."""
         steps = list(todo)
-        run = HardwareRun(self.devices, steps, self._lamp, rate_hz=self._rate_hz)
+        progress, kept = self.progress, Counter(dict.fromkeys(self._accounts, 0))
+        run = HardwareRun(self.devices, steps, self._lamp, rate_hz=self._rate_hz, progress=progress)
         self._clocked = len(steps)
+        progress.begin_run(steps)
         try:
             with self._timings.on("arm"):
                 self._arm(steps[0].exposure, cameras)
@@ -273,7 +294,9 @@ class Sequencer:
                 pulse = first + place
                 shot = Shot(steps[place], camera.name, frame, camera.info, pulse, attempt=0)
                 self._put(frames, shot)
+                kept[camera.name] += 1
                 todo[steps[place]].discard(camera.name)
+        progress.end_run(kept)
         self._doubtful = any(todo.values())
         if shots.error is not None:
             raise shots.error
@@ -305,6 +328,7 @@ class Sequencer:
                 if frame is not None and camera.name in wanted:
                     taken = Shot(step, camera.name, frame, camera.info, pulse.count, attempt)
                     self._put(frames, taken)
+                    self.progress.arrived(camera.name)
                     wanted.discard(camera.name)
             if not wanted:
                 return
@@ -323,6 +347,7 @@ class Sequencer:
         if cameras:
             lost = {"step": step.index, "cameras": sorted(cameras), "attempt": attempt}
             again = attempt < self._retries
+            self.progress.again += len(cameras) * again
             self._notify("capture.frame_missing", {**lost, "shot_again": again})
 
     def _account(self, camera: CameraDevice, frame: Frame | None, pulse: Pulse) -> None:
@@ -366,23 +391,26 @@ class Sequencer:
             raise Cancelled("aborted")
         if not self._pause_asked:
             return
-        self._move("pause")
         dark = blackout(self.devices)
         if dark.blocks:
             raise RuntimeError(f"pausing: {dark.detail}")
         with self._changed:
+            if self.state == "pausing":
+                self._move("hold")
             self._changed.wait_for(lambda: self._abort_asked or not self._pause_asked)
         if self._abort_asked:
             raise Cancelled("aborted while paused")
         check_interlocks(self.devices)
-        self._move("resume")
+        with self._changed:
+            if self.state == "paused":
+                self._move("resume")
 
     def _black_out(self) -> None:
         self.blackout = blackout(self.devices)
         self._dark.set()
 
     def _require(self, action: str) -> None:
-        if not self._machine.allows(action) or (self._abort_asked and action != "abort"):
+        if not self._machine.allows(action):
             raise WrongState(action, self.state)
 
     def _fail(self, error: BaseException) -> None:

@@ -11,23 +11,28 @@ from reconstruction import Capture, CaptureError
 from reconstruction.options import sentence
 from reconstruction.reading import printable
 
-State = Literal["idle", "running", "paused", "finishing", "done"]
+State = Literal["idle", "running", "pausing", "paused", "aborting", "finishing", "done"]
 Outcome = Literal["completed", "aborted", "failed", "interrupted", "damaged"]
 
+_END: dict[str, State] = {"complete": "finishing", "fail": "finishing"}
+
 TRANSITIONS: dict[State, dict[str, State]] = {
-    "idle": {"start": "running", "abort": "finishing", "fail": "finishing"},
-    "running": {"pause": "paused", **dict.fromkeys(("complete", "abort", "fail"), "finishing")},
-    "paused": {"resume": "running", "abort": "finishing", "fail": "finishing"},
+    "idle": {"start": "running", "abort": "aborting", "fail": "finishing"},
+    "running": {"pause": "pausing", "abort": "aborting", **_END},
+    "pausing": {"hold": "paused", "resume": "running", "abort": "aborting", **_END},
+    "paused": {"resume": "running", "abort": "aborting", "fail": "finishing"},
+    "aborting": {"abort": "aborting", "stop": "finishing", **_END},
     "finishing": {"finish": "done", "fail": "finishing"},
     "done": {"continue": "running"},
 }
 """state -> action -> next state; whatever is not listed is refused.
 
-"continue" shoots what a capture lacks that is done and did not complete: a new run, which starts
-where the table says that a run starts.
+"pause" and "abort" are asked for, "hold" and "stop" are when the run, dark, has heeded them; the
+step under way may complete it before. "continue" shoots what a capture lacks that is done and did
+not complete: a new run, which starts where the table says that a run starts.
 """
 
-OUTCOMES: dict[str, Outcome] = {"complete": "completed", "abort": "aborted", "fail": "failed"}
+OUTCOMES: dict[str, Outcome] = {"complete": "completed", "stop": "aborted", "fail": "failed"}
 """The outcome that the action decides; a later failure wins over an earlier success."""
 
 
@@ -68,11 +73,33 @@ class Machine:
         return self.state
 
 
+class Progress(BaseModel):
+    """What a run is at: the step's light, or projector and row; `by_box`: the trigger box clocks.
+
+    `step` counts steps whose frames have all arrived, `frames` those of each camera that have;
+    `again` frames that are shot again. `seconds_left` goes by the steps that were measured: None
+    while they are too few, and not counting a pause.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    step: int
+    kind: str | None = None
+    light: str | None = None
+    projector: str | None = None
+    row: int | None = None
+    by_box: bool = False
+    frames: dict[str, int]
+    again: int
+    seconds_left: float | None
+
+
 class CaptureStatus(BaseModel):
     """One capture: `state` says where it is, `outcome` how it ended (None while it is not done).
 
     `step` counts steps done of `steps`; `frames_missing` counts frames given up after all
-    retries; `request` is what was given to `CaptureManager.start` as `extra`.
+    retries; `request` is what was given to `CaptureManager.start` as `extra`; `progress` is there
+    while it is shot.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -92,6 +119,7 @@ class CaptureStatus(BaseModel):
     left_out: list[dict[str, str]]
     started: str | None
     request: dict[str, Any]
+    progress: Progress | None = None
 
 
 def read_status(path: Path) -> CaptureStatus:

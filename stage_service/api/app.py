@@ -24,6 +24,7 @@ from stage_service.api.lanes import Lanes
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
 from stage_service.service import Service
 from stage_service.viewer import Viewing
+from stage_service.web import pages
 
 
 def create_app(service: Service, access: Access | None = None) -> FastAPI:
@@ -45,6 +46,8 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
         version=version("hairstage"),
         summary="Runs a hair light stage and turns its captures into strands and relit hair.",
         lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
         responses={
             "default": {
                 "description": "An error, as a problem document (RFC 9457)",
@@ -59,7 +62,8 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
         app.include_router(part.reading)
     for more in (routes, steering, queueing, store, login):
         app.include_router(more.router)
-    app.include_router(login.open_to_all)
+    for shown in (login.open_to_all, pages.router):
+        app.include_router(shown)
 
     @app.get(PAGE, include_in_schema=False)
     def errors() -> PlainTextResponse:

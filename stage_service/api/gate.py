@@ -17,11 +17,12 @@ from reconstruction.reading import parse_json
 from stage_service.api.login import LOGIN, Logins
 from stage_service.api.problems import PAGE, problem_response
 from stage_service.records.tokens import SCOPES, Identity, Tokens, UnknownToken
+from stage_service.web.pages import FOLDER, PAGES
 
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 VIEW, VIEW_PAGE = "/view", "/view/page/"
-OPEN = {PAGE, "/docs", "/openapi.json", VIEW}
-"""Says nothing of a stage: how to ask, for whoever may not yet. So do the parts of `VIEW_PAGE`."""
+OPEN = {PAGE, "/openapi.json", VIEW, *PAGES}
+"""Says nothing of a stage: how to ask, for whoever may not yet. So do the pages' files."""
 ANYBODY = Identity(name="", scopes=SCOPES)
 MOST_BODY = 1 << 20
 BODY_S = 20.0
@@ -201,7 +202,8 @@ def _again(message: Message, receive: Receive) -> Receive:
 def _open(scope: Scope) -> bool:
     """Whether it may be asked by somebody unknown."""
     path = scope["path"]
-    return path in OPEN or path.startswith(VIEW_PAGE) or (scope["method"], path) == ("POST", LOGIN)
+    public = path in OPEN or path.startswith((VIEW_PAGE, FOLDER))
+    return public or (scope["method"], path) == ("POST", LOGIN)
 
 
 def _name(host: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mimetypes
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 
 from stage_service.acquisition.states import Outcome
 from stage_service.api.downloads import RANGES, bytes_response, file_response
-from stage_service.api.frames import png_preview
+from stage_service.api.frames import FrameFigures, figures_of, png_preview
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
 from stage_service.jobs.records import Job
@@ -24,6 +25,8 @@ from stage_service.service_models import (
     Health,
     JobRequest,
     ResumeRequest,
+    RigView,
+    StepView,
 )
 from stage_service.watching import text_of
 
@@ -66,6 +69,12 @@ def list_captures(
 def get_capture(capture: str, service: OnService) -> CaptureView:
     """Where a capture is, how it ended, and the job that follows it."""
     return service.capture(capture)
+
+
+@reading.get("/captures/{capture}/steps", tags=["captures"])
+def get_steps(capture: str, service: OnService) -> list[StepView]:
+    """What a capture shoots, in order: which step is which light."""
+    return service.steps(capture)
 
 
 @router.post("/captures/{capture}/pause", tags=["captures"])
@@ -114,10 +123,21 @@ def get_preview(
     camera: str,
     service: OnService,
     percentile: Annotated[float, Query(ge=50, le=100, description="what becomes white")] = 99.5,
+    white: Annotated[float | None, Query(gt=0, description="this does instead, W/(sr m²)")] = None,
+    size: Annotated[int | None, Query(ge=8, le=4096, description="of the longer side")] = None,
+    mark: Annotated[bool, Query(description="paint what is saturated")] = False,
 ) -> Response:
-    """A picture of a frame to look at: exposed by a percentile, sRGB."""
-    picture = service.frame(capture, step, camera, lambda file: png_preview(file, percentile))
-    return Response(picture, media_type="image/png")
+    """A picture of a frame to look at: exposed by a percentile, or by what is said to be white, so
+    that frames can be compared; sRGB, made smaller where `size` says so."""
+    look = partial(png_preview, percentile=percentile, white=white, size=size, mark=mark)
+    picture = service.frame(capture, step, camera, look)
+    return Response(picture, media_type="image/png", headers={"cache-control": "max-age=60"})
+
+
+@reading.get("/captures/{capture}/frames/{step}/{camera}.json", tags=["captures"])
+def get_figures(capture: str, step: int, camera: str, service: OnService) -> FrameFigures:
+    """How a frame is exposed, and how sharp it is."""
+    return service.frame(capture, step, camera, figures_of)
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])
@@ -183,6 +203,12 @@ async def get_artifact(job: str, path: str, service: OnService, lanes: OnLanes) 
     file = await lanes.jobs(service.artifact, job, path)
     kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
     return file_response(file, kind)
+
+
+@reading.get("/rig", tags=["service"])
+async def get_rig(service: OnService) -> RigView:
+    """Where lights, cameras and projectors stand, and the rig file's defaults."""
+    return service.rig()
 
 
 @reading.get("/health", tags=["service"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -65,7 +65,7 @@ class PipelineRequest(Strict):
     again `retries` times; a job that has run for `timeout_s` seconds, waiting not counted, fails.
     """
 
-    name: str
+    name: Annotated[str, Field(json_schema_extra={"enum": sorted(PIPELINES)})]
     options: JobOptions = JobOptions()
     priority: int = Field(default=5, ge=0, le=9)
     retries: int = Field(default=0, ge=0, le=5)

@@ -42,10 +42,10 @@ def test_whatever_is_not_in_the_table_is_refused_and_changes_nothing():
         machine.do("abort")
 
 
-@pytest.mark.parametrize("end", ["abort", "fail"])
+@pytest.mark.parametrize("end", [("abort", "stop"), ("fail",)])
 def test_only_what_did_not_complete_can_be_continued(end):
     machine = Machine()
-    for action in ("start", end, "finish", "continue"):
+    for action in ("start", *end, "finish", "continue"):
         machine.do(action)
     assert machine.state == "running"
     for action in ("complete", "finish"):

@@ -1,0 +1,1 @@
+"""The console: pages for the people at a stage, who steer it by the API as everybody does."""

@@ -1,0 +1,52 @@
+"""The console's files. They say nothing of a stage; what they show, they ask of the API.
+
+Plain ES modules: no build step, nothing from elsewhere, nothing on the server for an open page
+but its stream of events.
+"""
+
+from __future__ import annotations
+
+import mimetypes
+from pathlib import Path
+
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import FileResponse
+
+STATIC = Path(__file__).with_name("static")
+FILES = {path.name: path for path in STATIC.iterdir() if path.is_file()}
+FOLDER = "/web/"
+PAGES = {"/": "index.html", "/docs": "docs.html"}
+HEADERS = {
+    "cache-control": "no-cache",
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data: blob:; frame-src 'self'; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'none'"
+    ),
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+}
+"""A page takes nothing from another host, and no page of another host has it in a frame."""
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.get(FOLDER + "{name}")
+def get_file(name: str) -> FileResponse:
+    """A script, style sheet or picture of the pages."""
+    if name not in FILES:
+        raise HTTPException(404, f"the console has no file {name!r}")
+    kind = "text/javascript" if name.endswith(".js") else mimetypes.guess_type(name)[0]
+    return FileResponse(FILES[name], media_type=kind, headers=HEADERS)
+
+
+@router.get("/")
+def console() -> FileResponse:
+    """The operator's console."""
+    return get_file(PAGES["/"])
+
+
+@router.get("/docs")
+def docs() -> FileResponse:
+    """The API, from /openapi.json."""
+    return get_file(PAGES["/docs"])

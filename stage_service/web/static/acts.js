@@ -1,0 +1,101 @@
+// What people do, whichever view they are in.
+
+import { ask } from "./ask.js";
+import { button, h, seconds } from "./dom.js";
+import { S, busy, changed, load, refused, takeLease } from "./state.js";
+
+const notices = document.getElementById("notices");
+
+/** Tell the person something, for a while. */
+export function notice(text, kind = "") {
+  const made = h(`p.notice${kind ? "." + kind : ""}`, text);
+  notices.append(made);
+  setTimeout(() => made.remove(), kind === "bad" ? 15_000 : 6000);
+}
+
+/** Do what a button is for; a refusal is told. */
+export async function attempt(work) {
+  try {
+    return await work();
+  } catch (error) {
+    notice(error.status === 401 ? "log in again" : error.message, "bad");
+    return undefined;
+  }
+}
+
+export async function abort() {
+  if (!busy()) return notice("no capture is being made");
+  const { id } = S.capture;
+  await attempt(() => ask(`POST /captures/${id}/abort`));
+  return load.capture(id).catch(() => {});
+}
+
+export let darkening = null;
+/** Put everything off. Where nobody answers it is asked again, until somebody does. */
+export async function blackout() {
+  if (darkening) return;
+  const began = performance.now();
+  for (let tries = 1; ; tries++) {
+    darkening = { tries };
+    changed();
+    try {
+      const answer = await ask("POST /devices/blackout", undefined, { patience: 20_000 });
+      const took = seconds((performance.now() - began) / 1000);
+      if (answer.safe) notice(`dark, verified, after ${took}`, "good");
+      else notice(answer.detail, "bad");
+      break;
+    } catch (error) {
+      if (error.status) {
+        notice(`blackout refused: ${error.message}`, "bad");
+        break;
+      }
+      await new Promise((later) => setTimeout(later, 500));
+    }
+  }
+  darkening = null;
+  changed();
+  load.health().catch(() => {});
+}
+
+export function left(c) {
+  if (c.state === "aborting" || c.state === "finishing") return "nothing more is lit";
+  if (c.state === "paused") return "dark";
+  const s = c.progress?.seconds_left;
+  return s === null || s === undefined ? "time left: not known yet" : `${seconds(s)} left`;
+}
+
+/** Who steers, as the others see it. */
+export async function askName() {
+  const known = localStorage.getItem("name") ?? S.who?.name ?? "";
+  if (known) return known;
+  return new Promise((done) => {
+    const field = h("input", { name: "holder", required: true, maxlength: 100, autocomplete: "name" });
+    const box = h("dialog", { "aria-label": "who steers" }, h("form", { onsubmit: (event) => {
+      event.preventDefault();
+      localStorage.setItem("name", field.value);
+      box.remove();
+      done(field.value);
+    } }, h("label", "Your name, as the others see it", field), h("button.go", "Steer")));
+    document.body.append(box);
+    box.showModal();
+  });
+}
+
+/** A button that steers: off, and saying why, while this page may not. */
+export function steering(text, work, more = {}) {
+  const made = button(text, () => attempt(work), more);
+  const ready = more.ready ?? (() => true);
+  return {
+    element: made,
+    update() {
+      const why = refused();
+      made.disabled = why !== null || !ready();
+      made.title = why ?? more.title ?? "";
+    },
+  };
+}
+
+/** Steer alone from here on, unless this page does so already. */
+export async function underLease() {
+  await takeLease(await askName());
+}

@@ -1,0 +1,210 @@
+// Captures and their frames: by camera, by light, and as a film.
+
+import { attempt, notice } from "./acts.js";
+import { ask, get } from "./ask.js";
+import { button, clock, h, keyed, number, percent, say, seconds, svg } from "./dom.js";
+import { S, events } from "./state.js";
+
+const PAGE = 50;
+const FILM_MS = 120;
+
+export function open(view, [asked]) {
+  const list = h(".list", { role: "group", "aria-label": "captures" });
+  const older = button("older", () => turn(PAGE), { kind: "quiet" });
+  const newer = button("newer", () => turn(-PAGE), { kind: "quiet" });
+  const which = h("select", { "aria-label": "captures that", onchange: () => { offset = 0; loadList(); } },
+    ["", "completed", "aborted", "failed", "interrupted", "damaged"].map((x) => h("option", { value: x }, x || "all captures")));
+  const detail = h("section");
+  view.append(h(".side", h("section", { "aria-label": "captures" }, h("h1", "Captures"), which, list, h(".line", newer, older)), detail));
+
+  let offset = 0;
+  let shown = null; // {id, stop, update}
+
+  function turn(by) {
+    offset = Math.max(0, offset + by);
+    loadList();
+  }
+
+  async function loadList() {
+    const found = await attempt(() => get(`/captures?limit=${PAGE}&offset=${offset}${which.value ? `&outcome=${which.value}` : ""}`));
+    if (!found) return;
+    keyed(list, found.reverse(), (c) => c.id, (c) => {
+      const name = h("span");
+      const element = h("button", { type: "button", onclick: () => choose(c.id) }, name);
+      return { element, tell(x) { say(name, x.id, h("br"), h(`small${x.outcome === "failed" || x.outcome === "damaged" ? ".bad" : ""}`, `${x.outcome ?? x.state}, ${number(x.frames_written)} of ${number(x.frames_planned)} frames`)); element.dataset.id = x.id; } };
+    });
+    if (!found.length) say(list, h("p.quiet", offset ? "There are no older ones." : "There are none."));
+    newer.disabled = offset === 0;
+    older.disabled = found.length < PAGE;
+    mark();
+    if (!shown && (asked || found.length)) choose(asked ?? found[0].id);
+  }
+
+  function mark() {
+    for (const row of list.querySelectorAll("button")) {
+      if (row.dataset.id === shown?.id) row.setAttribute("aria-current", "true");
+      else row.removeAttribute("aria-current");
+    }
+  }
+
+  function choose(id) {
+    shown?.stop();
+    shown = { id, ...captureOf(detail, id) };
+    history.replaceState(null, "", `#frames/${id}`);
+    mark();
+  }
+
+  const onState = () => loadList();
+  events.addEventListener("capture.state", onState);
+  loadList();
+  return { end() { events.removeEventListener("capture.state", onState); shown?.stop(); }, update() { shown?.update(); } };
+}
+
+function captureOf(view, id) {
+  const controller = new AbortController();
+  let steps = [];
+  let status = null;
+  let film = 0;
+  let white = null;
+  const facts = h("dl.facts");
+  const title = h("h2.title", id);
+  const acts = h(".line");
+  const slider = h("input", { type: "range", min: 0, max: 0, value: 0, "aria-label": "step", oninput: () => { stopFilm(); show(); } });
+  const where = h("output", "");
+  const kinds = h("select", { "aria-label": "steps that", onchange: pick }, [["olat", "each light"], ["scanline", "the sweep"], ["all", "all steps"]].map(([v, t]) => h("option", { value: v }, t)));
+  const same = h("input", { type: "checkbox", checked: true, onchange: () => { white = null; show(); } });
+  const marked = h("input", { type: "checkbox", onchange: show });
+  const figures = h("input", { type: "checkbox", onchange: show });
+  const play = button("film", toggleFilm, { kind: "quiet" });
+  const grid = h(".grid");
+  const cells = new Map();
+  let chosen = [];
+  view.replaceChildren(title, facts, acts,
+    h(".scrub", h(".line", kinds, play), slider, where),
+    h(".line", h("label.check", same, h("span", "one exposure for all lights")), h("label.check", marked, h("span", "mark what is saturated")), h("label.check", figures, h("span", "histogram, focus"))),
+    grid);
+  grid.style.setProperty("--cell", S.rig.cameras.length > 12 ? "10rem" : "14rem");
+
+  async function load() {
+    try {
+      const more = { signal: controller.signal };
+      [status, steps] = await Promise.all([get(`/captures/${id}`, more), get(`/captures/${id}/steps`, more)]);
+    } catch (error) {
+      if (!controller.signal.aborted) say(facts, h("p.bad", error.message));
+      return;
+    }
+    tell();
+    if (!steps.some((s) => s.kind === kinds.value)) kinds.value = steps.some((s) => s.kind === "scanline") ? "scanline" : "all";
+    pick();
+  }
+
+  function tell() {
+    const c = status;
+    const rows = { "State": c.outcome ?? c.state, "Begun": clock(c.started), "Took": seconds(c.seconds), "Steps": number(c.steps), "Frames": `${number(c.frames_written)} of ${number(c.frames_planned)}`, "Missing": number(c.frames_missing) };
+    facts.replaceChildren(...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
+    if (c.error) facts.append(h("div", h("dt", "Error"), h("dd.bad", c.error)));
+    acts.replaceChildren(
+      h("a.button", { href: `/captures/${id}/archive.tar`, download: "" }, "Download"),
+      button("Read again and verify", () => attempt(async () => { await ask(`POST /captures/${id}/verify`); notice("it is read again"); })),
+      c.job ? h("a.button", { href: `#jobs/${c.job}` }, "Its job") : "",
+    );
+  }
+
+  function pick() {
+    stopFilm();
+    chosen = steps.filter((s) => s.lacks.length < S.rig.cameras.length && (kinds.value === "all" || s.kind === kinds.value));
+    slider.disabled = chosen.length < 2;
+    if (!chosen.length) say(where, "no frame of these yet");
+    slider.max = Math.max(0, chosen.length - 1);
+    slider.value = Math.min(slider.value, slider.max);
+    white = null;
+    play.disabled = chosen.length < 2;
+    show();
+  }
+
+  function toggleFilm() {
+    if (film) return stopFilm();
+    say(play, "stop");
+    film = setInterval(() => {
+      if ([...cells.values()].some((cell) => cell.busy)) return; // no faster than pictures come
+      slider.value = (Number(slider.value) + 1) % chosen.length;
+      show();
+    }, FILM_MS);
+    return undefined;
+  }
+
+  function stopFilm() {
+    clearInterval(film);
+    film = 0;
+    say(play, "film");
+  }
+
+  const words = (s) => ({ olat: s.light, scanline: `${s.projector}, row ${s.row}`, all_on: "all lights", tracking: "all projectors" }[s.kind] ?? "dark");
+
+  async function show() {
+    const step = chosen[slider.value];
+    if (!step) return;
+    say(where, `${words(step)} · step ${step.index}${step.exposure ? ` · ${seconds(step.exposure)}` : ""}`);
+    slider.setAttribute("aria-valuetext", words(step));
+    if (same.checked && white === null) await exposure();
+    for (const camera of S.rig.cameras) cellOf(camera).show(step);
+  }
+
+  /** What is white in all of them: the brightest of a few frames, of one camera. */
+  async function exposure() {
+    white = 0;
+    const some = [0.1, 0.3, 0.5, 0.7, 0.9].map((at) => chosen[Math.floor(at * chosen.length)]);
+    const found = await Promise.all(some.map((s) => get(`/captures/${id}/frames/${s.index}/${S.rig.cameras[0].name}.json`, { signal: controller.signal }).catch(() => null)));
+    white = Math.max(0, ...found.filter(Boolean).map((f) => f.white));
+  }
+
+  function cellOf(camera) {
+    if (cells.has(camera.name)) return cells.get(camera.name);
+    const image = h("img", { alt: "", width: camera.width, height: camera.height });
+    const text = h("figcaption", camera.name);
+    const plot = svg("svg", { class: "histogram", viewBox: "0 0 64 20", preserveAspectRatio: "none", "aria-hidden": "true" });
+    const figure = h(`figure${camera.width < 320 ? ".pixels" : ""}`, image, text);
+    grid.append(figure);
+    const cell = {
+      busy: false, next: null,
+      show(step) {
+        cell.next = step;
+        if (step.lacks.includes(camera.name)) {
+          image.removeAttribute("src");
+          say(text, `${camera.name}: no frame`);
+          return;
+        }
+        if (cell.busy) return; // the newest that was asked for comes next
+        cell.busy = true;
+        const done = () => { cell.busy = false; if (cell.next !== step) cell.show(cell.next); };
+        const options = [`size=${Math.min(Math.max(camera.width, camera.height), 480)}`, marked.checked ? "mark=true" : "", same.checked && white ? `white=${white}` : ""].filter(Boolean).join("&");
+        image.onload = done;
+        image.onerror = () => { say(text, `${camera.name}: no frame`); done(); };
+        image.alt = `${camera.name}, ${words(step)}`;
+        image.src = `/captures/${id}/frames/${step.index}/${camera.name}.png?${options}`;
+        say(text, camera.name);
+        if (figures.checked) cell.tell(step);
+        else plot.remove();
+      },
+      async tell(step) {
+        const f = await get(`/captures/${id}/frames/${step.index}/${camera.name}.json`, { signal: controller.signal }).catch(() => null);
+        if (!f || cell.next !== step) return;
+        const top = Math.log1p(Math.max(...f.histogram));
+        plot.replaceChildren(...f.histogram.map((n, i) => svg("path", { class: i === 63 && f.saturated ? "full" : "", d: `M${i} 20V${(20 - (19 * Math.log1p(n)) / (top || 1)).toFixed(2)}h.9V20z` })));
+        if (!plot.parentNode) figure.append(plot);
+        say(text, `${camera.name} · saturated ${percent(f.saturated)} · focus ${number(f.focus)} · 99.5 % at ${number(f.white)}`);
+      },
+    };
+    cells.set(camera.name, cell);
+    return cell;
+  }
+
+  load();
+  return {
+    stop() { controller.abort(); stopFilm(); },
+    update() {
+      if (S.capture?.id === id && status && (S.capture.state !== status.state || S.capture.outcome !== status.outcome)) load();
+    },
+  };
+}
+

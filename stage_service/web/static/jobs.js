@@ -1,0 +1,157 @@
+// What is made of captures: how far, how good, how long, and what has come of it.
+
+import { attempt } from "./acts.js";
+import { ask, get } from "./ask.js";
+import { button, bytes, clock, h, keyed, number, percent, say, seconds, svg, words } from "./dom.js";
+import { S, changed, events, load } from "./state.js";
+
+export function open(view, [asked]) {
+  const list = h(".list", { role: "group", "aria-label": "jobs" });
+  const none = h("p.quiet");
+  const detail = h("section");
+  let shown = null;
+  view.append(h(".side", h("section", { "aria-label": "jobs" }, h("h1", "Jobs"), none, list), detail));
+  load.jobs();
+
+  function choose(id) {
+    shown?.stop();
+    shown = { id, ...jobOf(detail, id) };
+    history.replaceState(null, "", `#jobs/${id}`);
+    changed();
+  }
+
+  function update() {
+    say(none, S.jobsProblem ?? (S.jobs?.length ? "" : "There are no jobs: a capture that names a pipeline makes one when it is complete."));
+    keyed(list, S.jobs ?? [], (j) => j.id, (j) => {
+      const name = h("span");
+      const share = h("progress", { max: 1, "aria-label": "done" });
+      return { element: h("button", { type: "button", onclick: () => choose(j.id) }, name, share), tell(x) {
+        say(name, `${x.pipeline} `, h("br"), h(`small${x.outcome === "failed" ? ".bad" : ""}`, `${x.outcome ?? x.state}${x.progress && x.state === "running" ? `: ${words(x.progress.step)}` : ""} · ${clock(x.created)}`));
+        share.hidden = x.state !== "running";
+        share.value = x.progress?.share ?? 0;
+      } };
+    });
+    if (!shown && (asked || S.jobs?.length)) choose(asked ?? S.jobs[0].id);
+    shown?.update();
+  }
+  return { update, end: () => shown?.stop() };
+}
+
+function jobOf(view, id) {
+  const facts = h("dl.facts");
+  const title = h("h2.title", id);
+  const wrong = h("p.bad");
+  const what = h("p.said");
+  const meter = h("progress", { max: 1, "aria-label": "done" });
+  const acts = h(".line");
+  const curves = h(".grid");
+  const stages = h("tbody");
+  const timed = h("section", h("h2", "Stages"), h("table", h("thead", h("tr", h("th", "stage"), h("th.n", "seconds"), h("th", "warnings"))), stages));
+  const files = h("section");
+  const page = h("section");
+  curves.style.setProperty("--cell", "22rem");
+  view.replaceChildren(title, facts, wrong, what, meter, acts, curves, timed, page, files);
+  let last = "";
+  let job = null;
+  let measured = "";
+
+  const onEvent = ({ detail }) => { if (detail.job === id) refresh(); };
+  for (const kind of ["job.state", "job.progress"]) events.addEventListener(kind, onEvent);
+
+  async function refresh() {
+    const known = S.jobs?.find((j) => j.id === id) ?? await attempt(() => get(`/jobs/${id}`));
+    if (!known) return;
+    job = known;
+    const step = `${job.state}/${job.outcome}/${job.progress?.step}`;
+    if (step === last) return update();
+    last = step;
+    update();
+    const list = await get(`/jobs/${id}/artifacts`).catch(() => []);
+    if (list.some((f) => f.path === "report.json")) reportOf(await get(`/jobs/${id}/report`));
+    filesOf(list);
+  }
+
+  /** How long the rest takes, by what the share that is done took. */
+  function timeLeft() {
+    const share = job.progress?.share ?? 0;
+    if (job.state !== "running" || !job.started || share < 0.02) return null;
+    return (((Date.now() - new Date(job.started)) / 1000) * (1 - share)) / share;
+  }
+
+  function update() {
+    if (!job) { refresh(); return; }
+    job = S.jobs?.find((j) => j.id === id) ?? job;
+    const p = job.progress;
+    const rows = {
+      "Pipeline": job.pipeline, "State": job.outcome ?? job.state, "Capture": job.capture.split("/").at(-1), "Model": job.model.split("/").at(-1),
+      "Begun": clock(job.started), "Took": job.finished && job.started ? seconds((new Date(job.finished) - new Date(job.started)) / 1000) : "–",
+      "Time left": job.state === "running" ? `about ${seconds(timeLeft())}, if steps take alike` : "–",
+    };
+    say(facts, ...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
+    say(wrong, job.error ? `${job.error.type}: ${job.error.detail}` : "");
+    wrong.hidden = !job.error;
+    say(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "It waits for a worker." : "");
+    meter.hidden = job.state !== "running";
+    meter.value = p?.share ?? 0;
+    meter.title = percent(p?.share ?? 0);
+    const may = S.who?.scopes.includes("jobs");
+    const key = `${job.state}/${job.outcome}/${may}`;
+    if (acts.dataset.key === key) return;
+    acts.dataset.key = key;
+    acts.replaceChildren(
+      ...(job.state !== "done" && may ? [button("Cancel", () => attempt(async () => { await ask(`DELETE /jobs/${id}`); load.jobs(); }))] : []),
+      ...(job.state === "done" && job.outcome !== "succeeded" && may ? [button("Run it again", () => attempt(again))] : []),
+      h("a.button", { href: `/models/${encodeURIComponent(job.model.split("/").at(-1))}/archive.tar`, download: "" }, "Download the model"),
+    );
+  }
+
+  async function again() {
+    const made = await ask("POST /jobs", { capture: job.capture.split("/").at(-1), model: job.model.split("/").at(-1), pipeline: { name: job.pipeline, options: job.options } });
+    await load.jobs();
+    location.hash = `#jobs/${made.id}`;
+    location.reload();
+  }
+
+  function reportOf(report) {
+    const text = JSON.stringify(report.stages.map((s) => [s.name, s.series.length]));
+    if (text === measured) return;
+    measured = text;
+    stages.replaceChildren(...report.stages.map((s) => h("tr", h("th", { scope: "row" }, words(s.name)), h("td.n", number(s.seconds)), h("td", s.warnings.map((w) => h("p.warn", w))))));
+    curves.replaceChildren(...report.stages.flatMap((s) => s.series.filter((x) => x.points.length > 1).map((x) => curve(`${words(s.name)}: ${x.name}`, x))));
+  }
+
+  function filesOf(list) {
+    const link = (path) => `/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
+    const has = (path) => list.some((f) => f.path === path);
+    page.replaceChildren(...(has("index.html") ? [h("h2", "Report"), h("p", h("a", { href: link("index.html"), target: "_blank", rel: "noopener" }, "the report on a page of its own"))] : []),
+      ...["relit.png", "comparison.png"].filter(has).map((f) => h("figure", h("img", { src: link(f), alt: f, loading: "lazy" }), h("figcaption", f))));
+    timed.hidden = stages.childElementCount === 0;
+    files.hidden = list.length === 0;
+    files.replaceChildren(h("details", h("summary", `Files (${list.length})`), h("table", h("tbody", list.map((f) => h("tr", h("td", h("a", { href: link(f.path), download: "" }, f.path)), h("td.n", bytes(f.bytes))))))));
+  }
+
+  refresh();
+  return { update, stop() { for (const kind of ["job.state", "job.progress"]) events.removeEventListener(kind, onEvent); } };
+}
+
+/** Error against run time, both from 0 or by powers of ten where it spans more than one. */
+function curve(title, series) {
+  const points = series.points.filter(([, e]) => Number.isFinite(e));
+  const [width, height, pad] = [440, 190, 44];
+  const errors = points.map(([, e]) => e);
+  const log = Math.min(...errors) > 0 && Math.max(...errors) / Math.min(...errors) > 10;
+  const f = log ? Math.log10 : (x) => x;
+  const low = log ? f(Math.min(...errors)) : Math.min(0, ...errors);
+  const high = Math.max(...errors.map(f));
+  const end = Math.max(...points.map(([t]) => t)) || 1;
+  const x = (t) => pad + ((width - pad - 12) * t) / end;
+  const y = (e) => height - 26 - ((height - 44) * (f(e) - low)) / (high - low || 1);
+  const text = (at, up, words_, anchor) => svg("text", { x: at, y: up, "text-anchor": anchor }, words_);
+  const said = `${title}: ${series.error} ${number(errors[0])} at the start, ${number(errors.at(-1))} after ${seconds(points.at(-1)[0])}`;
+  return h("figure", svg("svg", { class: "curve", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": said },
+    svg("path", { class: "axis", d: `M${pad} 12V${height - 26}H${width - 8}` }),
+    svg("path", { class: "data", d: `M${points.map(([t, e]) => `${x(t).toFixed(1)} ${y(e).toFixed(1)}`).join("L")}` }),
+    text(pad - 5, y(errors[0]) + 4, number(errors[0]), "end"), text(pad - 5, Math.min(height - 28, y(errors.at(-1)) + 4), number(errors.at(-1)), "end"),
+    text(width - 8, height - 10, seconds(end), "end"), text(pad, height - 10, "0 s", "start")),
+    h("figcaption", `${title} · ${series.error}${log ? " (log scale)" : ""}`));
+}

@@ -1,0 +1,175 @@
+// The stage as it is: the light that is lit, how far the capture is, and how it stands with darkness.
+
+import { left, steering } from "./acts.js";
+import { ask, get } from "./ask.js";
+import { bytes, clock, h, keyed, number, say, seconds } from "./dom.js";
+import { dome } from "./dome.js";
+import { S, busy, load } from "./state.js";
+
+const SAID = {
+  idle: "The capture is about to begin.",
+  running: "",
+  pausing: "It pauses at the end of this step, and puts the lights off.",
+  paused: "Paused. The stage is dark.",
+  aborting: "Aborting: it stops at the end of this step. Blackout (F9) does not wait.",
+  finishing: "Lights are put off and read back; the last frames are written.",
+};
+
+export function open(view) {
+  const picture = dome(S.rig, { label: "the dome from above, with the light that is lit" });
+  const lit = h("p.lit", { "aria-live": "off" });
+  const word = h("h1.big");
+  const said = h("p.said");
+  const meter = h("progress", { "aria-label": "steps" });
+  const facts = h("dl.facts");
+  const cameras = h("table.cameras", h("thead", h("tr", h("th", "camera"), h("th.n", "frames"), h("th", ""))), h("tbody"));
+  const byCamera = h("section", h("h2", "Frames by camera"), cameras);
+  const missing = h("ul.missing");
+  const pause = steering("Pause", () => steer("pause"), { ready: () => S.capture?.state === "running" && !S.capture.progress?.by_box });
+  const resume = steering("Resume", () => steer("resume"), { kind: "go", ready: () => ["paused", "pausing"].includes(S.capture?.state) });
+  const finish = steering("Shoot what is missing", () => steer("resume"), { ready: () => S.capture?.state === "done" && !["completed", "damaged"].includes(S.capture?.outcome) });
+  const goOn = steering("Go on with the queue", () => ask("POST /queue:go-on"), { ready: () => S.queue.held !== null });
+  const line = h("ol.queue");
+  const queueSaid = h("p.quiet");
+  view.append(h(".now",
+    h("section.stagepicture", { "aria-label": "dome" }, picture.element, lit,
+      h("p.key", h("span.k.todo", "to come"), h("span.k.done", "shot"), h("span.k.gone", "frames missing"), h("span.k.on", "lit"))),
+    h("section.course", { "aria-label": "capture" }, word, said, meter,
+      h(".line", pause.element, resume.element, finish.element, h("a.button", { href: "#plan" }, "New capture")),
+      facts,
+      h(".two", byCamera, h("section", h("h2", "Shot again or missing"), missing)),
+      h("section", h("h2", "Queue"), queueSaid, line, goOn.element)),
+  ));
+
+  let steps = null; // of the capture that is shown
+  let stepsOf = null;
+  const lacking = () => new Set((steps ?? []).filter((s) => (!busy() && s.lacks.length && s.index < S.capture.step) || S.missing.some((x) => !x.shot_again && x.step === s.index)).map((s) => s.light).filter(Boolean));
+
+  async function steer(action) {
+    await ask(`POST /captures/${S.capture.id}/${action}`, action === "resume" ? {} : undefined);
+    await load.capture(S.capture.id);
+  }
+
+  function update() {
+    const c = S.capture;
+    for (const part of [pause, resume, finish, goOn]) part.update();
+    pause.element.hidden = !busy() || ["paused", "pausing"].includes(c?.state);
+    resume.element.hidden = !["paused", "pausing"].includes(c?.state);
+    finish.element.hidden = busy() || !c || ["completed", "damaged"].includes(c.outcome);
+    goOn.element.hidden = S.queue.held === null;
+    queueOf();
+    if (!c) {
+      say(word, S.health?.lamps === "dark" ? "Dark, verified" : "Ready");
+      say(said, "No capture has been made here yet.");
+      meter.hidden = true;
+      tell([lamps(), disk()]);
+      picture.show({});
+      return;
+    }
+    if (stepsOf !== c.id && S.connected) {
+      stepsOf = c.id;
+      steps = null;
+      get(`/captures/${c.id}/steps`).then((list) => { steps = list; update(); }).catch(() => { stepsOf = null; });
+    }
+    headline(c);
+    meter.hidden = false;
+    meter.max = c.steps || 1;
+    meter.value = c.step;
+    const p = c.progress;
+    const frames = p ? Object.values(p.frames).reduce((a, b) => a + b, 0) : c.frames_written;
+    tell([
+      ["Capture", h("a", { href: `#frames/${c.id}` }, c.id)],
+      ["Steps", `${number(c.step)} of ${number(c.steps)}`],
+      ["Frames", `${number(frames)} of ${number(c.frames_planned)}`],
+      busy() ? ["Time left", p?.seconds_left == null ? `not known yet (predicted ${seconds(c.seconds_predicted)} in all)` : left(c)] : ["Took", `${seconds(c.seconds)} (predicted ${seconds(c.seconds_predicted)})`],
+      ["Shot again", number(p?.again ?? S.missing.filter((x) => x.shot_again).length)],
+      ["Missing", h(c.frames_missing ? "b.bad" : "span", number(c.frames_missing))],
+      ["Then", c.job ? h("a", { href: `#jobs/${c.job}` }, c.request.pipeline?.name ?? c.job) : c.request.pipeline?.name ?? "nothing follows"],
+      p?.by_box ? ["Clocked by", "the trigger box: no pause until its run is over"] : null,
+      lamps(), disk(),
+    ]);
+    showLights(c, p);
+    framesBy(c, p);
+    keyed(missing, S.missing.slice(0, 12), (x) => `${x.step}/${x.attempt}/${x.cameras}`, (x) => ({
+      element: h("li", `step ${x.step}${steps?.[x.step]?.light ? ` (${steps[x.step].light})` : ""}: ${x.cameras.join(", ")} — `, x.shot_again ? "shot again" : h("b.bad", "given up")),
+    }));
+    if (!S.missing.length && !missing.childElementCount) missing.append(h("li.quiet", "none"));
+    else if (S.missing.length) missing.querySelector(".quiet")?.remove();
+  }
+
+  function headline(c) {
+    if (busy()) {
+      say(word, { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" }[c.state]);
+      say(said, SAID[c.state]);
+      return;
+    }
+    const dark = S.health?.lamps === "dark";
+    say(word, S.health?.latch ? "UNSAFE" : dark ? "Dark, verified" : "Not known to be dark");
+    const how = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" }[c.outcome];
+    say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error ? ` ${c.error}` : ""}`);
+  }
+
+  const lamps = () => ["Lamps", h(S.health?.lamps === "unknown, unsafe" ? "b.bad" : "span", { title: S.health?.lamps_detail }, S.health?.lamps === "dark" ? "dark, verified" : S.health?.lamps ?? "–")];
+  function disk() {
+    const free = S.health?.disk_free_bytes;
+    return ["Disk", free === null ? h("b.bad", "does not answer") : `${bytes(free)} free`];
+  }
+  function tell(rows) {
+    say(facts, ...rows.filter(Boolean).map(([name, value]) => h("div", h("dt", name), h("dd", value))));
+  }
+
+  function showLights(c, p) {
+    const running = ["running", "pausing", "aborting"].includes(c.state);
+    const now = running && p ? p : {};
+    const shot = new Set((steps ?? []).slice(0, c.step).map((s) => s.light).filter(Boolean));
+    picture.show({
+      lit: now.kind === "all_on" ? "all" : now.light ?? null,
+      shot, missing: lacking(),
+      projector: now.kind === "tracking" ? "all" : now.projector ?? null,
+    });
+    const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
+    say(lit, busy() ? what : S.health?.lamps === "dark" ? "nothing is lit" : "nobody knows what is lit");
+  }
+
+  function framesBy(c, p) {
+    byCamera.hidden = !p;
+    if (!p) return;
+    const names = S.rig.cameras.map((x) => x.name);
+    const each = c.steps;
+    keyed(cameras.tBodies[0], names.map((name) => [name, p.frames[name] ?? 0]), ([name]) => name, () => {
+      const count = h("td.n");
+      const share = h("progress", { max: 1 });
+      const cell = h("th", { scope: "row" });
+      return {
+        element: h("tr", cell, count, h("td", share)),
+        tell([name, n]) {
+          say(cell, name);
+          say(count, number(n));
+          share.setAttribute("aria-label", `${name}: ${n} of ${each} frames`);
+          share.value = n / (each || 1);
+        },
+      };
+    });
+  }
+
+  function queueOf() {
+    const q = S.queue;
+    say(queueSaid, q.held ? `Held: ${q.held}. Nothing begins by itself.` : q.waiting.length ? (q.waits_for ? `The first one waits: ${q.waits_for}.` : "The first one is about to begin.") : "Nothing waits.");
+    keyed(line, q.waiting, (x) => x.id, (x) => {
+      const go = steering("start now", () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: prompt("Who at the stage answers for the flashes?") } : undefined), { kind: "quiet" });
+      const up = steering("first", () => ask(`PATCH /queue/${x.id}`, { place: 0 }), { kind: "quiet" });
+      const out = steering("remove", () => ask(`DELETE /queue/${x.id}`), { kind: "quiet" });
+      const parts = [go, up, out];
+      return { element: h("li", h("span", planWords(x.request.plan), h("small", ` by ${x.by}, ${clock(x.added)}${x.needs_arming ? " · flashes: start it at the stage" : ""}`)), parts.map((b) => b.element)), tell: () => parts.forEach((b) => b.update()) };
+    });
+  }
+
+  return { update };
+}
+
+export function planWords(plan = {}) {
+  const lights = plan.lights === undefined || plan.lights === "all" ? "all lights" : `${plan.lights.length} lights`;
+  const sweep = plan.projectors === undefined || plan.projectors === "all" ? "sweep" : plan.projectors.length ? `sweep of ${plan.projectors.join(", ")}` : "no sweep";
+  return `${lights}, ${sweep}`;
+}
+

@@ -1,0 +1,68 @@
+// The devices, what is wrong with them, who steers, and who did what.
+
+import { attempt } from "./acts.js";
+import { ask, get } from "./ask.js";
+import { button, bytes, clock, h, keyed, number, say, words } from "./dom.js";
+import { S, events, load } from "./state.js";
+
+const TOLD = ["capture.state", "stage.lamps", "stage.lease", "stage.blackout", "fresh", "queue.held"];
+
+export function open(view) {
+  const health = h("dl.facts");
+  const problems = h("ul.problems");
+  const devices = h(".grid");
+  const age = h("p.quiet");
+  const rows = h("tbody");
+  const lease = h(".line");
+  devices.style.setProperty("--cell", "16rem");
+  view.append(
+    h("h1", "The stage"), health, problems,
+    h("section.devices", h(".line", h("h2", "Devices"), button("Ask them again", askAll, { kind: "quiet" }), age), devices),
+    h("section", h("h2", "Who steers"), lease),
+    h("section", h("h2", "Who did what"), h(".wide", { tabindex: "0", role: "region", "aria-label": "audit log" }, h("table", h("thead", h("tr", ["when", "who", "what", "on", "came to", "because"].map((x) => h("th", x)))), rows))),
+  );
+
+  async function askAll() {
+    const found = await attempt(() => get("/devices"));
+    if (!found) return;
+    const { cameras = {}, safety, age_s: seen, projector_power: power = {}, ...single } = found;
+    say(age, seen === null ? "not asked yet" : `asked ${number(Math.round(seen))} s ago`);
+    const all = [...Object.entries(single), ...Object.entries(cameras).map(([k, v]) => [`camera ${k}`, v]), ...Object.entries(power).map(([k, v]) => [`power of ${k}`, v])];
+    keyed(devices, all.filter(([, v]) => v && typeof v === "object"), ([k]) => k, () => {
+      const name = h("h3");
+      const state = h("p");
+      const figures = h("dl.facts");
+      const element = h("article.device", name, state, figures);
+      return { element, tell([kind, d]) {
+        element.className = `device ${d.state === "unreachable" ? "unreachable" : d.state === "ok" ? "" : "asked"}`;
+        say(name, kind);
+        say(state, h(d.state === "unreachable" ? "b.bad" : "span", d.state), d.error ? ` ${d.error}` : "");
+        say(figures, ...Object.entries(d).filter(([k]) => !["name", "state", "error"].includes(k)).map(([k, v]) => h("div", h("dt", words(k)), h("dd", Array.isArray(v) ? v.map((x) => (typeof x === "object" ? JSON.stringify(x) : x)).join(", ") : String(v)))));
+      } };
+    });
+  }
+
+  async function askAudit() {
+    const found = await attempt(() => get("/audit?limit=200"));
+    if (!found) return;
+    rows.replaceChildren(...found.reverse().map((a) => h("tr", h("td.n", clock(a.time)), h("td", a.who), h("td", a.action), h("td", a.subject), h(["ok", "dark", "completed"].includes(a.result) ? "td" : "td.warn", a.result), h("td", a.detail))));
+  }
+
+  let timer = 0;
+  const onEvent = () => { clearTimeout(timer); timer = setTimeout(() => { askAudit(); askAll(); }, 300); };
+  for (const kind of TOLD) events.addEventListener(kind, onEvent);
+  askAll();
+  askAudit();
+
+  function update() {
+    const x = S.health;
+    if (!x) return;
+    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Lamps": `${x.lamps}: ${x.lamps_detail}`, "Root folder": x.root, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait" };
+    say(health, ...Object.entries(facts).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
+    say(problems, ...x.problems.map((text) => h("li", text)));
+    const held = S.lease.holder;
+    say(lease, held === null ? "Nobody in particular: anybody may steer." : `${held}, until ${clock(S.lease.expires)}.`,
+      held !== null && S.who?.scopes.includes("admin") ? button("end this lease", () => attempt(async () => { await ask("DELETE /lease?force=true"); await load.lease(); }), { kind: "quiet" }) : "");
+  }
+  return { update, end() { clearTimeout(timer); for (const kind of TOLD) events.removeEventListener(kind, onEvent); } };
+}

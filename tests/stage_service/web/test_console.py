@@ -1,0 +1,226 @@
+"""The console in a browser, over a simulated stage on real wires."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+from serving import Client, serving
+from waiting import until
+
+from simulators.peers.faults import Fault
+from stage_service.acquisition.states import CaptureStatus
+
+api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = [
+    pytest.mark.slow,  # a browser costs some seconds of processor time a page
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here"),
+]
+PATIENCE_MS = 20_000
+PACED = {"rate_hz": 8, "projectors": [], "stepping": "software"}
+
+
+class Pages:
+    """Pages of one console, what they complained of, and whom they asked."""
+
+    def __init__(self, browser: Any, url: str) -> None:
+        self.url = url
+        self.complaints: list[str] = []
+        self.hosts: set[str] = set()
+        self._context = browser.new_context(viewport={"width": 1280, "height": 800})
+        self._context.set_default_timeout(PATIENCE_MS)
+
+    def open(self, view: str = "now") -> Any:
+        page = self._context.new_page()
+        page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", lambda request: self.hosts.add(re.split("[/?#]", request.url)[2]))
+        page.goto(f"{self.url}/#{view}")
+        page.wait_for_selector("#view > *")
+        return page
+
+    def close(self) -> None:
+        self._context.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with api.sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def console(simulated, tmp_path, browser) -> Iterator[Callable[..., tuple[Client, Pages]]]:
+    """`console(*faults)`: a service and its pages, which must not complain nor ask others."""
+    with ExitStack() as stack:
+        opened: list[Pages] = []
+
+        def start(*faults: Fault) -> tuple[Client, Pages]:
+            rig_file, _ = simulated(*faults)
+            http = stack.enter_context(serving(rig_file, tmp_path / "root"))
+            pages = Pages(browser, str(http.base_url).rstrip("/"))
+            stack.callback(pages.close)
+            opened.append(pages)
+            return http, pages
+
+        yield start
+        for pages in opened:
+            assert pages.complaints == []
+            assert pages.hosts == {pages.url.partition("//")[2]}
+
+
+def says(page: Any, text: str) -> None:
+    """Wait until the view's headline says so."""
+    page.wait_for_selector(f"h1:has-text({text!r})")
+
+
+def test_a_capture_from_its_plan_to_darkness(console):
+    http, pages = console()
+    page = pages.open("plan")
+    page.fill("[name=rate_hz]", "8")
+    page.fill("[name=projectors]", "none")
+    page.select_option("[name=stepping]", "software")
+    page.wait_for_selector(".cost:has-text('8 Hz')")
+    page.click("text=Start now")
+    page.fill("[name=holder]", "Ada")
+    page.click("dialog button")
+    says(page, "Shooting")
+    assert http.get("/lease").json()["holder"] == "Ada"
+    page.wait_for_selector("circle.light.lit")
+    running = http.service.captures(1)[0]
+    assert running.progress is not None
+    lit = page.text_content("circle.light.lit title")
+    assert lit in {light["name"] for light in http.get("/rig").json()["lights"]}
+
+    page.click("button:text-is('Pause')")
+    says(page, "Paused")
+    assert http.get(f"/captures/{running.id}").json()["state"] == "paused"
+    assert page.query_selector("circle.light.lit") is None
+    page.click("button:text-is('Resume')")
+    says(page, "Shooting")
+    page.keyboard.press("F8")
+    says(page, "Dark, verified")
+    done = http.get(f"/captures/{running.id}").json()
+    assert (done["state"], done["outcome"]) == ("done", "aborted")
+    assert 0 < done["frames_written"] < done["frames_planned"]
+    assert "was aborted" in page.text_content(".said")
+
+    page.click("nav >> text=Frames")
+    picture = page.wait_for_selector("figure img[src]")
+    until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
+    page.keyboard.press("F9")
+    page.wait_for_selector("text=dark, verified, after")
+    assert [a["action"] for a in http.get("/audit").json()][-1] == "blackout"
+
+
+def test_a_lamp_that_stays_lit_cannot_be_missed(console):
+    http, pages = console(Fault("lights", "stuck", 4))
+    page = pages.open()
+    http.post("/captures", json={"plan": {**PACED, "rate_hz": 50}})
+    alarm = page.wait_for_selector(".alarm.latch")
+    text = alarm.text_content()
+    assert "treat every lamp as lit" in text
+    assert "until a blackout reads every lamp back dark" in text
+    assert page.text_content("#top .state") == "unsafe"
+    assert alarm.bounding_box()["width"] == 1280
+    red = page.evaluate("getComputedStyle(document.querySelector('.alarm')).backgroundColor")
+    r, g, b = (int(x) for x in re.findall(r"\d+", red)[:3])
+    assert r > 40 > max(g, b)
+    assert page.query_selector("text=Dark, verified") is None
+    says(page, "UNSAFE")
+
+
+def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
+    http, pages = console()
+    page = pages.open("plan")
+    page.wait_for_selector(".cost .facts")
+    begin = page.wait_for_selector("button:text-is('Start now'):enabled")
+    lease = http.post("/lease", json={"holder": "Eve", "seconds": 600}).json()
+    page.wait_for_selector("text=Eve steers")
+    page.wait_for_selector("button:text-is('Start now'):disabled")
+    assert "Eve steers the stage until" in begin.get_attribute("title")
+    mine = {"Hairstage-Lease": lease["token"]}
+    http.post("/captures", json={"plan": PACED}, headers=mine).raise_for_status()
+    page.click("nav >> text=Now")
+    says(page, "Shooting")
+    assert page.is_disabled("button:text-is('Pause')")
+    page.keyboard.press("F9")
+    says(page, "Dark, verified")
+    http.delete("/lease", headers=mine)
+    page.wait_for_selector("text=nobody steers")
+
+
+def test_three_pages_show_the_same_and_any_of_them_aborts(console):
+    http, pages = console()
+    three = [pages.open() for _ in range(3)]
+    http.post("/captures", json={"plan": PACED}).raise_for_status()
+    for page in three:
+        says(page, "Shooting")
+        page.wait_for_selector("circle.light.lit")
+    three[1].keyboard.press("F8")
+    for page in three:
+        says(page, "Dark, verified")
+
+
+def test_a_service_that_is_started_again_is_found_by_the_open_page(simulated, browser, tmp_path):
+    rig_file, _ = simulated()
+    with serving(rig_file, tmp_path / "root") as http:
+        url, port = str(http.base_url).rstrip("/"), http.base_url.port
+        pages = Pages(browser, url)
+        page = pages.open()
+        says(page, "Dark, verified")
+        before = page.evaluate("performance.timeOrigin")
+    page.wait_for_selector(".alarm:has-text('No connection to the service')")
+    with serving(rig_file, tmp_path / "root", port=port) as http:
+        page.wait_for_selector(".alarm", state="detached")
+        http.post("/captures", json={"plan": PACED}).raise_for_status()
+        says(page, "Shooting")
+        http.post("/devices/blackout")
+        says(page, "Dark, verified")
+        assert page.evaluate("performance.timeOrigin") == before, "nobody had to load it again"
+    pages.close()
+
+
+def test_a_list_of_ten_thousand_captures_is_paged(console, tmp_path):
+    http, pages = console()
+    http.post("/captures", json={"plan": {"lights": ["light_000"], "projectors": []}})
+    (one,) = until(lambda: [c for c in http.service.captures(9) if c.state == "done"])
+    status = CaptureStatus(**one.model_dump(exclude={"job"}))
+    many = http.service._captures._done
+    for n in range(10_000):
+        name = f"20250101-{n:06d}-aaaa"
+        many[name] = status.model_copy(update={"id": name})
+    page = pages.open("frames")
+    page.wait_for_selector(f".list button >> text={one.id}")
+    assert page.locator(".list button").count() == 50
+    page.click("button:text-is('older')")
+    page.wait_for_selector(".list button >> text=20250101-009950-aaaa")
+    assert page.locator(".list button").count() == 50
+    page.click("button:text-is('newer')")
+    page.wait_for_selector(f".list button >> text={one.id}")
+
+
+def test_axe_finds_nothing_to_complain_of(console):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe here").Axe()
+    http, pages = console()
+    http.post("/captures", json={"plan": {"lights": ["light_000"], "projectors": []}})
+    until(lambda: [c for c in http.service.captures(9) if c.state == "done"])
+    page = pages.open()
+    for view, there in (
+        ("now", "h1.big"),
+        ("plan", ".cost .facts"),
+        ("frames", "figure"),
+        ("stage", ".device"),
+        ("jobs", "#view p"),
+    ):
+        page.click(f"nav a[href='#{view}']")
+        page.wait_for_selector(there)
+        found = axe.run(page).response["violations"]
+        assert [(v["id"], [n["html"] for n in v["nodes"]][:3]) for v in found] == [], view
