@@ -101,6 +101,7 @@ function jobOf(view, id) {
     acts.replaceChildren(
       ...(job.state !== "done" && may ? [button("Cancel", () => attempt(async () => { await ask(`DELETE /jobs/${id}`); load.jobs(); }))] : []),
       ...(job.state === "done" && job.outcome !== "succeeded" && may ? [button("Run it again", () => attempt(again))] : []),
+      h("a.button", { href: `/view#model=${encodeURIComponent(job.model.split("/").at(-1))}` }, "View the strands"),
       h("a.button", { href: `/models/${encodeURIComponent(job.model.split("/").at(-1))}/archive.tar`, download: "" }, "Download the model"),
     );
   }

@@ -59,7 +59,9 @@ async function fresh(name, path, take) {
     try {
       do {
         entry.again = false;
-        take(await get(path));
+        const found = await get(path);
+        if (entry.again) continue; // something has happened since it was asked for
+        take(found);
         changed();
       } while (entry.again);
     } finally {

@@ -193,7 +193,7 @@ def test_a_list_of_ten_thousand_captures_is_paged(console, tmp_path):
     http.post("/captures", json={"plan": {"lights": ["light_000"], "projectors": []}})
     (one,) = until(lambda: [c for c in http.service.captures(9) if c.state == "done"])
     status = CaptureStatus(**one.model_dump(exclude={"job"}))
-    many = http.service._captures._done
+    many = http.service._captures.catalogue._found
     for n in range(10_000):
         name = f"20250101-{n:06d}-aaaa"
         many[name] = status.model_copy(update={"id": name})
