@@ -16,9 +16,9 @@ from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.field import OrientationField, solve_field
+from reconstruction.growth.field import OrientationField, solve_field, with_descent
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
-from reconstruction.growth.hair_envelope import build_envelope
+from reconstruction.growth.hair_envelope import build_envelope, build_hull, pixel_size
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.head.capture_head import (
@@ -31,7 +31,7 @@ from reconstruction.head.capture_head import (
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.images.segmentation import Network
-from reconstruction.light_codes.line_strands import line_strands, merge
+from reconstruction.light_codes.line_strands import line_strands, merge, roots_first
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, sweep_peaks, triangulate
 from reconstruction.masks import MaskedCapture, hair_masks, report_agreement, usable_masks
@@ -45,6 +45,8 @@ HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
 LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
+FINE_PIXEL = 1e-3  # metres: line stereo finds next to nothing on pixels twice as wide
+UNROOTED_DEPTH = 12e-3  # metres under a hull's surface that are filled where no head is known
 SPACING = 2e-3  # metres between a strand's points as it is written
 
 
@@ -64,7 +66,9 @@ def reconstruct(
     Writes `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`, `scalp_map.npz`,
     `masks/*.png`, `head.obj` where the capture has none, and `report.json`. What was made of the
     model's earlier strands is removed. Raises `CaptureError` where the capture lacks what the
-    method cannot do without: OLAT frames, a head or points to fit one to, two cameras.
+    method cannot do without (OLAT frames, a head or points to fit one to, two cameras), or where
+    no strand is found. `hull` needs masks and two cameras only, `auto` takes what the capture
+    holds: `light_planes` where it has a sweep, else `hull`; the stage `method` says which.
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
@@ -73,13 +77,18 @@ def reconstruct(
     whole = stages.undistorted(capture)
     capture = _without(whole, options.held_out)
     head = stages.known_head(capture)
+    if method == "auto":
+        method = stages.chosen(capture, head)
     cloud = stages.points(capture, motion)
     masked = stages.masks(whole, capture, cloud, head)
     if method == "photometric" or method == "lmvs":
         stages.seen_strands(masked, head, method)
+    elif method == "hull":
+        stages.hull(masked, cloud, head)
     else:
         head = head or stages.head_under_skin(masked, cloud)
-        envelope, measured = stages.tangents(masked, cloud, head.mesh)
+        envelope, depths = stages.envelope(masked, cloud, head.mesh)
+        measured = stages.tangents(masked, cloud, depths)
         seen = stages.surface(measured, cloud)
         if method == "fused":
             more, segments = stages.lines(masked, head, "photometric")
@@ -157,6 +166,17 @@ class _Stages:
             self.model.write_head(head.mesh)
         return head
 
+    def chosen(self, capture: Capture, head: FittedHead | None) -> Method:
+        """The method for what the capture holds; the stage `method` says what and which."""
+        with self.report.stage("method") as stage:
+            sweep, lights = bool(capture.of_kind("scanline")), len(capture.olat_lights())
+            method: Method = "light_planes" if sweep and lights else "hull"
+            holds = f"{'a' if sweep else 'no'} sweep, {lights} single lights, "
+            holds += f"{'no' if head is None else 'a'} head"
+            stage.figures.update(method=method, capture_holds=holds)
+            self.progress(f"{holds}: method {method}", 0.0)
+        return method
+
     def points(self, capture: Capture, motion: Motion | None) -> PointCloud:
         """Triangulated points in the reference pose; none where there was no sweep."""
         rig = capture.rig
@@ -207,7 +227,7 @@ class _Stages:
 
     def lines(
         self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
-    ) -> tuple[list[Array], Segments]:
+    ) -> tuple[list[AnyFloats], Segments]:
         """Polylines `(N, 3)` from line stereo, and the segments that they come from."""
         o, mesh, tell = self.options.light_codes, None if head is None else head.mesh, self.progress
         return line_strands(masked, mesh, self.report, method=method, options=o, progress=tell)
@@ -217,31 +237,76 @@ class _Stages:
     ) -> None:
         """Strands from line stereo alone: only what is seen, none of them rooted."""
         polylines, _ = self.lines(masked, head, method)
+        why = "line stereo measures what is seen; the method 'fused' leads it to the scalp"
         with self.report.stage("strands") as stage:
-            radius = self._radius(len(polylines))
-            strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
-            stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
-            stage.leave_out(
-                "roots",
-                "line stereo measures what is seen; the method 'fused' leads it to the scalp",
-                "the field and the growth",
-            )
-            self.model.write_strands(strands)
+            stage.leave_out("roots", why, "the field and the growth")
+            self._unrooted([*polylines], stage)
 
-    def tangents(
-        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh
-    ) -> tuple[VoxelGrid, Measured]:
-        """The hair's envelope, and the measured tangents in it."""
+    def _unrooted(self, polylines: list[AnyFloats], stage: Stage) -> None:
+        """Write strands that have no roots; raises `CaptureError` where there is none."""
+        if not polylines:
+            raise CaptureError("no strand was found: the method 'hull' fills the masks' hull")
+        radius = self._radius(len(polylines))
+        strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
+        stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
+        self.model.write_strands(strands)
+
+    def hull(self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None) -> None:
+        """Strands along the smooth field of the hull's surface, pulled by all that is measured.
+
+        Single lights give directions, and line stereo where pixels are at most `FINE_PIXEL` wide.
+        Without single lights nothing is measured; without a head no strand has a root.
+        """
+        o, olat = self.options, masked.capture.olat_lights()
+        mesh = None if head is None else head.mesh
+        envelope, depths = self.envelope(masked, cloud, mesh)
+        pixel = pixel_size(masked.cameras, envelope)
+        measured, seen = Measured.none(), list[AnyFloats]()
+        if olat:
+            measured = self.tangents(masked, cloud, depths)
+        with self.report.stage("line stereo") as stage:
+            if not olat:
+                stage.warn("no single lights: nothing is measured, all strands are guessed")
+            elif pixel > FINE_PIXEL:
+                why = f"a pixel is {1e3 * pixel:.1f} mm wide, more than {1e3 * FINE_PIXEL:g}"
+                stage.leave_out("line stereo", why, "its stages")
+            else:
+                try:
+                    lines, segments = self.lines(masked, head, "photometric")
+                    seen, measured = list(lines), merge(measured, segments)
+                except CaptureError as error:
+                    stage.warn(f"line stereo finds nothing: {error}")
+        scalp = None if mesh is None else find_scalp(mesh, envelope)
+        field = self.field(envelope, with_descent(envelope, measured, mesh), scalp)
+        if head is not None and scalp is not None:
+            self.strands(field, scalp, seen, head.scalp_map)
+            return
+        with self.report.stage("strands") as stage:
+            coverage, tracing = Coverage(field), Tracing(max_length=o.max_length)
+            for path in seen:
+                coverage.add(path)
+            within = UNROOTED_DEPTH if o.within is None else o.within
+            gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
+            self._unrooted(roots_first([*seen, *gaps], None), stage)
+
+    def envelope(
+        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh | None
+    ) -> tuple[VoxelGrid, dict[str, Array]]:
+        """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels."""
         o = self.options
         with self.report.stage("envelope") as stage:
-            envelope, depths = build_envelope(
-                masked, cloud, head, grid=o.grid, margin=o.margin, stage=stage
-            )
+            if head is None:
+                return build_hull(masked, grid=o.grid, stage=stage)
+            return build_envelope(masked, cloud, head, grid=o.grid, margin=o.margin, stage=stage)
+
+    def tangents(
+        self, masked: MaskedCapture, cloud: PointCloud, depths: dict[str, Array]
+    ) -> Measured:
+        """The measured tangents."""
         with self.report.stage("orientation") as stage:
-            measured = measure_tangents(
-                masked, cloud.points, depths, o.measure, stage, self.progress
+            return measure_tangents(
+                masked, cloud.points, depths, self.options.measure, stage, self.progress
             )
-        return envelope, measured
 
     def surface(self, measured: Measured, cloud: PointCloud) -> list[AnyFloats]:
         """Polylines `(N, 3)` through the measured lines; none of them rooted."""
@@ -261,7 +326,9 @@ class _Stages:
             stage.figures.update(strands=len(polylines), options=asdict(surface))
         return list(polylines)
 
-    def field(self, envelope: VoxelGrid, measured: Measured, scalp: Scalp) -> OrientationField:
+    def field(
+        self, envelope: VoxelGrid, measured: Measured, scalp: Scalp | None
+    ) -> OrientationField:
         """The orientation field in the envelope."""
         kept = measured.where(measured.confidence >= LEAST_CONFIDENCE)
         with self.report.stage("field") as stage:
@@ -277,9 +344,9 @@ class _Stages:
                 measured_voxels=int(field.measured.sum()),
                 empty_voxels=int(field.empty.sum()),
                 degenerate_voxels=int(field.degenerate.sum()),
-                scalp_cm2=scalp.area * 1e4,
-                scalp_marked=scalp.marked,
             )
+            if scalp is not None:
+                stage.figures.update(scalp_cm2=scalp.area * 1e4, scalp_marked=scalp.marked)
             if field.empty.any():
                 stage.warn(
                     f"{int(field.empty.sum())} voxels hang together with no measurement: left empty"

@@ -11,9 +11,12 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.laplace import conjugate_gradients, grid_laplacian
 from reconstruction.report.report import Series
+from reconstruction.tangents.estimate import Measured
 
 _PAD = 2
 _ROWS, _COLUMNS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
@@ -152,6 +155,23 @@ def descent(grid: VoxelGrid, head: Bools | None = None) -> tuple[Array, Array]:
     slope = np.linalg.norm(tangent, axis=1)
     keep = slope > 0.1  # flatter than 6 degrees, the way down is the voxels' noise
     return grid.centers(index[keep]), tangent[keep] / slope[keep, None]
+
+
+DESCENT_WEIGHT = 0.3
+"""Of the way down, beside the confidences (0 to 1) of measured lines in the same voxel."""
+
+
+def with_descent(grid: VoxelGrid, measured: Measured, head: Mesh | None = None) -> Measured:
+    """The measured lines and, all over the outer surface, the way down (`descent`).
+
+    Where nothing was measured that is all there is; elsewhere the lines pull the surface's field.
+    """
+    points, directions = descent(grid, None if head is None else inside_mesh(grid, head))
+    return Measured(
+        np.concatenate([measured.points, points]),
+        np.concatenate([measured.directions, directions]),
+        np.concatenate([measured.confidence, np.full(len(points), DESCENT_WEIGHT)]),
+    )
 
 
 def gather(

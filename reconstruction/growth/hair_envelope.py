@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -80,6 +81,38 @@ def build_envelope(
             f"{masked.capture.path}: no volume is left for hair: check masks, head.obj and poses"
         )
     return envelope, depths
+
+
+def build_hull(
+    masked: MaskedCapture, *, grid: float, stage: Stage
+) -> tuple[VoxelGrid, dict[str, Array]]:
+    """As `build_envelope` without sweep and head: the visual hull of the hair's masks alone.
+
+    Raises `CaptureError` where nothing is left, or too few cameras see hair.
+    """
+    masks = {k: m.hair for k, m in masked.masks.items() if m.hair.any()}
+    try:
+        envelope = visual_hull(masked.cameras, masks, spacing=grid)
+    except ValueError as error:
+        raise CaptureError(f"{masked.capture.path}: no volume for hair: {error}") from error
+    litres = float(envelope.inside.sum() * 1e3 * grid**3)
+    if not litres:
+        raise CaptureError(
+            f"{masked.capture.path}: no volume is left for hair: check masks and poses"
+        )
+    stage.figures.update(envelope_litres=litres, voxels=int(envelope.inside.sum()))
+    stage.warn("no head: what the hull holds of it counts as hair, and no strand has a root")
+    return envelope, {
+        c.name: np.where(masks[c.name], depth_map_first(c, envelope), 0.0)
+        for c in masked.cameras
+        if c.name in masks
+    }
+
+
+def pixel_size(cameras: Sequence[Camera], envelope: VoxelGrid) -> float:
+    """Metres that one pixel spans at the envelope's middle, the median over the cameras."""
+    middle = envelope.centers().mean(axis=0)[None]
+    return float(np.median([c.project(middle)[1][0] / c.K[0, 0] for c in cameras]))
 
 
 def _holding(grid: VoxelGrid, points: Array) -> Bools:

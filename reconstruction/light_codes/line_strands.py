@@ -153,7 +153,7 @@ def line_strands(
     method: Literal["photometric", "lmvs"] = "photometric",
     options: LightCodeOptions = LightCodeOptions(),
     progress: Progress = silent,
-) -> tuple[list[Array], Segments]:
+) -> tuple[list[AnyFloats], Segments]:
     """Polylines `(N, 3)` from line stereo, the end that is nearer to the head first.
 
     Without a head it is the higher end. None of them is rooted. Also the segments that they come
@@ -165,7 +165,7 @@ def line_strands(
     maps = _depth_maps(views, volume, report, method, options, progress)
     least = min(options.least_views, len(views))
     segments = _agreed_segments(views, maps, least, report, masked.capture.path)
-    return _roots_first(connect_segments(views, segments, report), head), segments
+    return roots_first([*connect_segments(views, segments, report)], head), segments
 
 
 def merge(measured: Measured, segments: Segments) -> Measured:
@@ -177,7 +177,8 @@ def merge(measured: Measured, segments: Segments) -> Measured:
     )
 
 
-def _roots_first(polylines: list[Array], head: Mesh | None) -> list[Array]:
+def roots_first(polylines: list[AnyFloats], head: Mesh | None) -> list[AnyFloats]:
+    """The polylines `(N, 3)`, each with the end nearer to the head first, or else the higher."""
     if not polylines:
         return []
     ends = np.stack([[p[0] for p in polylines], [p[-1] for p in polylines]], axis=1)

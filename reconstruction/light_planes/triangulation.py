@@ -26,6 +26,8 @@ NEIGHBOURS, ISOLATION = 8, 1.6  # see `supported`
 RADIUS, ROUGHNESS = 2.5e-3, 3e-4
 """Metres: a neighbourhood's size, and how far fibres lie off its plane (`flatten`)."""
 
+CHUNK = 20_000  # points whose neighbours are looked at together: about 4 kB each
+
 
 def sweep_peaks(capture: Capture, progress: Progress = silent) -> list[Peaks]:
     """The stripes of every camera and projector, streamed from disk.
@@ -256,20 +258,26 @@ def flatten(cloud: PointCloud, radius: float, roughness: float, neighbours: int 
     k = min(neighbours, n - 1)
     if k < 8:
         return cloud
-    distance, index = cKDTree(cloud.points).query(cloud.points, k=k + 1)
-    variance = cloud.deviation_along_view() ** 2
-    near = np.exp(-0.5 * (distance / radius) ** 2) * (distance <= 2 * radius)
-    weight = near * (cloud.weight / (variance + roughness**2))[index]
-    weight /= weight.sum(axis=1, keepdims=True)
-    neighbour = cloud.points[index]
-    mean = np.einsum("nk,nki->ni", weight, neighbour)
-    offset = neighbour - mean[:, None]
-    moments = np.einsum("nk,nki,nkj->nij", weight, offset, offset)
-    normal = np.linalg.eigh(moments)[1][:, :, 0]
+    tree = cKDTree(cloud.points)
+    information = cloud.weight / (cloud.deviation_along_view() ** 2 + roughness**2)
+
+    def planes(first: int) -> tuple[Array, Array, Bools]:
+        """Middles and normals of the planes of some points, and whether neighbours are enough."""
+        distance, index = tree.query(cloud.points[first : first + CHUNK], k=k + 1)
+        near = np.exp(-0.5 * (distance / radius) ** 2) * (distance <= 2 * radius)
+        weight = near * information[index]
+        weight /= weight.sum(axis=1, keepdims=True)
+        neighbour = cloud.points[index]
+        mean = np.einsum("nk,nki->ni", weight, neighbour)
+        offset = neighbour - mean[:, None]
+        moments = np.einsum("nk,nki,nkj->nij", weight, offset, offset)
+        return mean, np.linalg.eigh(moments)[1][:, :, 0], (near > 0).sum(axis=1) > 8
+
+    parts = zip(*map(planes, range(0, n, CHUNK)), strict=True)
+    mean, normal, use = (np.concatenate(part) for part in parts)
     residual = np.einsum("ni,ni->n", cloud.points - mean, normal)
     gain = np.einsum("nij,nj->ni", cloud.covariance, normal)
     total = np.einsum("ni,ni->n", gain, normal) + roughness**2
-    use = (near > 0).sum(axis=1) > 8
     step = np.where(use, residual / total, 0.0)[:, None] * gain
     reduced = gain[:, :, None] * gain[:, None, :] / total[:, None, None]
     return replace(

@@ -38,6 +38,11 @@ class Measured:
     directions: Array
     confidence: Array
 
+    @classmethod
+    def none(cls) -> Measured:
+        """No line at all."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
     def where(self, keep: Bools) -> Measured:
         """Those that are to be kept `(N,)`."""
         return Measured(self.points[keep], self.directions[keep], self.confidence[keep])

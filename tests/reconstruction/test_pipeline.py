@@ -28,6 +28,7 @@ from reconstruction import (
 )
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_planes import PointCloud
+from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.tangents.estimate import light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09
@@ -164,6 +165,40 @@ def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
     assert 1.0 < report["envelope"].figures["envelope_litres"] < 2.0
 
 
+def test_auto_without_head_or_sweep_fills_the_hull_along_what_is_measured(
+    shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
+) -> None:
+    capture = shoot(cameras=around, projectors=[], lights=LIGHTS[:4], extra=hair)
+    options = ReconstructOptions(grid=8e-3, max_length=0.1, measure=MeasureOptions(thin=8e-3))
+    report = reconstruct(capture, Model(tmp_path), method="auto", options=options)
+    assert report["method"].figures == {
+        "method": "hull",
+        "capture_holds": "no sweep, 4 single lights, no head",
+    }
+    assert any("no head" in w for w in report["envelope"].warnings)
+    strands = read_strands(tmp_path / "strands.npz")
+    assert len(strands) > 100
+    # of the whole ball's hull: as the meridians do, upper end first
+    radius = np.linalg.norm(strands.points, axis=1)
+    outer = (radius > 0.09) & (np.abs(strands.points[:, 2]) < 0.07)
+    along = (strands.tangents()[outer] * down(strands.points[outer])).sum(axis=1)
+    assert np.median(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))) < 12
+    ends = strands.points[strands.offsets[1:] - 1]
+    assert (strands.roots[:, 2] >= ends[:, 2]).all()
+
+
+@pytest.mark.slow
+def test_auto_with_a_head_and_with_nothing_but_masks(unswept: Capture, tmp_path: Path) -> None:
+    report = reconstruct(unswept, Model(tmp_path / "head"), method="auto", options=QUICK)
+    assert report["method"].figures["capture_holds"] == "no sweep, 12 single lights, a head"
+    runs_down(read_strands(tmp_path / "head" / "strands.npz"))
+    dark = Capture(unswept.path)
+    dark.steps = tuple(s for s in dark.steps if s.kind != "olat")
+    report = reconstruct(dark, Model(tmp_path / "dark"), method="auto", options=QUICK)
+    assert any("all strands are guessed" in w for w in report["line stereo"].warnings)
+    runs_down(read_strands(tmp_path / "dark" / "strands.npz"))
+
+
 def test_same_seed_same_strands(
     unswept: Capture, model: tuple[Path, Report], tmp_path: Path
 ) -> None:
@@ -243,6 +278,15 @@ def test_what_cannot_be_done_without_is_named(
         reconstruct(unswept, Model(tmp_path), options=ReconstructOptions(held_out=("c9",)))
     with pytest.raises(ValueError, match="unknown method 'guess'"):
         reconstruct(unswept, Model(tmp_path), method="guess")  # type: ignore[arg-type]
+
+
+def test_no_strand_is_an_error_that_says_what_to_do(
+    unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reconstruction.pipeline.line_strands", lambda *_, **__: ([], None))
+    with pytest.raises(CaptureError, match="no strand was found: the method 'hull'"):
+        reconstruct(unswept, Model(tmp_path), method="photometric")
+    assert not (tmp_path / "strands.npz").exists()
 
 
 def test_light_groups_are_neighbours() -> None:

@@ -20,7 +20,7 @@ def add(commands: Commands) -> None:
     """Add the command."""
     reconstruct = add_command(commands, "reconstruct", run)
     reconstruct.add_argument("capture", type=Path)
-    reconstruct.add_argument("--method", choices=METHODS, default="light_planes")
+    reconstruct.add_argument("--method", choices=METHODS, default="auto")
     reconstruct.add_argument("--out", type=Path, required=True, help="model folder")
     reconstruct.add_argument("--options", help="the method's options as JSON")
     add_held_out(reconstruct)
@@ -28,6 +28,9 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace, output: Output) -> None:
     """Strands from a capture.
+
+    --method auto takes what the capture holds, and says what it is: planes of light where there is
+    a sweep, else the masks' hull, filled along what single lights show.
 
     Write MODEL/strands.npz, .hair and .usdc, MODEL/report.json, and a page on them,
     MODEL/index.html.
@@ -50,8 +53,15 @@ def run(args: argparse.Namespace, output: Output) -> None:
     write_page(model)
     strands = model.strands()
     seconds = sum(stage.seconds for stage in model.report().stages)
+    chosen = next((s.figures for s in model.report().stages if s.name == "method"), None)
+    method = chosen["method"] if chosen else args.method
     data = {"model": str(model), "strands": len(strands), "points": len(strands.points)}
+    if chosen:
+        output.note(f"{chosen['capture_holds']}: method {method}")
+    for stage in model.report().stages:
+        for warning in stage.warnings:
+            output.note(f"warning: {stage.name}: {warning}")
     output.result(
-        {**data, "seconds": seconds},
+        {**data, "method": method, "seconds": seconds},
         f"{len(strands)} strands in {model.file('strands.npz')} ({seconds:.0f} s)",
     )
