@@ -29,7 +29,7 @@ BODY_S = 20.0
 """A request's body is there within this time."""
 LINGER_S = 10.0
 """How long a request that is refused may go on sending."""
-UPLOADS, MOST_UPLOAD, UPLOAD_S = "/uploads/", 32 << 20, 120.0
+UPLOADS, MOST_UPLOAD, UPLOAD_S = ("/uploads/", f"{VIEW}/models/"), 32 << 20, 120.0
 """Where a `PUT` may be larger, and take longer: two at a time, each of them in memory."""
 
 

@@ -37,7 +37,7 @@ from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
 from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
 from stage_service.storage import BadUpload, InUse, NotThere
-from stage_service.viewer import NothingToView
+from stage_service.viewer import BadLight, NothingToView
 from stage_service.watching import NotReady
 
 log = logging.getLogger("hairstage.api")
@@ -149,6 +149,7 @@ BY_ERROR: dict[type[Exception], str] = {
     PlanError: "invalid-plan",
     BadInput: "bad-input",
     BadUpload: "bad-input",
+    BadLight: "bad-input",
     InUse: "in-use",
     NotThere: "not-there",
     NothingToView: "not-there",

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
 
 from stage_service.api.downloads import file_response
 from stage_service.api.gate import VIEW, VIEW_PAGE
 from stage_service.api.steering import READS
-from stage_service.viewer import Viewed, Viewing
+from stage_service.viewer import NothingToView, Viewed, Viewing
 
 FILES = Path(__file__).parents[1] / "viewer" / "page"
 POLICY = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'"
@@ -20,6 +22,23 @@ BYTES: dict[str, Any] = {
     "response_class": Response,
     "responses": {200: {"content": {"application/octet-stream": {}}}},
 }
+
+PNG: dict[str, Any] = {
+    "response_class": Response,
+    "responses": {200: {"content": {"image/png": {}}}},
+}
+MAP: dict[str, Any] = {"requestBody": {"required": True, "content": {"image/x-exr": {}}}}
+Colour = Annotated[list[Annotated[float, Field(ge=0, le=1e9)]], Field(min_length=3, max_length=3)]
+
+
+class Light(BaseModel):
+    """How much of each light: its number, and by what its red, green and blue are multiplied."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    weights: dict[Annotated[int, Field(ge=0, le=100_000)], Colour] = {}
+    exposure: Annotated[float, Field(gt=0, le=1e9)] = 1.0
+
 
 page = APIRouter(include_in_schema=False)
 reading = APIRouter(prefix=f"{VIEW}/models", dependencies=READS, tags=["viewer"])
@@ -101,3 +120,60 @@ def get_head(model: OnModel) -> Response:
 def get_confidence(model: OnModel) -> Response:
     """How near a measured point each point of the strands is: 255 at it, 0 at 5 mm and beyond."""
     return _bytes(model.confidence())
+
+
+@reading.get("/{name}/lighting")
+def get_lighting(model: OnModel) -> dict[str, Any]:
+    """The lights by number, and the hair's material if one was fitted."""
+    return model.lighting.about()
+
+
+@reading.get("/{name}/table", **BYTES)
+def get_table(model: OnModel) -> Response:
+    """The azimuthal part of the hair's four lobes, by the eye's inclination and the turn."""
+    return _bytes(model.lighting.table())
+
+
+@reading.get("/{name}/seen/{light}", **BYTES)
+def get_seen(model: OnModel, light: int) -> Response:
+    """Where a light reaches: 255 or 0 for each point of the strands, then of the head."""
+    if not 0 <= light < len(model.lighting.lights):
+        raise NothingToView(f"there is no light number {light}")
+    return _bytes(model.lighting.seen(light))
+
+
+@reading.post("/{name}/few")
+def get_few(model: OnModel, body: Light) -> list[dict[str, Any]]:
+    """The few lights that stand for all of these in the shader."""
+    return model.lighting.few(dict(body.weights))
+
+
+@reading.post("/{name}/sums/{camera}.png", **PNG)
+def get_sum(model: OnModel, camera: str, body: Light) -> Response:
+    """A camera's captured frames under these lights: their sum, exposed, in the sRGB curve."""
+    if camera not in {c["name"] for c in model.about()["cameras"]}:
+        raise NothingToView(f"there is no camera {camera!r}")
+    png = model.lighting.sum(camera, dict(body.weights), body.exposure)
+    return Response(png, media_type="image/png")
+
+
+@reading.get("/{name}/environments/{which}")
+def get_environment(
+    model: OnModel, which: str, rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0
+) -> dict[int, list[float]]:
+    """By what each light is multiplied to stand for the map "studio" or "sky"."""
+    return model.lighting.environment(which, "", rotation_deg)
+
+
+@reading.put("/{name}/environments/{file}", openapi_extra=MAP)
+async def put_environment(
+    model: OnModel,
+    file: str,
+    request: Request,
+    rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0,
+) -> dict[int, list[float]]:
+    """By what each light is multiplied to stand for this .hdr or .exr map. It is not kept."""
+    data, kind = await request.body(), file.rpartition(".")[2].lower()
+    return await run_in_threadpool(
+        lambda: model.lighting.environment(data, kind, rotation_deg),
+    )

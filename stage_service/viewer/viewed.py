@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,12 +13,19 @@ from reconstruction import Capture, Mesh, Model, Strands
 from reconstruction.arrays import Floats
 from stage_service.viewer.packing import PackedStrands
 
+if TYPE_CHECKING:
+    from stage_service.viewer.lighting import Lighting
+
 FAR = 5e-3
 """Metres to the nearest measured point beyond which a strand's point counts as not measured."""
 
 
 class NothingToView(LookupError):
     """The model, the capture or the part of it is not there; the message says what to do."""
+
+
+class BadLight(ValueError):
+    """Light that cannot be made; the message says what is wrong with it."""
 
 
 class Viewed:
@@ -63,6 +70,18 @@ class Viewed:
     def _packed_truth(self) -> PackedStrands:
         assert self.truth is not None
         return PackedStrands.of(self.truth)
+
+    @property
+    def lighting(self) -> Lighting:
+        """What light does to it. Brings the renderer, which a service needs for nothing else."""
+        with self.lock:
+            return self._lighting
+
+    @cached_property
+    def _lighting(self) -> Lighting:
+        from stage_service.viewer.lighting import Lighting
+
+        return Lighting(self.model, self.capture, self._packed)
 
     def about(self) -> dict[str, Any]:
         """What there is, JSON-ready: sets of strands, head, cameras, lights."""

@@ -1,6 +1,8 @@
 // The panel beside the picture: what is shown, and how.
 
 import * as net from "./net.js";
+import { Relight } from "./relight.js";
+import { Pinhole, add, scale } from "./space.js";
 
 export function element(tag, properties = {}, ...children) {
   const made = Object.assign(document.createElement(tag), properties);
@@ -37,7 +39,107 @@ export class Controls {
       element("p", { textContent: `${count(model.count)} strands of ${model.points} points, half ` +
         `of the model's points within ${model.deviation_mm[0].toFixed(2)} mm of them, 95 % within ` +
         `${model.deviation_mm[1].toFixed(2)}, all within ${model.deviation_mm[2].toFixed(2)}` }),
-      ...this.strands());
+      ...this.strands(), ...this.cameras());
+    this.light().catch((error) => viewer.status(error.message));
+  }
+
+  // Light comes later: the strands do not wait for the renderer.
+  async light() {
+    const { viewer } = this;
+    viewer.relight = this.relight = await Relight.begin(viewer);
+    if (this.relight.told.material) this.colour.append(
+      element("option", { value: "lit", textContent: "lit" }));
+    this.panel.append(...this.relight.controls());
+  }
+
+  cameras() {
+    const { viewer } = this, { about, picture } = viewer, { state } = picture;
+    if (!about.cameras.length) return [];
+    const size = 0.12, lines = [];
+    const plain = [0.45, 0.48, 0.55];
+    this.frusta = about.cameras.map((c) => {
+      const p = new Pinhole(c), [fx, fy] = [c.K[0][0], c.K[1][1]];
+      const corner = (u, v) => {
+        const local = [(u - c.K[0][2]) / fx, (v - c.K[1][2]) / fy, 1].map((x) => x * size);
+        return add(p.eye, [0, 1, 2].map((i) => local.reduce((s, x, k) => s + x * c.R[k][i], 0)));
+      };
+      const four = [corner(0, 0), corner(c.width, 0), corner(c.width, c.height), corner(0, c.height)];
+      four.forEach((a, i) => {
+        lines.push(...a, ...plain, ...four[(i + 1) % 4], ...plain, ...p.eye, ...plain, ...a, ...plain);
+      });
+      return { name: c.name, middle: scale(four.reduce(add), 0.25) };
+    });
+    picture.setWires(lines);
+    const wires = element("input", { type: "checkbox" });
+    wires.addEventListener("change", () => {
+      state.wires = wires.checked;
+      viewer.orbit.zoom(wires.checked ? 6 : 1 / 6);
+      viewer.draw();
+    });
+    this.through = choice([["", "none: turn freely"], ...about.cameras.map((c) => [c.name, c.name])],
+      "", (name) => this.look(name));
+    this.wipe = slider(0, 1, 0.005, 0.5, (v) => this.wiped(v));
+    this.see = slider(0, 1, 0.02, 1, (v) => {
+      state.opacity = v;
+      this.wiped(Number(this.wipe.value));
+      viewer.draw();
+    });
+    this.overlay = [labelled("strands", this.see), labelled("wipe", this.wipe),
+      element("p", { textContent: "Left of the wipe: captured frames; right: the model." })];
+    this.overlay.forEach((x) => { x.hidden = true; });
+    viewer.leave = () => this.look("");
+    viewer.click = (e) => this.pick(e);
+    return [element("h2", { textContent: "Cameras" }), labelled("show them", wires),
+      labelled("through", this.through), ...this.overlay];
+  }
+
+  // A click near a camera's frustum looks through it.
+  pick(event) {
+    const { viewer } = this, { state } = viewer.picture, { canvas } = viewer;
+    if (!state.wires || state.camera) return;
+    const { clientWidth: w, clientHeight: h } = canvas, view = viewer.view(w, h);
+    const box = canvas.getBoundingClientRect();
+    let best = [28, null];
+    for (const { name, middle } of this.frusta) {
+      const local = view.R.map((row, i) => row.reduce((s, x, k) => s + x * middle[k], view.t[i]));
+      if (local[2] <= 0) continue;
+      const u = view.K[0][0] * local[0] / local[2] + view.K[0][2];
+      const v = view.K[1][1] * local[1] / local[2] + view.K[1][2];
+      const off = Math.hypot(u - event.clientX + box.left, v - event.clientY + box.top);
+      if (off < best[0]) best = [off, name];
+    }
+    if (best[1]) this.look(best[1]);
+  }
+
+  async look(name) {
+    const { viewer, relight } = this, { state } = viewer.picture;
+    const shown = document.getElementById("sum");
+    state.camera = viewer.about.cameras.find((c) => c.name === name) ?? null;
+    this.through.value = name;
+    const captured = Boolean(name) && relight?.told.captured;
+    this.overlay.forEach((x) => { x.hidden = !captured; });
+    shown.hidden = !captured;
+    if (!captured) {
+      state.opacity = 1;
+      this.see.value = 1;
+      viewer.canvas.style.clipPath = "";
+      return viewer.draw();
+    }
+    this.wiped(Number(this.wipe.value));
+    viewer.draw();
+    if (!Object.keys(relight.weights).length)
+      relight.weights = Object.fromEntries(relight.directions.map((_, i) => [i, [1, 1, 1].map(
+        (x) => x / Math.sqrt(relight.directions.length))]));
+    await relight.set(relight.weights);
+  }
+
+  // What is captured is shown left of `share` of the picture, what is drawn right of it and over it.
+  wiped(share) {
+    const { viewer } = this, { state } = viewer.picture, shown = document.getElementById("sum");
+    const cut = `${(100 * share).toFixed(2)}%`;
+    const over = state.opacity < 1;  // then strands are seen through, over the whole photograph
+    shown.style.clipPath = over ? "" : `inset(0 calc(100% - ${cut}) 0 0)`;
+    viewer.canvas.style.clipPath = state.camera && !over ? `inset(0 0 0 ${cut})` : "";
   }
 
   strands() {
@@ -95,6 +197,13 @@ export class Controls {
     }
     picture.state.mode = mode;
     this.explain();
+    if (mode === "lit") {
+      try {
+        await this.relight.material();
+        if (!Object.keys(this.relight.weights).length) this.relight.towards([-0.6, -0.7, 0.4]);
+        else await this.relight.set(this.relight.weights);
+      } catch (error) { viewer.status(error.message); }
+    }
   }
 
   explain() {
@@ -106,7 +215,7 @@ export class Controls {
         confidence: `yellow: measured there; dark: ${about.confidence_mm} mm and more from any ` +
           "measured point, grown by a rule",
         root: "hue: where on the scalp the strand is rooted",
-        length: `dark: short; yellow: ${longest} mm`, lit: "" }[state.mode];
+        length: `dark: short; yellow: ${longest} mm`, lit: "the fitted fibres, lit: see below" }[state.mode];
     viewer.draw();
   }
 }

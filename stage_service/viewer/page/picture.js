@@ -18,7 +18,7 @@ export class Picture {
     const plain = (lighting) => new Program(
       gl, shaders.STRAND_VERTEX(lighting), shaders.STRAND_FRAGMENT);
     this.plain = plain(shaders.UNLIT);
-    this.skin = new Program(gl, shaders.HEAD_VERTEX(""), shaders.HEAD_FRAGMENT(shaders.UNLIT_HEAD));
+    this.skin = new Program(gl, shaders.HEAD_VERTEX, shaders.HEAD_FRAGMENT(shaders.UNLIT_HEAD));
     this.wire = new Program(gl, shaders.WIRE_VERTEX, shaders.WIRE_FRAGMENT);
     this.copy = new Program(gl, shaders.SCREEN_VERTEX, shaders.COPY_FRAGMENT);
     this.show = new Program(gl, shaders.SCREEN_VERTEX, shaders.SHOW_FRAGMENT);
@@ -30,14 +30,12 @@ export class Picture {
     this.batch = 1000;
   }
 
-  // The programs for light: compiled when it is first wanted.
+  // What gives the uniforms of light; the programs for it are compiled when it is first wanted.
   setLighting(lighting) {
-    if (!this.litStrands) {
-      this.litStrands = new Program(
-        this.gl, shaders.STRAND_VERTEX(lighting.strands), shaders.STRAND_FRAGMENT);
-      this.litSkin = new Program(
-        this.gl, shaders.HEAD_VERTEX(""), shaders.HEAD_FRAGMENT(lighting.skin));
-    }
+    this.litStrands ??= new Program(
+      this.gl, shaders.STRAND_VERTEX(shaders.LIT), shaders.STRAND_FRAGMENT);
+    this.litSkin ??= new Program(
+      this.gl, shaders.HEAD_VERTEX, shaders.HEAD_FRAGMENT(shaders.LIT_HEAD));
     this.lighting = lighting;
   }
 
@@ -152,7 +150,7 @@ export class Picture {
       };
       const camera = view(wide, height), common = this.common(camera, how);
       begin();
-      if (this.head && state.head) {
+      if (this.head && state.head && state.opacity === 1) {
         const lit = this.lit();
         (lit ? this.litSkin : this.skin).use({ ...common, ...(lit ? this.lighting.uniforms() : {}) });
         this.head.draw();

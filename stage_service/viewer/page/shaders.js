@@ -83,7 +83,7 @@ void main() {
   oColour = vec4(c * uOpacity, uOpacity);
 }`;
 
-export const HEAD_VERTEX = (lighting) => HEAD + `
+export const HEAD_VERTEX = HEAD + `
 layout(location = 0) in vec3 aPlace;
 layout(location = 1) in vec4 aSeen0;
 layout(location = 2) in vec4 aSeen1;
@@ -148,4 +148,80 @@ out vec4 oColour;
 void main() {
   vec4 c = texture(uPicture, vAt);
   oColour = vec4(shown(c.rgb), c.a);
+}`;
+
+// Direct light of the hair's BSDF seen from afar: M_p of each lobe, times a table of the mean of
+// A_p N_p over the fibre's width (appearance/bsdf/far_field.py), times what the shadow lets through.
+const LIGHTS = `
+uniform int uLights;
+uniform vec3 uLightAt[8], uLightPower[8];
+uniform vec3 uAmbient;
+vec3 incoming(int i, vec3 p, out vec3 l) {
+  l = uLightAt[i] - p;
+  float d2 = dot(l, l);
+  l *= inversesqrt(d2);
+  return uLightPower[i] / d2;
+}
+`;
+
+export const LIT = LIGHTS + `
+uniform sampler2D uSeen0, uSeen1, uTable;
+uniform vec4 uVariance;
+uniform float uTilt;
+uniform vec2 uGrid;  // cosines, turns
+float scaledI0(float x) {  // I0(x) exp(-x): Abramowitz and Stegun 9.8.1, 9.8.2
+  if (x < 3.75) {
+    float y = x * x / 14.0625;
+    return exp(-x) * (1.0 + y * (3.5156229 + y * (3.0899424 + y * (1.2067492 + y * (0.2659732
+      + y * (0.0360768 + y * 0.0045813))))));
+  }
+  float z = 3.75 / x;
+  return (0.39894228 + z * (0.01328592 + z * (0.00225319 + z * (-0.00157565 + z * (0.00916281
+    + z * (-0.02057706 + z * (0.02635537 + z * (-0.01647633 + z * 0.00392377)))))))) * inversesqrt(x);
+}
+float longitudinal(float si, float ci, float so, float co, float v) {
+  float chord = (ci - co) * (ci - co) + (si + so) * (si + so), r = 1.0 / v;
+  return scaledI0(ci * co * r) * exp(-0.5 * chord * r) * r / (1.0 - exp(-2.0 * r));
+}
+vec3 azimuthal(int lobe, float cosine, float turn) {
+  float row = clamp(cosine * uGrid.x, 0.5, uGrid.x - 0.5) + float(lobe) * uGrid.x;
+  float column = clamp(turn / 3.14159265 * uGrid.y, 0.5, uGrid.y - 0.5);
+  return texture(uTable, vec2(column / uGrid.y, row / (4.0 * uGrid.x))).rgb;
+}
+vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) {
+  float si = clamp(dot(t, view), -1.0, 1.0), ci = sqrt(max(1.0 - si * si, 1e-8));
+  float s1 = sin(uTilt), c1 = cos(uTilt), s2 = 2.0 * s1 * c1, c2 = c1 * c1 - s1 * s1;
+  float s4 = 2.0 * s2 * c2, c4 = c2 * c2 - s2 * s2;
+  vec4 sines = vec4(si * c2 + ci * s2, si * c1 - ci * s1, si * c4 - ci * s4, si);
+  vec4 cosines = vec4(abs(ci * c2 - si * s2), abs(ci * c1 + si * s1), abs(ci * c4 + si * s4), ci);
+  vec4 seen0 = texelFetch(uSeen0, at, 0), seen1 = texelFetch(uSeen1, at, 0);
+  vec3 across = (view - si * t) / ci, sum = vec3(0.0);
+  for (int i = 0; i < uLights; i++) {
+    vec3 l;
+    vec3 power = incoming(i, p, l);
+    sum += uAmbient * power;
+    float seen = i < 4 ? seen0[i] : seen1[i - 4];
+    if (seen == 0.0) continue;
+    float so = clamp(dot(t, l), -1.0, 1.0), co = sqrt(max(1.0 - so * so, 1e-8));
+    float turn = acos(clamp(dot(across, l - so * t) / co, -1.0, 1.0));
+    vec3 f = vec3(0.0);
+    for (int lobe = 0; lobe < 4; lobe++)
+      f += longitudinal(sines[lobe], cosines[lobe], so, co, uVariance[lobe])
+        * azimuthal(lobe, ci, turn);
+    sum += seen * power * f;
+  }
+  return sum;
+}`;
+
+export const LIT_HEAD = LIGHTS + `
+uniform vec3 uSkin;
+vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
+  vec3 sum = vec3(0.0);
+  for (int i = 0; i < uLights; i++) {
+    vec3 l;
+    vec3 power = incoming(i, p, l);
+    float seen = i < 4 ? seen0[i] : seen1[i - 4];
+    sum += power * (seen * max(dot(n, l), 0.0) / 3.14159265 * uSkin + uAmbient);
+  }
+  return sum;
 }`;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -82,3 +83,27 @@ def test_confidence_is_the_distance_to_measured_points(http, model: Model):
 def test_only_parts_of_the_page_are_given(http, path):
     wanted = 404 if ".." in path else 200
     assert http.get(f"/view/page/{path}").status_code == wanted
+
+
+def test_light_that_cannot_be_made_is_refused_with_what_is_wrong(http):
+    base = "/view/models/bristles"
+    wrong = http.put(f"{base}/environments/a.exr", content=b"no map")
+    assert (wrong.status_code, wrong.json()["title"]) == (
+        *(422, "A file or name in the request cannot be used"),
+    )
+    assert "hdr" in http.put(f"{base}/environments/a.jpg", content=b"x").json()["detail"]
+    assert "studio, sky" in http.get(f"{base}/environments/mars").json()["detail"]
+    assert http.post(f"{base}/few", json={"weights": {"400": [1, 1, 1]}}).status_code == 422
+    assert http.post(f"{base}/few", json={"weights": {"4": [1, 1]}}).status_code == 422
+    assert http.get(f"{base}/seen/400").status_code == 404
+    assert http.get(f"{base}/table").status_code == 404  # no material was fitted
+
+
+def test_a_map_becomes_lights_of_its_power(http):
+    image = np.full((8, 16, 3), 0.5, np.float32)
+    data = cv2.imencode(".hdr", image)[1].tobytes()
+    weights = http.put("/view/models/bristles/environments/even.hdr", content=data).json()
+    few = http.post("/view/models/bristles/few", json={"weights": weights}).json()
+    assert len(few) == 8
+    power = sum(np.array(x["intensity"]) / np.square(x["position"]).sum() for x in few)
+    np.testing.assert_allclose(power, 4 * np.pi * 0.5, rtol=0.01)

@@ -1,0 +1,124 @@
+"""Captured frames under any light: sums of the answers to single lights. No fit is needed.
+
+Light adds up: a frame under several lights is the sum of the frames under each, by their levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from appearance.render.environment_maps import check_environment
+from reconstruction import Camera, Capture, Light
+from reconstruction.arrays import AnyFloats, Array, Floats
+
+MEMORY = 1 << 30
+"""Bytes that one camera's frames may take; larger ones are reduced by whole factors."""
+
+
+class LightSums:
+    """A camera's answers to single lights `(L, H, W, 3)`, in memory; `names (L,)` are the lights'.
+
+    `reduced` pixels a side of the frames are one of these, their mean, where frames are large.
+    Raises `MissingFrame` where a light's frame is missing.
+    """
+
+    def __init__(self, capture: Capture, camera: str, memory: int = MEMORY) -> None:
+        at: Camera = capture.rig.camera(camera)
+        self.names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
+        count = max(1, len(self.names))
+        self.reduced = 1
+        while 12 * count * (at.height // self.reduced) * (at.width // self.reduced) > memory:
+            self.reduced += 1
+        height, width = at.height // self.reduced, at.width // self.reduced
+        self.responses = np.empty((len(self.names), height, width, 3), np.float32)
+        for i, name in enumerate(self.names):
+            self.responses[i] = _reduced(capture.light(name, camera)[0], self.reduced)
+
+    def __call__(self, weights: Mapping[str, ArrayLike]) -> Floats:
+        """Radiance `(H, W, 3)` under lights by name, each at its `weights`: one number or three.
+
+        Raises `ValueError` for a light that this camera has no frame of.
+        """
+        unknown = sorted(set(weights) - set(self.names))
+        if unknown:
+            raise ValueError(f"no frames of the lights {unknown[:5]}; there are {len(self.names)}")
+        out = np.zeros(self.responses.shape[1:], np.float32)
+        for name, weight in weights.items():
+            out += self.responses[self.names.index(name)] * np.asarray(weight, np.float32)
+        return out
+
+
+def _reduced(image: Floats, by: int) -> Floats:
+    if by == 1:
+        return image
+    height, width = (n // by * by for n in image.shape[:2])
+    blocks = image[:height, :width].reshape(height // by, by, width // by, by, 3)
+    return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
+
+
+def weights_of_environment(
+    lights: Sequence[Light], envmap: AnyFloats, rotation_deg: float = 0.0
+) -> Array:
+    """What each of `lights` is to be multiplied by to stand for a map: `(L, 3)`.
+
+    Every direction of the lat-long map `(h, w, 3)` (as in `render_environment`) is given to the
+    nearest light: what its cell sends over the light's own irradiance at the origin. Where the
+    lights leave a part of the sphere empty, the nearest ones stand for it.
+    """
+    image = check_environment(envmap, "environment").astype(float)
+    height, width = image.shape[:2]
+    theta = np.pi * (np.arange(height) + 0.5) / height
+    phi = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width) + np.radians(rotation_deg)
+    sine = np.sin(theta)[:, None]
+    up = np.broadcast_to(np.cos(theta)[:, None], (height, width))
+    directions = np.stack([sine * np.cos(phi), sine * np.sin(phi), up], axis=-1).reshape(-1, 3)
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    solid = np.repeat((edges[:-1] - edges[1:]) * 2 * np.pi / width, width)
+    position = np.array([light.position for light in lights])
+    unit = position / np.linalg.norm(position, axis=1, keepdims=True)
+    nearest = np.empty(len(directions), np.int64)
+    for part in range(0, len(directions), 65536):
+        block = slice(part, part + 65536)
+        nearest[block] = (directions[block] @ unit.T).argmax(axis=1)
+    power = np.zeros((len(lights), 3))
+    np.add.at(power, nearest, image.reshape(-1, 3) * solid[:, None])
+    return power / np.maximum(irradiance(lights), 1e-12)
+
+
+def irradiance(lights: Sequence[Light]) -> Array:
+    """What each light alone sends through the origin across its ray: `(L, 3)`, W/m²."""
+    origin = np.zeros(3)
+    return np.array(
+        [x.intensity_towards(origin) / np.square(x.position).sum() for x in lights]
+    ).reshape(-1, 3)
+
+
+def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple[int, Array]]:
+    """At most `most` of `lights` that stand for all at their `weights (L, 3)`: (number, weight).
+
+    The brightest are taken apart first: each group, of the lights nearest to one of those chosen,
+    has the irradiance of its members and stands where its brightest one is.
+    """
+    power = weights * irradiance(lights)
+    bright = power.sum(axis=1)
+    lit = np.flatnonzero(bright > 0)
+    if len(lit) == 0:
+        return []
+    unit = np.array([lights[int(i)].position for i in lit])
+    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    chosen = [int(bright[lit].argmax())]
+    while len(chosen) < min(most, len(lit)):
+        # what is badly stood for: its power times its squared distance to the nearest chosen
+        cost = bright[lit] * (1 - (unit @ unit[chosen].T).max(axis=1)).clip(0)
+        if cost.max() <= 0:
+            break
+        chosen.append(int(cost.argmax()))
+    group = (unit @ unit[chosen].T).argmax(axis=1)
+    own = irradiance(lights)
+    return [
+        (int(lit[c]), power[lit[group == k]].sum(axis=0) / np.maximum(own[lit[c]], 1e-12))
+        for k, c in enumerate(chosen)
+    ]

@@ -1,0 +1,181 @@
+"""Light on a model that is looked at: sums of captured frames, and what the shader needs."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections import OrderedDict
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from appearance import Exposure, FittedModel
+from appearance.bsdf.far_field import azimuthal_table
+from appearance.bsdf.lobes import variances
+from appearance.model.light_sums import LightSums, few_lights, weights_of_environment
+from appearance.model.relight import PROCEDURAL
+from appearance.render.environment_maps import load_environment
+from appearance.render.visibility import above_faces, reached, within_fibres
+from reconstruction import Capture, Light, Model
+from reconstruction.arrays import Array
+from reconstruction.geometry.lights import dome_positions
+from stage_service.viewer.packing import PackedStrands
+from stage_service.viewer.viewed import BadLight
+
+MOST_LIGHTS = 8
+"""Lights that the shader adds up."""
+COSINES, TURNS = 24, 96
+KEPT_LIGHTS = 48
+"""Lights whose shadows are kept: a byte for each point of the strands and of the head."""
+DOME_LIGHTS, DOME_RADIUS = 331, 1.5
+"""The dome of a model without its capture."""
+
+
+class Lighting:
+    """What light does to one model, as `packed` is drawn. Safe to use from several threads."""
+
+    def __init__(self, model: Model, capture: Capture | None, packed: PackedStrands) -> None:
+        self._model, self._capture, self._packed = model, capture, packed
+        self._lock = threading.RLock()
+        self._seen: OrderedDict[int, bytes] = OrderedDict()
+        self._sums: tuple[str, LightSums] | None = None
+
+    @cached_property
+    def lights(self) -> list[Light]:
+        """The rig's lights that were shot, or a dome where there is no capture."""
+        if self._capture is not None and (names := self._capture.olat_lights()):
+            return [self._capture.rig.light(n) for n in names]
+        bright = np.full(3, 10.0)
+        places = dome_positions(DOME_LIGHTS, DOME_RADIUS, -60)
+        return [Light(f"light_{i:03d}", p, bright) for i, p in enumerate(places)]
+
+    @cached_property
+    def fitted(self) -> FittedModel:
+        """The model with its material. Raises `ModelError` where none was fitted."""
+        return FittedModel.load(self._model, self._capture)
+
+    @cached_property
+    def exposure(self) -> Exposure:
+        """The capture's as the fit has it, else what the frames under one light want."""
+        if self._model.has("appearance.json"):
+            return self.fitted.appearance.exposure
+        return Exposure(1.0)
+
+    def about(self) -> dict[str, Any]:
+        """Lights, and the material if one was fitted; JSON-ready."""
+        out: dict[str, Any] = {
+            "lights": [{"name": x.name, "position": x.position.tolist()} for x in self.lights],
+            "exposure": self.exposure.scale,
+            "captured": self._capture is not None and bool(self._capture.olat_lights()),
+            "material": None,
+        }
+        if self._model.has("appearance.json"):
+            hair, fitted = self.fitted.maps.mean(), self.fitted
+            out["material"] = {
+                "cosines": COSINES,
+                "turns": TURNS,
+                "variances": [float(v) for v in variances(hair.beta_m)],
+                "tilt": float(np.radians(hair.tilt_deg)),
+                "skin": list(fitted.appearance.skin),
+                "colour": list(fitted.appearance.colour),
+                "one_material": fitted.maps.uniform,
+                "field": fitted.field is not None,
+            }
+        return out
+
+    def table(self) -> bytes:
+        """`azimuthal_table` of the hair `(4, COSINES, TURNS, 4)`, float32; the last is not used."""
+        cosines = (np.arange(COSINES) + 0.5) / COSINES
+        turns = np.pi * (np.arange(TURNS) + 0.5) / TURNS
+        values = azimuthal_table(self.fitted.maps.mean(), cosines, turns)
+        return np.pad(values, ((0, 0),) * 3 + ((0, 1),)).astype("<f4").tobytes()
+
+    def few(self, weights: dict[int, list[float]]) -> list[dict[str, Any]]:
+        """The few lights that the shader is to have for all of `weights` (number: RGB)."""
+        full = np.zeros((len(self.lights), 3))
+        for number, value in weights.items():
+            if not 0 <= number < len(self.lights):
+                raise BadLight(f"there is no light number {number}: 0 to {len(self.lights) - 1}")
+            full[number] = value
+        chosen = few_lights(self.lights, full, MOST_LIGHTS)
+        return [
+            {
+                "number": i,
+                "position": self.lights[i].position.tolist(),
+                "intensity": (w * self.lights[i].intensity_towards(np.zeros(3))).tolist(),
+            }
+            for i, w in chosen
+        ]
+
+    def seen(self, number: int) -> bytes:
+        """Whether light `number` reaches each point `(S, n)`, then each vertex of the head: uint8.
+
+        255 where it does. A shadow ray through all strands from each.
+        """
+        with self._lock:
+            found = self._seen.get(number)
+            if found is None:
+                found = self._seen[number] = self._traced(self.lights[number].position)
+                if len(self._seen) > KEPT_LIGHTS:
+                    self._seen.popitem(last=False)
+            return found
+
+    def _traced(self, towards: Array) -> bytes:
+        points = self._packed.positions().reshape(-1, 3).astype(float)
+        radii = np.repeat(self._packed.radii.astype(float), self._packed.points.shape[1])
+        offset = within_fibres(points, towards, radii, seed=0)
+        lit = reached(self._scene, points, towards, offset)
+        head = self.fitted.head
+        if head is not None:
+            vertices = np.asarray(head.vertices, float)
+            lifted = above_faces(vertices, head.faces)
+            lit = np.append(lit, reached(self._scene, vertices, towards, lifted))
+        return np.where(lit, 255, 0).astype(np.uint8).tobytes()
+
+    @cached_property
+    def _scene(self) -> Any:
+        return self.fitted.without_field().scene()
+
+    def environment(
+        self, what: str | bytes, kind: str, rotation_deg: float
+    ) -> dict[int, list[float]]:
+        """What each light is multiplied by under a map: "studio", "sky", or the bytes of an .hdr or
+        .exr file. Raises `BadLight`."""
+        if isinstance(what, str):
+            if what not in PROCEDURAL:
+                raise BadLight(f"there is no environment {what!r}: {', '.join(PROCEDURAL)}")
+            image = PROCEDURAL[what]()
+        else:
+            if kind not in ("hdr", "exr"):
+                raise BadLight(f"an environment map must be .hdr or .exr, got {kind!r}")
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / f"map.{kind}"
+                file.write_bytes(what)
+                try:
+                    image = load_environment(file)
+                except (ValueError, OSError) as error:
+                    raise BadLight(f"the map cannot be read: {error}") from error
+        weights = weights_of_environment(self.lights, image, rotation_deg)
+        return {i: w.tolist() for i, w in enumerate(weights) if w.any()}
+
+    def sum(self, camera: str, weights: dict[int, list[float]], exposure: float) -> bytes:
+        """A PNG of `camera`'s frames under lights (number: RGB): their sum, times `exposure`, in
+        the sRGB curve, each value rounded once."""
+        if self._capture is None:
+            raise BadLight("there are no frames: name the capture with --capture")
+        with self._lock:
+            if self._sums is None or self._sums[0] != camera:
+                self._sums = None  # the old one's memory first
+                self._sums = camera, LightSums(self._capture, camera)
+            sums = self._sums[1]
+        try:
+            radiance = sums({self.lights[i].name: w for i, w in weights.items()})
+        except (ValueError, IndexError) as error:
+            raise BadLight(f"{camera}: {error}") from error
+        values = np.rint(255 * Exposure(exposure)(radiance)).astype(np.uint8)
+        return cv2.imencode(".png", values[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[
+            1
+        ].tobytes()

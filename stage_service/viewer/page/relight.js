@@ -1,0 +1,226 @@
+// Light: dragged over the dome, painted on it, or out of an environment map; and what it does to
+// captured frames (sums, made by the server) and to the fitted model (the shader).
+
+import { choice, element, labelled, slider } from "./controls.js";
+import { texture } from "./gl.js";
+import * as net from "./net.js";
+import { dot, unit } from "./space.js";
+
+const NEAREST = 3;
+
+export class Relight {
+  static async begin(viewer) {
+    return new Relight(viewer, await net.json(net.ofModel("/lighting")));
+  }
+
+  constructor(viewer, told) {
+    Object.assign(this, { viewer, told, weights: {}, painting: false, lights: [], kept: new Map() });
+    this.directions = told.lights.map((l) => unit(l.position));
+    const { state } = viewer.picture;
+    this.base = told.exposure;
+    state.exposure = this.base;
+  }
+
+  // --- the material, once
+  async material() {
+    const { gl, picture } = this.viewer, { material } = this.told;
+    const values = new Float32Array(await net.bytes("/table"));
+    const [wide, high] = [material.turns, 4 * material.cosines];
+    this.table = texture(gl, gl.TEXTURE_2D, gl.LINEAR, () => {
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, wide, high);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, wide, high, gl.RGBA, gl.FLOAT, values);
+    });
+    picture.setLighting(this);
+  }
+
+  uniforms() {
+    const { material } = this.told, { model } = this.viewer.picture.sets;
+    const at = new Float32Array(24), power = new Float32Array(24);
+    this.lights.forEach((l, i) => { at.set(l.position, 3 * i); power.set(l.intensity, 3 * i); });
+    return {
+      uLights: this.seen ? this.lights.length : 0, uLightAt: at, uLightPower: power,
+      uSeen0: this.seen?.[0] ?? model.none, uSeen1: this.seen?.[1] ?? model.none,
+      uTable: this.table, uVariance: material.variances, uTilt: material.tilt,
+      uGrid: [material.cosines, material.turns], uSkin: material.skin,
+      uAmbient: material.colour.map((c) => this.ambient * c / (4 * Math.PI)),
+    };
+  }
+
+  ambient = 0.5;
+
+  // --- the light
+  towards(way, colour = [1, 1, 1]) {
+    const direction = unit(way);
+    const near = this.directions.map((d, i) => [Math.acos(Math.min(1, dot(d, direction))), i])
+      .sort((a, b) => a[0] - b[0]).slice(0, NEAREST);
+    const all = near.map(([angle]) => 1 / Math.max(angle, 1e-4));
+    const sum = all.reduce((a, b) => a + b, 0);
+    const brightest = near[0][0] < 0.01 ? [1, 0, 0] : all.map((w) => w / sum);
+    const weights = this.painting ? { ...this.weights } : {};
+    near.forEach(([, i], k) => {
+      if (brightest[k] > 0) weights[i] = colour.map((c, j) =>
+        (this.painting ? weights[i]?.[j] ?? 0 : 0) + brightest[k] * c);
+    });
+    return this.set(weights);
+  }
+
+  async set(weights) {
+    this.weights = weights;
+    this.paintDome?.();
+    if (this.under) { this.again = true; return; }  // one at a time: the latest wins
+    this.under = true;
+    try {
+      do { this.again = false; await this.apply(); } while (this.again);
+    } catch (error) { this.viewer.status(error.message); }
+    this.under = false;
+  }
+
+  async apply() {
+    const { viewer } = this, { state } = viewer.picture, body = this.body();
+    const through = state.camera?.name;
+    const jobs = [];
+    if (through && this.told.captured) jobs.push(this.showSum(through, body));
+    if (state.mode === "lit" && this.told.material) jobs.push(this.shade(body));
+    await Promise.all(jobs);
+    viewer.draw();
+  }
+
+  body() {
+    return { method: "POST", headers: { "content-type": "application/json" },
+      body: JSON.stringify({ weights: this.weights, exposure: this.viewer.picture.state.exposure }) };
+  }
+
+  async showSum(camera, body) {
+    this.viewer.status("adding up captured frames");
+    const answer = await net.ask(net.ofModel(`/sums/${camera}.png`), body);
+    const shown = document.getElementById("sum");
+    if (shown.src) URL.revokeObjectURL(shown.src);
+    shown.src = URL.createObjectURL(await answer.blob());
+    await shown.decode();
+    this.viewer.status("");
+  }
+
+  async shade(body) {
+    const { viewer } = this, { picture, gl } = viewer, hair = picture.sets.model;
+    const lights = await net.json(net.ofModel("/few"), body);
+    const points = hair.count * hair.points, vertices = picture.head?.vertices ?? 0;
+    const missing = lights.filter((l) => !this.kept.has(l.number));
+    if (missing.length) viewer.status("casting shadows");
+    for (const { number } of missing) {
+      this.kept.set(number, new Uint8Array(await net.bytes(`/seen/${number}`)));
+      if (this.kept.size > 24) this.kept.delete(this.kept.keys().next().value);
+    }
+    const groups = [0, 1].map((g) => {
+      const some = lights.slice(4 * g, 4 * g + 4);
+      const strands = new Uint8Array(4 * points), head = new Uint8Array(4 * vertices);
+      some.forEach(({ number }, k) => {
+        const data = this.kept.get(number);
+        for (let i = 0; i < points; i++) strands[4 * i + k] = data[i];
+        for (let i = 0; i < vertices; i++) head[4 * i + k] = data[points + i];
+      });
+      return { strands, head, used: some.length > 0 };
+    });
+    for (const old of this.seen ?? []) if (old !== hair.none) gl.deleteTexture(old.texture);
+    this.seen = groups.map((g) => g.used ? hair.perPoint(g.strands, 4) : hair.none);
+    picture.head?.seen(groups.map((g) => g.head));
+    this.lights = lights;
+    viewer.status("");
+  }
+
+  // --- the panel
+  controls() {
+    const { viewer, told } = this, { state } = viewer.picture;
+    const parts = [element("h2", { textContent: "Light" }), this.dome()];
+    const colour = element("input", { type: "color", value: "#ffffff" });
+    this.colour = () => [1, 3, 5].map((i) =>
+      (parseInt(colour.value.slice(i, i + 2), 16) / 255) ** 2.2);
+    const paint = element("button", { textContent: "Paint" });
+    paint.setAttribute("aria-pressed", "false");
+    paint.addEventListener("click", () => {
+      this.painting = !this.painting;
+      paint.setAttribute("aria-pressed", String(this.painting));
+    });
+    const dark = element("button", { textContent: "Dark" });
+    dark.addEventListener("click", () => this.set({}));
+    const maps = ["studio", "sky"].map((name) => {
+      const made = element("button", { textContent: name });
+      made.addEventListener("click", () => this.environment(
+        () => net.json(net.ofModel(`/environments/${name}`))));
+      return made;
+    });
+    const file = element("input", { type: "file", accept: ".hdr,.exr" });
+    file.addEventListener("change", () => file.files[0] && this.drop(file.files[0]));
+    parts.push(element("div", { className: "row" }, paint, colour, dark, ...maps),
+      labelled("map", file),
+      labelled("exposure", slider(-6, 6, 0.1, 0, (stops) => {
+        state.exposure = this.base * 2 ** stops;
+        viewer.draw();
+          if (state.camera) this.set(this.weights);
+      })));
+    for (const kind of ["dragover", "drop"])
+      document.addEventListener(kind, (e) => {
+        e.preventDefault();
+        if (kind === "drop" && e.dataTransfer.files[0]) this.drop(e.dataTransfer.files[0]);
+      });
+    if (told.material) {
+      parts.push(labelled("indirect", slider(0, 2, 0.05, this.ambient, (v) => {
+        this.ambient = v;
+        viewer.draw();
+      })));
+      const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and what leaves " +
+        "later) with shadows; light between fibres is an even guess from their colour, set by " +
+        "“indirect”, not computed."];
+      if (!told.material.one_material) notes.push("One material is shown: the mean of its map.");
+      if (told.material.field) notes.push("The model's field is not shown.");
+      notes.push("Of an environment the eight strongest lights are shaded.");
+      parts.push(element("p", { textContent: notes.join(" ") }));
+    }
+    return parts;
+  }
+
+  drop(file) {
+    this.environment(() => net.json(
+      net.ofModel(`/environments/${encodeURIComponent(file.name)}`), { method: "PUT", body: file }));
+  }
+
+  async environment(get) {
+    try { await this.set(await get()); } catch (error) { this.viewer.status(error.message); }
+  }
+
+  // The dome seen from in front: the middle is before the face, the rim behind the head.
+  dome() {
+    const canvas = this.canvas = element("canvas", { id: "dome", width: 520, height: 520, tabIndex: 0 });
+    canvas.setAttribute("aria-label", "the dome from the front: drag to move the light");
+    const at = ([x, y, z]) => {
+      const angle = Math.acos(Math.max(-1, Math.min(1, -y))) / Math.PI;
+      const flat = Math.hypot(x, z) || 1;
+      return [260 + 248 * angle * x / flat, 260 - 248 * angle * z / flat];
+    };
+    this.paintDome = () => {
+      const pen = canvas.getContext("2d");
+      pen.clearRect(0, 0, 520, 520);
+      const brightest = Math.max(1e-9, ...Object.values(this.weights).flat());
+      this.directions.forEach((d, i) => {
+        const w = this.weights[i], [x, y] = at(d);
+        pen.beginPath();
+        pen.arc(x, y, w ? 9 : 3.5, 0, 2 * Math.PI);
+        pen.fillStyle = w
+          ? `rgb(${w.map((c) => 40 + 215 * (c / brightest) ** 0.45).join(",")})` : "#4a4e5a";
+        pen.fill();
+      });
+    };
+    const move = (e) => {
+      if (e.type === "pointermove" && !e.buttons) return;
+      const box = canvas.getBoundingClientRect();
+      const x = (e.clientX - box.left) / box.width * 2 - 1;
+      const y = 1 - (e.clientY - box.top) / box.height * 2;
+      const angle = Math.min(1, Math.hypot(x, y)) * Math.PI, turn = Math.atan2(y, x);
+      this.towards([Math.sin(angle) * Math.cos(turn), -Math.cos(angle), Math.sin(angle) * Math.sin(turn)],
+        this.colour());
+    };
+    canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); move(e); });
+    canvas.addEventListener("pointermove", move);
+    this.paintDome();
+    return canvas;
+  }
+}
