@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -20,6 +19,7 @@ from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import write_json
 from reconstruction.reading import printable, read_json
 from stage_service.acquisition.states import CaptureStatus
+from stage_service.background import Background
 from stage_service.records.events import EventLog
 
 log = logging.getLogger("hairstage.verification")
@@ -42,7 +42,7 @@ class Verification(BaseModel):
     problems: list[str] = []
 
 
-class Verifier:
+class Verifier(Background):
     """Reads captures again, one at a time, in a process of its own that stands still while
     `busy()`; results are kept in `path`. With `days`, each of `due()` is read again so often.
 
@@ -57,25 +57,15 @@ class Verifier:
         due: Callable[[], Sequence[CaptureStatus]],
         days: float | None,
     ) -> None:
+        super().__init__("verifier")
         self._path, self._events, self._busy, self._due, self._days = path, events, busy, due, days
-        self._changed = threading.Condition()
-        self._closed = False
         self._waiting: dict[str, Path] = {}
         self._running: str | None = None
         self._known = self._read()
-        self._thread = threading.Thread(target=self._run, name="verifier", daemon=True)
 
     def start(self) -> None:
         """Begin."""
         self._thread.start()
-
-    def close(self) -> None:
-        """End what runs."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5)
 
     def ask(self, capture: str, folder: Path) -> Verification:
         """Read it again, soon."""
@@ -115,7 +105,7 @@ class Verifier:
                 folder = self._waiting.pop(self._running)
             try:
                 found = self._verify(self._running, folder)
-            except Exception as error:  # the thread goes on with the next one
+            except OSError as error:  # there is no process to be had: the next one may have one
                 log.exception("%s", folder)
                 found = [f"it could not be read again: {printable(str(error))}"]
             self._learn(self._running, found)
@@ -162,7 +152,7 @@ class Verifier:
             answer = json.loads(out)
             told = answer["problems"] if "problems" in answer else [answer["error"]["detail"]]
             return [str(problem) for problem in told]
-        except (ValueError, KeyError):
+        except (ValueError, KeyError, TypeError):
             return [f"reading it ended with exit code {child.returncode}"]
 
     def _learn(self, capture: str, problems: list[str] | None) -> None:

@@ -21,6 +21,7 @@ from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import write_json
 from reconstruction.reading import printable, read_json
 from stage_service.acquisition.captures import Busy
+from stage_service.background import Background
 from stage_service.records.events import EventLog
 from stage_service.records.lease import Leased
 
@@ -68,7 +69,7 @@ class _Kept(BaseModel):
     history: list[Entry] = []
 
 
-class CaptureQueue:
+class CaptureQueue(Background):
     """What waits, in order, in the file `path`; a thread of its own begins it.
 
     `begin(entry)` starts a capture and returns its id; `waits_for()` says what keeps the stage from
@@ -83,15 +84,14 @@ class CaptureQueue:
         begin: Callable[[Entry], str],
         waits_for: Callable[[], str | None],
     ) -> None:
+        super().__init__("capture-queue")
         self._path, self._events = path, events
         self._begin, self._stage_waits_for = begin, waits_for
-        self._changed = threading.Condition()  # for moments
         self._beginning = threading.Lock()  # one at a time, by the thread or by a person
         self._writing = threading.Lock()
         self._told: str | None = None
-        self._unsaved = self._closed = False
+        self._unsaved = False
         self._kept = self._read()
-        self._thread = threading.Thread(target=self._run, name="capture-queue", daemon=True)
 
     def start(self, begun: Mapping[str, str], unfinished: Collection[str]) -> None:
         """Begin, with the captures that `begun` has by their entries' ids; hold where the last one
@@ -105,14 +105,6 @@ class CaptureQueue:
                 self._kept.held = f"capture {last}, the last one, did not complete"
                 self._unsaved = True
         self._thread.start()
-
-    def close(self) -> None:
-        """Begin nothing any more."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5)
 
     @property
     def held(self) -> str | None:
@@ -219,7 +211,9 @@ class CaptureQueue:
                     self._save()
                 if not closed:
                     self._begin_the_next()
-            except Exception:  # a full disk, say: what waits stays, and the thread goes on
+            # A full disk, or whatever it is: without this thread nothing that waits would ever
+            # begin, and nobody be told; what waits stays.
+            except Exception:
                 log.exception("%s", self._path)
                 if closed:
                     return
@@ -243,7 +237,9 @@ class CaptureQueue:
                 capture = self._begin(entry)
             except (Busy, Leased):
                 return
-            except Exception as error:  # it would be refused again: for a person to look at
+            # The devices', the plan's, the disk's: it would be refused again, so that a person has
+            # to look at it.
+            except Exception as error:
                 self.hold(f"{entry.id} cannot begin: {error}")
                 return
             self._begun(entry, capture)

@@ -143,8 +143,9 @@ class CaptureManager:
         check_flashing(resolved, armed_by)
         free = shutil.disk_usage(self.folder).free
         if cost.bytes + RESERVE > free:
-            need, have = f"{cost.bytes / 1e9:.1f} GB", f"{free / 1e9:.1f} GB"
-            raise PlanError([f"the plan writes {need}, {self.folder} has {have} free"])
+            need, kept, have = (f"{n / 1e9:.2f} GB" for n in (cost.bytes, RESERVE, free))
+            told = f"the plan writes {need} and leaves {kept} free, {self.folder} has {have}"
+            raise PlanError([told])
         now = datetime.now(UTC)
         capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
         description = {
@@ -475,7 +476,8 @@ class CaptureManager:
             # Before anybody sees the capture as done: its job is named from then on.
             try:
                 self._on_complete(status)
-            except Exception as error:  # the capture is whole; what follows it is told apart
+            # Whoever is told, and whatever is wrong there: the capture is whole, and has to end.
+            except Exception as error:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
         with self._lock:

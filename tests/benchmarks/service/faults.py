@@ -174,11 +174,12 @@ def _database(_folder: Path) -> Iterator[tuple[list[str], Strike]]:
         @contextmanager
         def strike(live: Live) -> Iterator[None]:
             server.stop()
-            request = b"GET /jobs HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
             with ExitStack() as links:
                 for _ in range(45):
                     address = (live.http.base_url.host, live.http.base_url.port or 80)
-                    links.enter_context(socket.create_connection(address)).sendall(request)
+                    links.enter_context(socket.create_connection(address)).sendall(
+                        live.request("/jobs")
+                    )
                 try:
                     yield
                 finally:

@@ -18,6 +18,7 @@ import httpx
 
 from stage_service.cli.support.children import Children, own_command
 from stage_service.config import RigFile
+from stage_service.records.tokens import own_token
 
 HURRY_S = 300.0
 """Whatever a service is to come to, it has by then, on a busy machine too."""
@@ -36,7 +37,7 @@ class Live:
     def words(self, root: Path) -> list[str]:
         """The arguments of `hairstage` that serve this stage."""
         devices = self.rig.path.parent / "devices.toml"
-        words = ("serve", "--json", "--no-auth", "--port", "0", "--rig", self.rig.path)
+        words = ("serve", "--json", "--port", "0", "--rig", self.rig.path)
         return [str(word) for word in (*words, "--root", root, "--devices", devices)]
 
     def begin(self, command: Sequence[str] = ()) -> None:
@@ -49,7 +50,12 @@ class Live:
         url = self._children.first_line(name, self.child, HURRY_S)["url"]
         # A connection each: one that waits for its next request makes room where there are many.
         each = httpx.Limits(max_keepalive_connections=0)
-        self.http = httpx.Client(base_url=url, timeout=60, trust_env=False, limits=each)
+        self.http = self.client(url, limits=each)
+
+    def client(self, url: str | httpx.URL, **more: Any) -> httpx.Client:
+        """Asks with this user's own token."""
+        headers = {"Authorization": f"Bearer {own_token()}"}
+        return httpx.Client(base_url=url, headers=headers, timeout=60, trust_env=False, **more)
 
     def kill(self) -> None:
         """SIGKILL."""
@@ -74,6 +80,11 @@ class Live:
             time.sleep(0.1)
         done: dict[str, Any] = status
         return done
+
+    def request(self, path: str) -> bytes:
+        """A `GET` as it goes over the wire."""
+        token = f"Authorization: Bearer {own_token()}"
+        return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n{token}\r\n\r\n".encode()
 
     def stage_pid(self) -> int:
         """The process that is the stage's devices."""
@@ -118,7 +129,7 @@ def _polls(live: Live) -> Iterator[None]:
 
 def _poll(live: Live, over: threading.Event) -> None:
     """25 requests a second."""
-    with httpx.Client(base_url=live.http.base_url, timeout=60, trust_env=False) as http:
+    with live.client(live.http.base_url) as http:
         while not over.wait(0.04):
             with contextlib.suppress(httpx.HTTPError):
                 http.get("/captures")
@@ -128,7 +139,7 @@ def _poll(live: Live, over: threading.Event) -> None:
 def _listeners(live: Live) -> Iterator[None]:
     """200 clients that follow the events, and read what comes."""
     over = threading.Event()
-    with _connected(live, 200, b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") as links:
+    with _connected(live, 200, live.request("/events")) as links:
 
         def read() -> None:
             open_ones = list(links)
@@ -170,6 +181,35 @@ def _half_open(live: Live) -> Iterator[None]:
     """1,000 connections that send half a request."""
     with _connected(live, 1000, b"GET /health HTTP/1.1\r\n"):
         yield
+
+
+@contextlib.contextmanager
+def console(live: Live) -> Iterator[None]:
+    """A browser that has logged in, follows the events and looks once a second, and Prometheus."""
+    over = threading.Event()
+
+    def look() -> None:
+        with live.client(live.http.base_url) as http:
+            http.post("/login", json={"token": own_token()}).raise_for_status()
+            del http.headers["Authorization"]
+            while not over.wait(1.0):
+                for path in ("/health", "/captures?limit=50", "/devices", "/queue", "/metrics"):
+                    http.get(path).raise_for_status()
+
+    def follow() -> None:
+        with live.client(live.http.base_url) as http, http.stream("GET", "/events") as events:
+            for _ in events.iter_lines():
+                if over.is_set():
+                    return
+
+    threads = [threading.Thread(target=work, daemon=True) for work in (look, follow)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        threads[0].join()
 
 
 LOADS: dict[str, Callable[[Live], AbstractContextManager[None]]] = {

@@ -2,14 +2,17 @@
 
 Leaves `soak.json`: memory and descriptors of the service at each capture's end, what became of each
 capture, whether every frame reads back; and, of each fault under each load, how long a blackout
-took, the frames that were lost, and whether the capture was finished, as a table in `loads.md` too.
+took, the frames that were lost, and whether the capture was finished, as a table in `loads.md` too;
+and what an open console costs a capture.
 """
 
 from __future__ import annotations
 
 import argparse
 import random
+import statistics
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,9 +21,10 @@ from benchmarks.acquisition.rates import simulated
 from benchmarks.command import Benchmark, option
 from benchmarks.results import markdown, save
 from benchmarks.service.faults import HEAD, Cell, cells
-from benchmarks.service.live import Live
+from benchmarks.service.live import Live, console
 from reconstruction import Progress, verify
 from stage_service.cli.support.children import Children
+from stage_service.config import RigFile
 
 PLAN = {
     "lights": [f"light_{i:03d}" for i in range(60)],
@@ -29,12 +33,14 @@ PLAN = {
 }
 WAITING = 3
 """Captures that the queue is kept filled with."""
+PAIRS = 10
+"""Captures with a console beside ones without."""
 KILL_EVERY = 7
 """Of so many captures one meets a SIGKILL of the service."""
 
 
 def run(
-    out: Path, minutes: float, seed: int, progress: Progress, *, quick: bool = False
+    out: Path, minutes: float, seed: int, progress: Progress, *, quick: bool, table: bool
 ) -> dict[str, Any]:
     """Shoot for so long, then fill the table; returns what `soak.json` holds."""
     out.mkdir(parents=True, exist_ok=True)
@@ -47,13 +53,49 @@ def run(
                 _shoot(live, minutes, random.Random(seed), result, progress)
                 live.end()
                 save(out / "soak.json", result)
+            result["console"] = _watched(rig, children, folder, 1 if quick else PAIRS, progress)
+            save(out / "soak.json", result)
             found: list[Cell] = []
-            for cell in cells(rig, children, folder, progress, quick=quick):
+            for cell in cells(rig, children, folder, progress, quick=quick) if table else ():
                 found.append(cell)
                 result["cells"] = [c.__dict__ for c in found]
                 save(out / "soak.json", result)
                 (out / "loads.md").write_text(markdown(HEAD, [c.row() for c in found]))
     return result
+
+
+def _watched(
+    rig: RigFile, children: Children, folder: Path, pairs: int, progress: Progress
+) -> dict[str, Any]:
+    """Seconds of captures with an open console, and metrics asked for, over those of captures that
+    nobody looks at; one right after the other, which is first taken in turns."""
+    live = Live(rig, children, folder / "watched")
+    seconds: dict[bool, list[float]] = {True: [], False: []}
+    for pair in range(-1, pairs):  # before the first, the stage makes its pictures
+        progress(f"console, pair {pair}", 0.5)
+        for watched in (True, False) if pair % 2 else (False, True):
+            with console(live) if watched else nullcontext():
+                time.sleep(1.0)
+                capture = live.ask("POST", "/captures", {"plan": PLAN})["id"]
+                took = _seconds(live, capture)
+            if pair >= 0:
+                seconds[watched].append(took)
+    live.end()
+    ratios = [a / b for a, b in zip(seconds[True], seconds[False], strict=True)]
+    return {
+        "watched_s": seconds[True],
+        "alone_s": seconds[False],
+        "ratio_median": statistics.median(ratios),
+        "ratios": ratios,
+        "goal": 1.02,
+    }
+
+
+def _seconds(live: Live, capture: str) -> float:
+    """Seconds of a capture that is hardly asked about."""
+    while live.ask("GET", f"/captures/{capture}")["state"] != "done":
+        time.sleep(1.0)
+    return float(live.ask("GET", f"/captures/{capture}")["seconds"])
 
 
 def _shoot(
@@ -168,8 +210,11 @@ tracking = 0.005
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     minutes = 0.2 if args.quick else args.minutes
-    return run(args.out, minutes, args.seed, progress, quick=args.quick)
+    return run(args.out, minutes, args.seed, progress, quick=args.quick, table=args.table)
 
 
-MINUTES = option("--minutes", "how long to shoot; 0: only the table", type=float, default=60.0)
-BENCHMARK = Benchmark(_bench, (MINUTES,))
+OPTIONS = (
+    option("--minutes", "how long to shoot; 0: not at all", type=float, default=60.0),
+    option("--no-table", "without load x fault", dest="table", action="store_false"),
+)
+BENCHMARK = Benchmark(_bench, OPTIONS)

@@ -1,0 +1,31 @@
+"""What goes on by itself beside the requests, on a thread of its own, until it is closed."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+
+END_S = 5.0
+"""Whoever closes it waits for so long: what is stuck by then is left to the process."""
+
+
+class Background(ABC):
+    """A thread that runs `_run`, whose owner starts it; `_changed` guards what it looks at, and
+    wakes it."""
+
+    def __init__(self, name: str) -> None:
+        self._changed = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Return once `_closed`."""
+
+    def close(self) -> None:
+        """End it, or keep it from beginning."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(END_S)
