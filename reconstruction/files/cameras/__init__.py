@@ -10,13 +10,28 @@ Camera axes and pixel centres become ours; units and the world's axes stay the f
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
+from reconstruction.containment import plain_file
+from reconstruction.files.cameras.captury import read_calib
 from reconstruction.files.cameras.colmap import read_colmap
 from reconstruction.files.cameras.errors import CameraFile, CameraFileError
+from reconstruction.files.cameras.metashape import read_metashape
 from reconstruction.files.cameras.nerfstudio import read_transforms
+from reconstruction.files.cameras.opencv import (
+    SUFFIXES,
+    cameras_from,
+    read_opencv,
+    read_opencv_folder,
+)
 from reconstruction.reading import read_json
 
 __all__ = ["CameraFile", "CameraFileError", "read_cameras"]
+
+_KNOWN = (
+    "a COLMAP model (cameras and images, .txt or .bin), transforms.json, Metashape's .xml, "
+    "OpenCV's .yml or .xml, a map of cameras in .json, .calib"
+)
 
 
 def read_cameras(path: str | Path) -> CameraFile:
@@ -37,21 +52,45 @@ def read_cameras(path: str | Path) -> CameraFile:
 
 def _read(path: Path) -> CameraFile:
     if path.is_dir():
-        for folder in (path, path / "0", path / "sparse" / "0", path / "sparse"):
-            if (folder / "cameras.txt").is_file() or (folder / "cameras.bin").is_file():
-                return read_colmap(folder)
-        if (path / "transforms.json").is_file():
-            return _read(path / "transforms.json")
-        raise CameraFileError(f"{path}: neither a COLMAP model nor transforms.json is in it")
+        return _read_folder(path)
     if path.name in ("cameras.txt", "images.txt", "cameras.bin", "images.bin"):
         return read_colmap(path.parent)
-    if path.suffix == ".json":
-        data = read_json(path)
-        if isinstance(data, dict) and "frames" in data:
-            return read_transforms(path, data)
-        raise CameraFileError(f"{path}: has no 'frames', as transforms.json has")
     if not path.exists():
         raise CameraFileError(f"{path}: no such file or folder")
-    raise CameraFileError(
-        f"{path}: no format that is known: a COLMAP model (folder), transforms.json"
-    )
+    if path.suffix == ".json":
+        return _read_json(path)
+    if path.suffix == ".xml":
+        root = _root(path)
+        return read_opencv(path) if root.tag == "opencv_storage" else read_metashape(path, root)
+    if path.suffix in SUFFIXES:
+        return read_opencv(path)
+    if path.suffix == ".calib":
+        return read_calib(path)
+    raise CameraFileError(f"{path}: no format that is known: {_KNOWN}")
+
+
+def _read_folder(path: Path) -> CameraFile:
+    for folder in (path, path / "0", path / "sparse" / "0", path / "sparse"):
+        if (folder / "cameras.txt").is_file() or (folder / "cameras.bin").is_file():
+            return read_colmap(folder)
+    if (path / "transforms.json").is_file():
+        return _read(path / "transforms.json")
+    if files := sorted(f for f in path.iterdir() if f.suffix in SUFFIXES):
+        return read_opencv_folder(path, files)
+    raise CameraFileError(f"{path}: none of what is known is in it: {_KNOWN}")
+
+
+def _read_json(path: Path) -> CameraFile:
+    data = read_json(path)
+    if isinstance(data, dict) and "frames" in data:
+        return read_transforms(path, data)
+    if isinstance(data, dict):
+        return CameraFile(cameras_from(path, data))
+    raise CameraFileError(f"{path}: expected an object, with 'frames' or a map for each camera")
+
+
+def _root(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.fromstring(plain_file(path).read_bytes())
+    except ElementTree.ParseError as error:
+        raise CameraFileError(f"{path}: broken XML ({error})") from error

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from reconstruction import Camera
@@ -80,3 +81,106 @@ def write_transforms(path: Path, cameras: Sequence[Camera]) -> None:
         frames.append(frame | {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3})
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}))
+
+
+CHUNK_R = np.array([[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]])
+CHUNK_T, CHUNK_SCALE = np.array([3.9, 1.6, 1.0]), 1.357
+
+
+def write_metashape(path: Path, cameras: Sequence[Camera], component: bool = False) -> None:
+    """Camera to chunk, x right, y down, z forward; world = scale R chunk + t; p1, p2 as Agisoft's.
+
+    u = w/2 + cx + x' f + x' b1 + y' b2, v = h/2 + cy + y' f.
+    """
+
+    def words(values: np.ndarray) -> str:
+        return " ".join(repr(float(v)) for v in np.ravel(values))
+
+    world = (
+        f"<transform><rotation locked='false'>{words(CHUNK_R)}</rotation><translation>"
+        f"{words(CHUNK_T)}</translation><scale>{CHUNK_SCALE!r}</scale></transform>"
+    )
+    sensors, entries = "", ""
+    for i, camera in enumerate(cameras):
+        k1, k2, p1, p2, k3 = camera.distortion
+        K, w, h = camera.K, camera.width, camera.height
+        values = {"f": K[1, 1], "cx": K[0, 2] + 0.5 - w / 2, "cy": K[1, 2] + 0.5 - h / 2}
+        values |= {"b1": K[0, 0] - K[1, 1], "b2": K[0, 1], "k1": k1, "k2": k2, "k3": k3}
+        values |= {"p1": p2, "p2": p1}
+        inner = "".join(f"<{k}>{float(v)!r}</{k}>" for k, v in values.items())
+        sensors += (
+            f'<sensor id="{i}" label="{camera.name}" type="frame"><resolution width="{w}" '
+            f'height="{h}"/><calibration type="frame" class="initial"><f>1</f></calibration>'
+            f'<calibration type="frame" class="adjusted"><resolution width="{w}" height="{h}"/>'
+            f"{inner}</calibration></sensor>"
+        )
+        pose = np.eye(4)
+        pose[:3, :3] = CHUNK_R.T @ camera.R.T
+        pose[:3, 3] = CHUNK_R.T @ (camera.center - CHUNK_T) / CHUNK_SCALE
+        entries += (
+            f'<camera id="{i}" sensor_id="{i}" component_id="0" label="{camera.name}">'
+            f"<transform>{words(pose)}</transform></camera>"
+        )
+    entries += f'<camera id="{len(cameras)}" sensor_id="0" label="lost"/>'
+    components = f"<components><component id='0'>{world}</component></components>"
+    path.write_text(
+        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1">'
+        f"<sensors>{sensors}</sensors>{components if component else ''}"
+        f"<cameras>{entries}</cameras>{'' if component else world}"
+        f'<reference>LOCAL_CS["Local CS",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]</reference>'
+        f"</chunk></document>"
+    )
+
+
+def write_opencv(folder: Path, cameras: Sequence[Camera]) -> None:
+    """By OpenCV itself, a file for each camera; half of them with a Rodrigues vector."""
+    folder.mkdir(parents=True)
+    for i, camera in enumerate(cameras):
+        storage = cv2.FileStorage(str(folder / f"{camera.name}.yml"), cv2.FILE_STORAGE_WRITE)
+        storage.write("image_width", camera.width)
+        storage.write("image_height", camera.height)
+        storage.write("camera_matrix", camera.K)
+        storage.write("distortion_coefficients", camera.distortion[None])
+        if i % 2:
+            storage.write("R", camera.R)
+            storage.write("T", camera.t[:, None])
+        else:
+            storage.write("rvec", cv2.Rodrigues(camera.R)[0])
+            storage.write("tvec", camera.t)
+        storage.release()
+
+
+def write_map(path: Path, cameras: Sequence[Camera]) -> None:
+    """A map for each camera with its camera-to-world pose."""
+    out = {}
+    for camera in cameras:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.R.T, camera.center
+        out[camera.name] = {"K": camera.K.tolist(), "dist": [camera.distortion.tolist()]}
+        out[camera.name] |= {"width": camera.width, "height": camera.height, "pose": pose.tolist()}
+    path.write_text(json.dumps(out))
+
+
+def write_calib(path: Path, cameras: Sequence[Camera]) -> None:
+    """In millimetres, through a sensor 10 mm wide; k1, k2, p2, p1, k3."""
+    lines = ["tc camera calibration v0.3"]
+    for i, camera in enumerate(cameras):
+        K, w, h = camera.K, camera.width, camera.height
+        k1, k2, p1, p2, k3 = camera.distortion
+        high = 10.0 * h / w
+        lines += [f"camera\t{i}\tCamera_{i + 1}", "\tframe\t0"]
+        lines.append(f"\t\tsensorSize\t10.0 {high!r}\t# in mm")
+        lines.append(f"\t\tfocalLength\t{float(10 * K[0, 0] / w)!r}   # in mm")
+        lines.append(f"\t\tpixelAspect {float(K[1, 1] / K[0, 0])!r} # y / x")
+        cx, cy = (K[0, 2] + 0.5 - w / 2) / w * 10, (K[1, 2] + 0.5 - h / 2) / h * high
+        lines.append(f"\t\tcenterOffset {float(cx)!r} {float(cy)!r} # in mm")
+        lines.append("\t\tdistortionModel\tOpenCV")
+        lines.append("\t\tdistortion " + " ".join(repr(float(v)) for v in (k1, k2, p2, p1, k3)))
+        for name, value in (
+            ("origin", 1000 * camera.center),
+            ("up", -camera.R[1]),
+            ("right", camera.R[0]),
+        ):
+            lines.append(f"\t\t{name} " + " ".join(repr(float(v)) for v in value))
+        lines.append("#    extrinsics")
+    path.write_text("\n".join(lines) + "\n")

@@ -16,6 +16,7 @@ from reconstruction import Camera
 from reconstruction.files.cameras import CameraFileError, read_cameras
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModel, LensModelCamera
+from reconstruction.geometry.placement import PlacementOptions, placed, resized
 
 _spec = importlib.util.spec_from_file_location(
     "camera_writers", Path(__file__).with_name("camera_writers.py")
@@ -57,6 +58,10 @@ WRITERS: dict[str, Callable[[Path, list[Camera]], object]] = {
     "sparse": writers.write_colmap_text,
     "binary": writers.write_colmap_binary,
     "transforms.json": writers.write_transforms,
+    "cameras.xml": writers.write_metashape,
+    "2.xml": lambda path, cameras: writers.write_metashape(path, cameras, component=True),
+    "opencv": writers.write_opencv,
+    "map.json": writers.write_map,
 }
 
 
@@ -112,6 +117,48 @@ def test_a_picture_through_another_lens_is_resampled_to_a_pinhole() -> None:
     assert lens.undistorted.distortion.tolist() == [0] * 5
 
 
+def test_a_calib_file_gives_the_same_pixels_in_millimetres(tmp_path: Path) -> None:
+    """It counts pixels in shares of the picture's width: scaled to the pictures they are ours."""
+    writers.write_calib(tmp_path / "cameras.calib", stage())
+    file = read_cameras(tmp_path / "cameras.calib")
+    assert file.metres == 0.001
+    found = placed(file.cameras, PlacementOptions(unit="mm"), file.axes)
+    named = [replace(c, name=f"Cam{i + 1:02d}") for i, c in enumerate(stage())]
+    assert_same_pixels([resized(c, 640, 480) for c in found], named)
+
+
+def test_cameras_that_metashape_has_not_aligned_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.xml"
+    writers.write_metashape(path, stage())
+    file = read_cameras(path)
+    assert any(note.endswith("not aligned, left out: lost") for note in file.notes)
+    assert file.metres == 1
+    good = path.read_text()
+    for old, new, words in (
+        ("<document", "<documents", "broken XML"),
+        ('sensor_id="2"', 'sensor_id="22"', "cam_02: there is no sensor '22'"),
+        ('label="cam_03">', 'label="cam_03"><transform>1 2 3</transform>', "expected 16 finite"),
+        ("LOCAL_CS", "GEOGCS", "on the globe .* local coordinates"),
+    ):
+        path.write_text(good.replace(old, new))
+        with pytest.raises(CameraFileError, match=words):
+            read_cameras(path)
+    path.write_text(good.replace("<k1>", "<k4>0.01</k4><k1>"))
+    assert isinstance(read_cameras(path).cameras[0], LensModelCamera)
+
+
+def test_what_opencv_did_not_write_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cam.yml"
+    for text, words in (
+        ("not: [yaml", "OpenCV cannot read it"),
+        ("%YAML:1.0\n---\nwidth: 3\n", "has one of K, camera_matrix"),
+        ('%YAML:1.0\n---\nK: "text"\n', "K must be .* finite numbers"),
+    ):
+        path.write_text(text)
+        with pytest.raises(CameraFileError, match=words):
+            read_cameras(path)
+
+
 def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
     """As files have it that list a frame for each camera and light."""
     path = tmp_path / "transforms.json"
@@ -148,7 +195,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     cameras.write_text(lenses.replace("12 FULL_OPENCV", "12 FOV"))
     refused("FOV has 5 parameters, got 12")
     cameras.unlink()
-    refused("neither a COLMAP model nor")
+    refused("none of what is known is in it: a COLMAP model")
     refused("no such file", tmp_path / "nowhere")
     binary = tmp_path / "binary"
     writers.write_colmap_binary(binary, stage())
