@@ -30,7 +30,7 @@ def add(commands: Commands) -> None:
     imported.add_argument(
         "--cameras",
         type=Path,
-        help="instead of cameras.json: a COLMAP model's folder, transforms.json",
+        help="instead of cameras.json: of COLMAP, nerfstudio, Metashape, OpenCV",
     )
     imported.add_argument(
         "--lights",

@@ -1,0 +1,341 @@
+"""Layouts of public OLAT sets: which file is which frame, and where cameras and lights stand.
+
+FaceOLAT (github.com/prraoo/FaceOLAT), HumanOLAT (github.com/TMT22/HumanOLAT) and OpenIllumination
+(github.com/oppo-us-research/OpenIlluminationCapture), as their pages and tools describe them; no
+real set was at hand. In the first two the whole stage lights up between single lights, so that the
+subject can be tracked; which frames these are differs between takes, by one or more.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from reconstruction.arrays import Array
+from reconstruction.capture.folder import StepKind
+from reconstruction.capture.import_geometry import Geometry
+from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, with_fully_lit
+from reconstruction.containment import plain_file
+from reconstruction.files.cameras import CameraFile, read_cameras
+from reconstruction.files.cameras.nerfstudio import read_transforms
+from reconstruction.files.lights import LightFile, read_lights
+from reconstruction.geometry.placement import (
+    PlacementOptions,
+    check_cameras,
+    check_lights,
+    placed,
+    placed_lights,
+)
+from reconstruction.reading import read_json
+
+Preset = Literal["faceolat", "humanolat", "openillumination"]
+HATCH = (
+    *(178, 179, 208, 209, 210, 237, 238, 239, 240, 267, 268, 269, 270, 271),
+    *(295, 296, 297, 298, 319, 320, 321),
+)
+"""Lights on the door of HumanOLAT's stage, from 0: its authors advise against their positions."""
+
+
+@dataclass(frozen=True)
+class TakeFrame:
+    """One file: of which kind of step, `light` (single lights only), and `number` in the take."""
+
+    kind: StepKind
+    number: int
+    camera: str
+    path: Path
+    light: str | None = None
+
+
+@dataclass(frozen=True)
+class Take:
+    """One take of a set; `subjects` are masks of the subject by camera.
+
+    `response` is how the files hold light.
+    """
+
+    geometry: Geometry
+    frames: list[TakeFrame]
+    subjects: Mapping[str, Path] = field(default_factory=dict)
+    response: Literal["linear", "srgb"] = "srgb"
+
+
+@dataclass(frozen=True)
+class PresetFiles:
+    """What a user gives beside the folder: `cameras` and `lights` where they are elsewhere."""
+
+    folder: Path
+    take: str | None = None
+    cameras: Path | None = None
+    lights: Path | None = None
+
+
+Files = dict[str, dict[int, Path]]
+"""By camera and by the number that ends the file's name."""
+Mean = Callable[[Path], float]
+"""Mean light of a picture; its unit does not matter."""
+
+
+def read_preset(
+    preset: Preset, files: PresetFiles, mean: Mean, given: Mapping[str, Any] = MappingProxyType({})
+) -> Take:
+    """The take in `files.folder`; `given` fields of `PlacementOptions` stand for the preset's own.
+
+    Raises `ValueError` (`PresetProblem`, those of camera and light files) that says what is amiss.
+    """
+    if not files.folder.is_dir():
+        raise PresetProblem(f"{files.folder}: no such folder")
+    return {"faceolat": _faceolat, "humanolat": _humanolat, "openillumination": _openillumination}[
+        preset
+    ](files, mean, given)
+
+
+def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
+    """`CamNN/IDxxxxx/IDxxxxx.NNNNNN.*`, and of the repository: `--cameras calibration/cameras/
+    NNN.xml --lights relighting/lights/light_pattern_metadata.json`, with `..._per_frame.json`.
+    """
+    taken = _takes(files, files.folder, "CamNN/ID20001/ID20001.000001.exr")
+    lights = _given(files.lights, "--lights relighting/lights/light_pattern_metadata.json")
+    table = lights.with_name("light_pattern_per_frame.json")
+    rows = read_json(table)
+    try:
+        order = [int(light) - 1 for _, light in sorted((int(f), int(n)) for f, n in rows)]
+    except (TypeError, ValueError) as error:
+        raise PresetProblem(f"{table}: expected a list of [frame, light] ({error})") from error
+    where = replace(PlacementOptions(unit="m", light_unit="mm", up="y"), **given)
+    geometry = _placed(
+        read_cameras(_given(files.cameras, "--cameras calibration/cameras/NNN.xml")),
+        read_lights(lights),
+        where,
+    )
+    linear = {p.suffix.lower() for paths in taken.values() for p in paths.values()} <= {".exr"}
+    frames, notes = _sequence(taken, geometry, order, mean, 0)
+    return Take(
+        replace(geometry, notes=[*geometry.notes, *notes]),
+        frames,
+        response="linear" if linear else "srgb",
+    )
+
+
+def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
+    """A pose: `images_processed` or `images_raw/CamNN/ID.NNN.avif`, and `../shared` of its subject.
+
+    Processed pictures are undistorted already; frame 0 is white light, 1 to 13 are gradients and
+    environments, from 13 or 14 on single lights follow.
+    """
+    folder, shared = files.folder, files.folder.parent / "shared"
+    pictures = next(
+        (folder / n for n in ("images_processed", "images_raw") if (folder / n).is_dir()), None
+    )
+    if pictures is None:
+        raise PresetProblem(
+            f"{folder}: expected a subject's pose, with images_processed/CamNN or images_raw/CamNN"
+        )
+    taken = _takes(files, pictures, "CamNN/ID.000014.avif", deep=False)
+    cameras = read_cameras(files.cameras or shared / "cameras.calib")
+    if pictures.name == "images_processed":
+        cameras = replace(cameras, cameras=[c.pinhole() for c in cameras.cameras])
+    lights = read_lights(files.lights or shared / "LSX_light_positions_aligned.pc")
+    spiral = shared / "LSX3_light_z_spiral.txt"
+    try:
+        turns = [int(w) - 1 for w in plain_file(spiral).read_text().split()]
+    except (OSError, ValueError) as error:
+        raise PresetProblem(f"{spiral}: expected a light's number a line ({error})") from error
+    order = with_fully_lit(turns)
+    where = replace(PlacementOptions(unit="mm", light_unit="m", up="y"), **given)
+    geometry = _placed(cameras, lights, where)
+    frames, notes = _sequence(taken, geometry, order, mean, 1)
+    hatch = {geometry.lights[i].name for i in HATCH if i < len(geometry.lights)}
+    kept = [light for light in geometry.lights if light.name not in hatch]
+    frames = [f for f in frames if f.light not in hatch]
+    notes.append(f"{len(hatch)} lights on the stage's door are left out: their places are not sure")
+    zero = _span(taken)[0]
+    white = [
+        TakeFrame("all_on", zero, c, paths[zero])
+        for c, paths in taken.items()
+        if c in geometry.cameras and zero in paths
+    ]
+    masks = {c: folder / "segmentations" / "masks" / "000" / f"{c}.png" for c in taken}
+    return Take(
+        Geometry(geometry.cameras, kept, [*geometry.notes, *notes]),
+        [*white, *frames],
+        {c: p for c, p in masks.items() if p.is_file()},
+        "srgb" if pictures.name == "images_processed" else "linear",
+    )
+
+
+def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
+    """An object: `Lights/NNN/raw_undistorted/CAMERA.JPG`, `output/transforms_*.json`, and
+    `--lights light_pos.npy`; poses have OpenCV's axes and a unit of their own.
+    """
+    folder = files.folder
+    by_light = {p.name: p / "raw_undistorted" for p in sorted((folder / "Lights").glob("*"))}
+    if not by_light or not all(p.is_dir() for p in by_light.values()):
+        raise PresetProblem(f"{folder}: expected Lights/000/raw_undistorted/CAMERA.JPG and so on")
+    lights = read_lights(_given(files.lights, "--lights light_pos.npy"))
+    if len(by_light) == 13 and len(lights.lights) > 13:
+        raise PresetProblem(
+            f"{folder}: the 13 patterns of many lights; take the object's OLAT pictures instead"
+        )
+    if not (by_light.keys() <= {f"{i:03d}" for i in range(len(lights.lights) + 1)}):
+        raise PresetProblem(f"{folder}: Lights has folders that are no light's number: 000, 001, …")
+    shape = _first_shape(by_light)
+    read: list[CameraFile] = []
+    for path in sorted((folder / "output").glob("transforms_*.json")):
+        read.append(read_transforms(path, _calibrated(path, read_json(path), shape)))
+    cameras = {c.name: c for file in read for c in file.cameras}
+    if not cameras:
+        raise PresetProblem(f"{folder}: expected output/transforms_train.json and _test.json")
+    where = replace(PlacementOptions(camera_axes="opencv"), **given)
+    file = CameraFile(
+        list(cameras.values()),
+        ["cameras and lights are given with the cameras 1 away: give --unit with that in metres"],
+        axes="opengl",
+    )
+    geometry = _placed(file, lights, where)
+    frames = []
+    absent = []
+    for number, place in by_light.items():
+        for path in sorted(p for p in place.iterdir() if p.is_file()):
+            if path.stem in cameras and int(number) < len(geometry.lights):
+                light = geometry.lights[int(number)].name
+                frames.append(TakeFrame("olat", int(number), path.stem, path, light))
+            elif path.stem not in cameras and path.stem not in absent:
+                absent.append(path.stem)
+    notes = [*geometry.notes]
+    if absent:
+        notes.append(f"no pose for {', '.join(absent)}: left out")
+    masks = {c: folder / "output" / "com_masks" / f"{c}.png" for c in cameras}
+    return Take(
+        replace(geometry, notes=notes), frames, {c: p for c, p in masks.items() if p.is_file()}
+    )
+
+
+def _calibrated(path: Path, data: Any, shape: tuple[int, int]) -> dict[str, Any]:
+    """Frames with a size: that of the calibration, which may differ from the pictures' own."""
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), dict):
+        raise PresetProblem(f"{path}: expected an object of frames by camera")
+    frames = {}
+    for name, frame in data["frames"].items():
+        wide = frame.get("calib_imgw") if isinstance(frame, dict) else None
+        if not isinstance(wide, int) or wide < 1:
+            raise PresetProblem(f"{path}: frames.{name}.calib_imgw: expected pixels, got {wide!r}")
+        frames[name] = {**frame, "w": wide, "h": round(wide * shape[1] / shape[0])}
+    return {"frames": frames}
+
+
+def _first_shape(by_light: Mapping[str, Path]) -> tuple[int, int]:
+    """Width and height of the first picture."""
+    for place in by_light.values():
+        for path in sorted(p for p in place.iterdir() if p.is_file()):
+            image = cv2.imread(str(path))
+            if image is not None:
+                return image.shape[1], image.shape[0]
+    raise PresetProblem(f"{next(iter(by_light.values()))}: has no picture")
+
+
+def _given(path: Path | None, example: str) -> Path:
+    if path is None:
+        raise PresetProblem(f"give {example}, of the set's repository")
+    return path
+
+
+def _placed(cameras: CameraFile, lights: LightFile, where: PlacementOptions) -> Geometry:
+    stand = placed(cameras.cameras, where, cameras.axes)
+    notes = [*cameras.notes, *check_cameras(stand, where, cameras.axes)]
+    shine = placed_lights(lights.lights, where)
+    check_lights(stand, shine, where.light_unit or where.unit)
+    return Geometry({c.name: c for c in stand}, shine, [*notes, *lights.notes])
+
+
+def _takes(files: PresetFiles, root: Path, example: str, deep: bool = True) -> Files:
+    """The files of the take that is asked for."""
+    folders = sorted(p for p in root.glob("Cam*") if p.is_dir())
+    if not folders:
+        raise PresetProblem(f"{root}: expected {example}")
+    if deep:
+        takes = sorted({p.name for f in folders for p in f.iterdir() if p.is_dir()})
+        take = files.take or (takes[0] if len(takes) == 1 else None)
+        if take not in takes:
+            shown = ", ".join(takes[:8]) or "none"
+            raise PresetProblem(f"{root}: give --take; there are {shown}")
+        folders = [f / str(take) for f in folders]
+    out: Files = {}
+    for place in folders:
+        paths = [p for p in place.iterdir() if p.is_file()] if place.is_dir() else []
+        found = [(re.search(r"(\d+)\.[A-Za-z0-9]+$", p.name), p) for p in sorted(paths)]
+        numbered = {int(match[1]): path for match, path in found if match}
+        if numbered:
+            out[(place.parent if deep else place).name] = numbered
+    if not out:
+        raise PresetProblem(f"{root}: expected {example}")
+    return out
+
+
+def _sequence(
+    taken: Files, geometry: Geometry, order: Sequence[int], mean: Mean, skip: int
+) -> tuple[list[TakeFrame], list[str]]:
+    """Frames of the cameras that have a pose: the pattern stands where the brightness says.
+
+    It is looked for after the first `skip` files. A file that is not there is no frame.
+    """
+    highest = max(order)
+    if highest >= len(geometry.lights):
+        raise PresetProblem(f"the pattern has {highest + 1} lights, {len(geometry.lights)} stand")
+    posed = [c for c in taken if c in geometry.cameras]
+    notes = []
+    if without := [c for c in taken if c not in geometry.cameras]:
+        notes.append(f"no pose for {', '.join(without)}: left out")
+    if not posed:
+        raise PresetProblem(f"no camera of {', '.join(taken)} has a pose")
+    numbers = range(*_span(taken))
+    pattern = find_pattern(_brightness(taken, posed, numbers, mean)[skip:], order)
+    start = numbers[0] + skip + pattern.start
+    first, second = (start + i for i in np.flatnonzero(np.asarray(order) < 0)[:2])
+    notes.append(f"the stage is fully lit in the frames {first}, {second}, …")
+    wrong = {numbers[0] + skip + i for i in pattern.wrong}
+    if wrong:
+        notes.append(
+            f"frames {', '.join(map(str, sorted(wrong)))} are brighter or darker than the pattern "
+            "has them: left out"
+        )
+    frames = []
+    for camera in posed:
+        for number, light in enumerate(order, start):
+            path = taken[camera].get(number)
+            if path is None or number in wrong:
+                continue
+            name = None if light < 0 else geometry.lights[light].name
+            kind: StepKind = "tracking" if light < 0 else "olat"
+            frames.append(TakeFrame(kind, number, camera, path, name))
+    return frames, notes
+
+
+def _span(taken: Files) -> tuple[int, int]:
+    """The first number and the one after the last."""
+    numbers = [n for files in taken.values() for n in files]
+    if max(numbers) - min(numbers) > 10 * len(set(numbers)):
+        raise PresetProblem(f"files are numbered from {min(numbers)} to {max(numbers)}: no take")
+    return min(numbers), max(numbers) + 1
+
+
+def _brightness(taken: Files, posed: Sequence[str], numbers: Sequence[int], mean: Mean) -> Array:
+    """Mean of the files of three cameras that are spread over the stage `(N,)`, each over its own.
+
+    A frame that none of them has is as bright as most.
+    """
+    chosen = posed[:: max(1, len(posed) // 3)][:3]
+    value = np.array(
+        [[mean(taken[c][n]) if n in taken[c] else np.nan for n in numbers] for c in chosen]
+    )
+    value /= np.nanmedian(value, axis=1, keepdims=True)
+    there = np.isfinite(value)
+    total = np.where(there, value, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    return np.where(there.any(axis=0), total, 1.0)
