@@ -93,9 +93,13 @@ class Import:
 
     @classmethod
     def of(
-        cls, folder: Path, geometry: Geometry | None = None, settings: ImportSettings | None = None
+        cls,
+        folder: Path,
+        geometry: Geometry | None = None,
+        settings: ImportSettings | None = None,
+        found: Found | None = None,
     ) -> Import:
-        """Look at `folder`; `settings` stand for its import.toml.
+        """Look at `folder`; `settings` stand for its import.toml, `found` for looking at names.
 
         `geometry` stands for the folder's cameras.json, and for lights.json where it has lights.
         Raises `ImportProblem` naming the file and field that are wrong or missing.
@@ -110,7 +114,7 @@ class Import:
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
-        found = find(folder, settings, given)
+        found = find(folder, settings, given) if found is None else found
         cameras = {c.name: _sized(c, found) for c in given.cameras}
         lenses = {n: Lens.of(c) for n, c in cameras.items() if isinstance(c, LensModelCamera)}
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())

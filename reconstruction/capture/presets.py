@@ -15,17 +15,19 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import StepKind
+from reconstruction.capture.folder import Step, StepKind
 from reconstruction.capture.import_geometry import Geometry
+from reconstruction.capture.import_settings import Found, ImportSettings
 from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, with_fully_lit
 from reconstruction.containment import plain_file
 from reconstruction.files.cameras import CameraFile, read_cameras
 from reconstruction.files.cameras.nerfstudio import read_transforms
 from reconstruction.files.lights import LightFile, read_lights
+from reconstruction.files.pictures import Sensor, picture_size, read_picture
+from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.placement import (
     PlacementOptions,
     check_cameras,
@@ -97,6 +99,23 @@ def read_preset(
     ](files, mean, given)
 
 
+def understood(take: Take) -> tuple[ImportSettings, Found]:
+    """The take as `Import.of` wants it: a step for each number, in the order of shooting."""
+    rank = {(f.number, f.kind, f.light): f for f in take.frames}
+    keys = sorted(rank, key=lambda k: (k[0], k[1], k[2] or ""))
+    steps = [Step(i, kind, 1.0, light=light) for i, (_, kind, light) in enumerate(keys)]
+    at = {key: i for i, key in enumerate(keys)}
+    frames = {(at[f.number, f.kind, f.light], f.camera): {1.0: f.path} for f in take.frames}
+    settings = ImportSettings(sensor=Sensor(response=take.response), units="relative")
+    found = Found(tuple(steps), frames, {}, {}, {}, take.subjects, (), ())
+    return settings, found
+
+
+def mean_light(path: Path) -> float:
+    """Mean light of a picture, by what its format says of its numbers."""
+    return float(read_picture(path, Sensor(), picture_size(path)).light.mean())
+
+
 def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     """`CamNN/IDxxxxx/IDxxxxx.NNNNNN.*`, and of the repository: `--cameras calibration/cameras/
     NNN.xml --lights relighting/lights/light_pattern_metadata.json`, with `..._per_frame.json`.
@@ -118,7 +137,7 @@ def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     linear = {p.suffix.lower() for paths in taken.values() for p in paths.values()} <= {".exr"}
     frames, notes = _sequence(taken, geometry, order, mean, 0)
     return Take(
-        replace(geometry, notes=[*geometry.notes, *notes]),
+        Geometry(_shot(geometry, taken), geometry.lights, [*geometry.notes, *notes]),
         frames,
         response="linear" if linear else "srgb",
     )
@@ -164,7 +183,7 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
     ]
     masks = {c: folder / "segmentations" / "masks" / "000" / f"{c}.png" for c in taken}
     return Take(
-        Geometry(geometry.cameras, kept, [*geometry.notes, *notes]),
+        Geometry(_shot(geometry, taken), kept, [*geometry.notes, *notes]),
         [*white, *frames],
         {c: p for c, p in masks.items() if p.is_file()},
         "srgb" if pictures.name == "images_processed" else "linear",
@@ -235,9 +254,7 @@ def _first_shape(by_light: Mapping[str, Path]) -> tuple[int, int]:
     """Width and height of the first picture."""
     for place in by_light.values():
         for path in sorted(p for p in place.iterdir() if p.is_file()):
-            image = cv2.imread(str(path))
-            if image is not None:
-                return image.shape[1], image.shape[0]
+            return picture_size(path)
     raise PresetProblem(f"{next(iter(by_light.values()))}: has no picture")
 
 
@@ -295,6 +312,8 @@ def _sequence(
         notes.append(f"no pose for {', '.join(without)}: left out")
     if not posed:
         raise PresetProblem(f"no camera of {', '.join(taken)} has a pose")
+    if unused := [str(c) for c in geometry.cameras if c not in taken]:
+        notes.append(f"no pictures of {', '.join(unused)}: left out")
     numbers = range(*_span(taken))
     pattern = find_pattern(_brightness(taken, posed, numbers, mean)[skip:], order)
     start = numbers[0] + skip + pattern.start
@@ -316,6 +335,10 @@ def _sequence(
             kind: StepKind = "tracking" if light < 0 else "olat"
             frames.append(TakeFrame(kind, number, camera, path, name))
     return frames, notes
+
+
+def _shot(geometry: Geometry, taken: Files) -> dict[str | int, Camera]:
+    return {name: camera for name, camera in geometry.cameras.items() if name in taken}
 
 
 def _span(taken: Files) -> tuple[int, int]:

@@ -27,7 +27,7 @@ Size = tuple[int, int]
 """Width and height."""
 
 RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"}
-FORMATS = {".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg"} | RAW
+FORMATS = {".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".avif"} | RAW
 LOSSY = {".jpg", ".jpeg"}
 FULL = 0.99
 """Of the way from black to white from which on a channel of whole numbers counts as saturated:
@@ -83,6 +83,9 @@ def picture_size(path: Path) -> Size:
                 return int(raw.sizes.width), int(raw.sizes.height)
     except Exception as error:  # both bindings raise what they please
         raise PictureError(_broken(path, error)) from error
+    if suffix == ".avif":
+        height, width = _avif(path).shape[:2]
+        return width, height
     spec = _opened(path).spec()
     return int(spec.width), int(spec.height)
 
@@ -102,11 +105,21 @@ def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
         return _exr(path, sensor)
     if suffix in RAW:
         return _raw(path, sensor)
+    if suffix == ".avif":
+        return _counts(path, _avif(path), sensor)
     source = _opened(path)
     values = source.read_image(oiio.UNKNOWN)
     if values is None or source.geterror(False):
         raise PictureError(_broken(path, source.geterror()))
     return _counts(path, np.asarray(values), sensor)
+
+
+def _avif(path: Path) -> NDArray[Any]:
+    """Whole numbers `(H, W, 3)`; OpenCV reads what OpenImageIO's wheels do not."""
+    values = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    if values is None:
+        raise PictureError(_broken(path, "OpenCV cannot read it"))
+    return np.asarray(values)
 
 
 def _opened(path: Path) -> Any:

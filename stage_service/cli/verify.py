@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stage_service.cli.support.commands import FAILED, Commands, Output, add_command, progress_bar
+
+if TYPE_CHECKING:
+    from reconstruction.capture.import_folder import Import
 
 
 def add(commands: Commands) -> None:
@@ -41,7 +45,7 @@ def add(commands: Commands) -> None:
         "--light-distance", type=float, help="metres, where the lights are directions"
     )
     unit = "m, cm, mm, inch, or its length in metres"
-    imported.add_argument("--unit", type=_unit, default="m", help=f"of --cameras: {unit}")
+    imported.add_argument("--unit", type=_unit, help=f"of --cameras: {unit}; default: m")
     imported.add_argument("--light-unit", type=_unit, help=f"of --lights, where it differs: {unit}")
     ups = ("x", "-x", "y", "-y", "z", "-z")
     imported.add_argument("--up", choices=ups, help="axis of the files' world that points up")
@@ -50,6 +54,9 @@ def add(commands: Commands) -> None:
         choices=("opencv", "opengl"),
         help="where they are not what the format of --cameras says",
     )
+    presets = ("faceolat", "humanolat", "openillumination")
+    imported.add_argument("--preset", choices=presets, help="the folder is laid out as this set is")
+    imported.add_argument("--take", help="of --preset faceolat: ID20001")
 
 
 def run_verify(args: argparse.Namespace, output: Output) -> int:
@@ -71,23 +78,10 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
 
     Read cameras, lights, pictures by the patterns of import.toml, and masks.
     """
-    from dataclasses import replace
-
     from reconstruction.capture.contact_sheet import contact_sheet
-    from reconstruction.capture.import_folder import Import, settings_of
-    from reconstruction.capture.import_geometry import GeometryFiles, read_geometry
-    from reconstruction.options import parse_options
+    from reconstruction.images.scene_checks import check_scene
 
-    asked = {f: getattr(args, f) for f in ("cameras", "lights", "light_distance")}
-    where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
-    files = parse_options(GeometryFiles, {**asked, "placement": where}, "import")
-    geometry = read_geometry(files) if args.cameras else None
-    settings = settings_of(args.folder, args.settings)
-    if args.pictures is not None:
-        patterns = replace(settings.pictures, olat=args.pictures)
-        settings = replace(settings, pictures=patterns)
-    understood = Import.of(args.folder, geometry, settings)
-    notes = [*(geometry.notes if geometry else []), *understood.found.notes]
+    understood, notes = _understood(args)
     for note in notes:
         output.note(note)
     if args.dry_run:
@@ -98,6 +92,10 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         return
     with progress_bar("import") as progress:
         capture = understood.write(args.out, progress)
+        progress("holding cameras and lights against the pictures", 1.0)
+        doubts = check_scene(capture)
+    for note in doubts:
+        output.note(note)
     counts = {
         "cameras": len(capture.rig.cameras),
         "lights": len(capture.rig.lights),
@@ -105,7 +103,36 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         "missing": len(understood.missing),
     }
     text = f"{args.out}: " + ", ".join(f"{n} {what}" for what, n in counts.items())
-    output.result({"capture": str(args.out), **counts, "notes": notes}, text)
+    output.result({"capture": str(args.out), **counts, "notes": [*notes, *doubts]}, text)
+
+
+def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
+    """What lies in the folder, and what there is to be told of it."""
+    from dataclasses import replace
+
+    from reconstruction.capture.import_folder import Import, settings_of
+    from reconstruction.capture.import_geometry import GeometryFiles, read_geometry
+    from reconstruction.capture.presets import PresetFiles, mean_light, read_preset, understood
+    from reconstruction.geometry.placement import PlacementOptions
+    from reconstruction.options import parse_options
+
+    where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
+    given = {f: value for f, value in where.items() if value is not None}
+    if args.preset is not None:
+        parse_options(PlacementOptions, given, "import")
+        files = PresetFiles(args.folder, args.take, args.cameras, args.lights)
+        take = read_preset(args.preset, files, mean_light, given)
+        settings, found = understood(take)
+        return Import.of(args.folder, take.geometry, settings, found), take.geometry.notes
+    asked = {f: getattr(args, f) for f in ("cameras", "lights", "light_distance")}
+    named = parse_options(GeometryFiles, {**asked, "placement": given}, "import")
+    geometry = read_geometry(named) if args.cameras else None
+    settings = settings_of(args.folder, args.settings)
+    if args.pictures is not None:
+        patterns = replace(settings.pictures, olat=args.pictures)
+        settings = replace(settings, pictures=patterns)
+    seen = Import.of(args.folder, geometry, settings)
+    return seen, [*(geometry.notes if geometry else []), *seen.found.notes]
 
 
 def _unit(text: str) -> str | float:

@@ -1,0 +1,108 @@
+"""Pictures that do not belong to their cameras or lights: told from small copies of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reconstruction import Camera
+from reconstruction.geometry.lights import dome_positions
+from reconstruction.images.scene_checks import check_light_axes, check_silhouettes, odd_lights
+
+BALLS = (([0, 0, 0], 0.1), ([0.09, 0.02, 0.05], 0.05), ([-0.03, 0.1, -0.06], 0.06))
+"""A lumpy subject: centres and radii."""
+RNG = np.random.default_rng(1)
+
+
+def cameras() -> list[Camera]:
+    out = []
+    for i in range(7):
+        a = 0.85 * i
+        position = [np.cos(a), np.sin(a), 0.5 * np.sin(1.7 * i)]
+        out.append(Camera.look_at(f"cam_{i}", 96, 80, position, [0, 0, 0], 28, 20.0 * i))
+    return out
+
+
+def hits(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Depth `(H, W)` along the rays, inf where they meet nothing, and normals `(H, W, 3)`."""
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = camera.rays(np.stack([x, y], axis=-1))
+    depth, normal = np.full(x.shape, np.inf), np.zeros((*x.shape, 3))
+    for center, radius in BALLS:
+        towards = np.array(center) - camera.center
+        along = rays @ towards
+        inside = along**2 - (towards @ towards - radius**2)
+        t = along - np.sqrt(np.maximum(inside, 0))
+        nearer = (inside > 0) & (t < depth)
+        depth[nearer] = t[nearer]
+        points = camera.center + t[..., None] * rays
+        normal[nearer] = ((points - center) / radius)[nearer]
+    return depth, normal
+
+
+def test_exchanged_cameras_are_named() -> None:
+    stage = cameras()
+    masks = {c.name: np.isfinite(hits(c)[0]) for c in stage}
+    assert check_silhouettes(stage, masks) == []
+    for a, b in (("cam_0", "cam_1"), ("cam_3", "cam_5")):
+        swapped = masks | {a: masks[b], b: masks[a]}
+        (said,) = check_silhouettes(stage, swapped)
+        assert said.startswith(f"{a} and {b}: their pictures, or their poses, seem to be exchanged")
+
+
+def test_a_camera_that_looks_elsewhere_is_named() -> None:
+    stage = cameras()
+    masks = {c.name: np.isfinite(hits(c)[0]) for c in stage}
+    turn = np.radians(4)
+    R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    moved = R @ stage[4].R
+    stage[4] = replace(stage[4], R=moved, t=-moved @ stage[4].center)
+    (said,) = check_silhouettes(stage, masks)
+    assert said.startswith("cam_4: its silhouette does not fit the others'")
+
+
+@pytest.fixture(scope="module")
+def lit() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tiles (L, C, T) of the lumps, matte, under 120 lights; places of lights and cameras."""
+    stage, lights = cameras()[::2], dome_positions(120, 1.5)
+    pictures = []
+    for camera in stage:
+        depth, normal = hits(camera)
+        shade = np.maximum(normal @ (lights / 1.5).T, 0) * np.isfinite(depth)[..., None]
+        tiles = shade.reshape(8, 10, 8, 12, -1).mean(axis=(1, 3)).reshape(64, -1).T
+        pictures.append(tiles + RNG.normal(0, 1e-3, tiles.shape))
+    return np.stack(pictures, axis=1), lights, np.array([c.center for c in stage])
+
+
+def test_lights_with_each_others_pictures_are_found(lit) -> None:
+    pictures, places, _ = lit
+    assert odd_lights(pictures, places) == {}
+    wrong = places.copy()
+    wrong[[7, 90]] = wrong[[90, 7]]
+    angle = np.degrees(np.arccos(places[7] @ places[90] / 1.5**2))
+    assert angle > 60
+    found = odd_lights(pictures, wrong)
+    assert sorted(found) == [7, 90]
+    assert abs(found[7] - angle) < 15
+
+
+@pytest.mark.parametrize(
+    ("axes", "signs", "named"),
+    [
+        ((0, 2, 1), (1, 1, 1), "x z y"),
+        ((0, 1, 2), (1, -1, -1), "x -y -z"),
+        ((2, 0, 1), (1, 1, 1), "y z x"),
+    ],
+)
+def test_lights_in_another_world_than_the_cameras_are_told(lit, axes, signs, named) -> None:
+    pictures, places, eyes = lit
+    assert check_light_axes(pictures, places, eyes) == []
+    (said,) = check_light_axes(pictures, places[:, axes] * signs, eyes)
+    assert f"were the lights' axes {named}, it would be" in said
+
+
+def test_pictures_that_show_nothing_say_nothing() -> None:
+    places = dome_positions(30, 1.5)
+    assert check_light_axes(np.full((30, 2, 9), 3.0), places, np.eye(3)[:2]) == []
