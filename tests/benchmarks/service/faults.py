@@ -140,7 +140,7 @@ def _kill(
     else:
         ended = _finish(live, capture["id"], capture["path"])
     live.end()
-    return Cell(f"SIGKILL: {name}", load, seconds, "dark", *ended)
+    return Cell(f"SIGKILL: {name}", load, seconds, "lamps dark", *ended)
 
 
 def _lit(rig: RigFile) -> int:
