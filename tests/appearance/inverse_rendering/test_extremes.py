@@ -111,6 +111,17 @@ def test_a_bright_constant_image_makes_the_hair_lighter(plain):
     assert check(grey, HairMaps.of(START), ENOUGH).sigma_a.max() < START.sigma_a[0]
 
 
+def test_frames_that_are_all_saturated_end_the_fit_at_once_with_the_reason(plain):
+    views = [
+        replace(o, radiance=np.full_like(o.radiance, 4.0), valid=np.zeros_like(o.valid))
+        for o in plain.views
+    ]
+    start = HairMaps.of(START)
+    found = run(FitProblem(plain.mapped, views, 1.0, plain.skin), start, options=OPTIONS)
+    assert (found.ended, found.steps) == ("no pair of camera and light shows lit hair", 0)
+    assert found.maps is start
+
+
 def test_black_frames_end_the_fit_at_once_with_the_reason(plain):
     views = [replace(o, radiance=np.zeros_like(o.radiance)) for o in plain.views]
     start = HairMaps.of(START)

@@ -45,7 +45,7 @@ def test_all_are_found_together(plain, tufted, start):
     np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.25)
 
 
-@pytest.mark.parametrize(("beta_m", "beta_n"), [(0.05, 0.3), (0.7, 0.7)])
+@pytest.mark.parametrize(("beta_m", "beta_n"), [(0.05, 0.3), (0.7, 0.7), (0.8, 0.3)])
 def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
     problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
@@ -54,6 +54,28 @@ def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     assert maps.beta_m == pytest.approx(beta_m, rel=0.2)
     assert maps.beta_n == pytest.approx(beta_n, rel=0.3)
     np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.15)
+
+
+def test_white_hair(tufted):
+    """What is left of its light after a crossing; the roughness of a lobe that all light makes."""
+    truth = replace(tufted.truth, sigma_a=(0.001, 0.002, 0.008))
+    problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
+    quiet = replace(EFFORT, pixels=60)
+    _, _, maps, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3), effort=quiet)
+    left = np.exp(-2 * maps.sigma_a[0, 0, 0])
+    assert left == pytest.approx(np.exp(-2 * np.array(truth.sigma_a)), abs=0.04)
+    assert maps.beta_m == pytest.approx(truth.beta_m, rel=0.15)
+
+
+def test_black_hair_from_a_dark_start(tufted):
+    """Its highlight tells roughness and index. Of its absorption it tells that it is black."""
+    truth = replace(tufted.truth, sigma_a=(6.0, 9.0, 15.0))
+    problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
+    quiet = replace(EFFORT, pixels=60)
+    _, _, maps, _ = solve(problem, HairAppearance((3.0, 3.0, 3.0), 0.4, 0.3), effort=quiet)
+    assert maps.beta_m == pytest.approx(truth.beta_m, rel=0.1)
+    assert maps.eta == pytest.approx(truth.eta, abs=0.05)
+    assert np.exp(-2 * maps.sigma_a).max() < 0.01
 
 
 def test_intensities_are_found_and_their_mean_is_kept(tufted):
