@@ -48,6 +48,7 @@ FILES = {
     "relit.png": "the hair under an environment map",
     "relit.exr": "the same as radiance",
     "render.png": "what `hairstage render` drew last",
+    "render.webp": "the animation that `hairstage render` drew last",
     "report.json": "every stage: seconds, figures, error against run time, warnings",
     "plots": "the report's plots",
     "results.json": "the job's figures in one object",
@@ -68,6 +69,7 @@ _OF_APPEARANCE = (
     "relit.png",
     "relit.exr",
     "render.png",
+    "render.webp",
     "plots",
     "results.json",
 )

@@ -102,11 +102,12 @@ class Field:
         """Read `field.npz`. Raises `ModelError` where it is not there or not a field."""
         data = model.arrays(FIELD_FILE)
         try:
-            kind, degree = str(data["kind"]), int(data["degree"])
+            kinds: dict[str, Kind] = {name: name for name in get_args(Kind)}
+            kind, degree = kinds.get(str(data["kind"])), int(data["degree"])
             grid = Grid(*(int(n) for n in data["grid"]))
             rows, values = data["rows"].astype(np.int64), data["values"].astype(np.float32)
-            if kind not in get_args(Kind) or values.shape != (len(rows), count_of(degree) ** 2 * 3):
-                raise ValueError(f"kind {kind}, degree {degree}, values {values.shape}")
+            if kind is None or values.shape != (len(rows), count_of(degree) ** 2 * 3):
+                raise ValueError(f"kind {data['kind']}, degree {degree}, values {values.shape}")
             if len(rows) and (rows.min() < 0 or rows.max() >= grid.count):
                 raise ValueError(f"anchors {rows.min()} to {rows.max()} of {grid.count}")
             if not np.isfinite(values).all():
@@ -116,7 +117,7 @@ class Field:
         except (KeyError, TypeError, ValueError) as error:
             path = model.file(FIELD_FILE)
             raise ModelError(f"{path}: {error}: run 'hairstage fit --field' again") from error
-        return cls(kind, degree, grid, places, rows, values)  # type: ignore[arg-type]
+        return cls(kind, degree, grid, places, rows, values)
 
 
 @dataclass(frozen=True, eq=False)

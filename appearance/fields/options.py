@@ -27,15 +27,17 @@ class FieldOptions:
     anchors (n_c along strands, w, h cells of the scalp's map) whose values add up, from coarse to
     fine; w = h = 0 are anchors on every strand. `ridges` are tried from the last to the first,
     and grow with the degrees a and b of a coefficient as (1 + a(a + 1))(1 + b(b + 1)). `iterations`
-    of conjugate gradients at most, fewer once the gradient has fallen to `tolerance`.
+    of conjugate gradients at most, fewer once the gradient has fallen to `tolerance`. Views and
+    lights are parted into `folds` each, and left out part by part to choose the ridge and judge.
     """
 
     kind: Kind = "modulation"
-    degree: Degree = 2
+    degree: Degree = 1
     levels: tuple[Level, ...] = NESTED
-    ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
+    ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
     iterations: Count = 40
     tolerance: Annotated[float, Field(gt=0)] = 0.01
+    folds: Annotated[int, Field(ge=2, le=16)] = 3
 
 
 @options

@@ -13,9 +13,10 @@ import numpy as np
 
 from appearance.bsdf.maps import MappedStrands
 from appearance.fields.anchors import Places
-from appearance.fields.fit import FieldFit, Monitor, Pictures, fit_pictures
+from appearance.fields.fit import FieldFit, Monitor, fit_pictures
 from appearance.fields.hits import RECORD, HitOptions, find_hits
 from appearance.fields.options import FieldRequest
+from appearance.fields.pictures import Pictures
 from appearance.observations import chosen, observe
 from appearance.render.harmonics import count_of
 from appearance.render.smoothed import olat_smoothed
@@ -128,6 +129,10 @@ def memory_needed(pixels: Sequence[int], lights: int, request: FieldRequest) -> 
     """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
     n = count_of(request.fit.degree)
     hit = RECORD.itemsize + 2 * n * 8 + 4 * sum((2 * k + 1) ** 2 for k in range(1, 4))
-    pixel = request.hits * hit + 2 * 3 * 4 * (n * (n + 1) // 2 + 3 * n) + 8 * 3 * lights
+    pixel = (
+        request.hits * hit
+        + (request.fit.folds + 1) * 3 * 4 * (n * (n + 1) // 2 + n)
+        + 8 * 3 * lights
+    )
     view = max(pixels) * (3 * 8 * 6 * lights + 4 * n * (n + 1) // 2 * lights)
     return (sum(pixels) * pixel + view) / 1e9

@@ -50,14 +50,16 @@ def relight(
     return radiance
 
 
-def three_quarter_view(strands: Strands, size: int) -> Camera:
+def three_quarter_view(strands: Strands, size: int, round_deg: float = 0.0) -> Camera:
     """A camera of `size`² pixels that sees all of `strands` from the front left, slightly above.
 
-    The face looks along −y, as everywhere in this project.
+    The face looks along −y, as everywhere in this project. `round_deg` is how far the camera has
+    gone round it from there, counter-clockwise seen from above.
     """
     low, high = strands.points.min(axis=0).astype(float), strands.points.max(axis=0).astype(float)
     middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    direction = np.array([0.62, -0.75, 0.22])
+    c, s = np.cos(np.radians(round_deg)), np.sin(np.radians(round_deg))
+    direction = np.array([0.62 * c + 0.75 * s, 0.62 * s - 0.75 * c, 0.22])
     distance = 6.0 * reach
     position = middle + distance * direction / np.linalg.norm(direction)
     fov = float(np.degrees(2 * np.arcsin(0.85 * reach / distance)))

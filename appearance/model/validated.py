@@ -87,13 +87,13 @@ def fit_field_validated(
 ) -> dict[str, Any]:
     """Fit a field on top of what the model renders, kept only where it makes pictures better.
 
-    Of the lights that are not `held_out`, `request.lights` are used: directions far apart. A camera
-    and every fourth light are left out, and the field is rendered later where its pictures under
-    new lights, of the new view, and of both are each no worse than without it; otherwise it goes to
-    the model's folder "rejected", with a warning in the report. What is kept is fitted to all of
-    the frames. Writes `field.npz` and the stage "field" of the report. Returns `{"validation":
-    {group: {"without", "with"}} in dB, "rendered", "ridge", "clamped", "lights"}`, or "left_out"
-    where no field is asked for; that removes an earlier one.
+    Of the lights that are not `held_out`, `request.lights` are used: directions far apart. Cameras
+    and lights are left out in turn, and the field is rendered later where pictures under new
+    lights, of new views, and of both each gain by it, and together more than twice the spread;
+    otherwise it goes to the model's folder "rejected", with a warning in the report. What is kept
+    is fitted to all of the frames. Writes `field.npz` and the stage "field" of the report. Returns
+    `{"validation": {group: {"without", "with", "spread"}} in dB, "gain", "rendered", "ridge",
+    "clamped", "lights"}`, or "left_out" where no field is asked for; that removes an earlier one.
     """
     held_out, request = held_out or HeldOut(), request or FieldRequest()
     model.remove(FIELD_FILE)
@@ -113,21 +113,15 @@ def fit_field_validated(
         found = fit_field(training, model, base, request, progress, seed)
         found.field.save(model)
         stage.warnings += found.warnings
-        worse = [n for n, f in found.validation.items() if f["with"] < f["without"]]
-        if worse or not found.validation:
-            rejected = model.rejected()
-            rejected.remove(FIELD_FILE)
+        doubts = found.doubts()
+        if doubts:
+            model.rejected().remove(FIELD_FILE)
             model.reject(FIELD_FILE)
-        for group in worse:
-            scores = found.validation[group]
-            stage.warn(
-                f"{request.field}, {group}: pictures are better without it, "
-                f"{scores['without']:.2f} dB against {scores['with']:.2f}: it is not rendered"
-            )
-        if not found.validation:
-            stage.warn(f"{request.field}: nothing says whether it is better: it is not rendered")
+        for doubt in doubts:
+            stage.warn(f"{request.field}, {doubt}: it is not rendered")
         result: dict[str, Any] = {
             "validation": found.validation,
+            "gain": found.gain,
             "rendered": model.has(FIELD_FILE),
             "field": request.field,
             "ridge": found.ridge,

@@ -20,13 +20,20 @@ import numpy as np
 from reconstruction.files.strands.alembic import write_abc
 from reconstruction.files.strands.cyhair import read_hair, write_hair
 from reconstruction.files.strands.errors import StrandFileError
-from reconstruction.files.strands.npz import read_npz, write_npz
+from reconstruction.files.strands.npz import read_npz, read_npz_poses, write_npz
 from reconstruction.files.strands.photobooth import read_data
 from reconstruction.files.strands.tressfx import read_tfx
 from reconstruction.files.strands.usd import read_usd, write_usd
 from reconstruction.geometry.strands import Strands
 
-__all__ = ["READABLE", "WRITABLE", "StrandFileError", "read_strands", "write_strands"]
+__all__ = [
+    "READABLE",
+    "WRITABLE",
+    "StrandFileError",
+    "read_poses",
+    "read_strands",
+    "write_strands",
+]
 
 _USD = (".usd", ".usda", ".usdc")
 _READERS: dict[str, Callable[[Path], Strands]] = {
@@ -70,6 +77,22 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
     if up_axis == "y" and reader is not read_usd:
         return strands.transformed(_Y_UP_TO_Z_UP, np.zeros(3))
     return strands
+
+
+def read_poses(path: str | Path) -> list[Strands]:
+    """Read strands that move: an `.npz` of points (T, N, 3); one pose of any other file.
+
+    Raises `StrandFileError` as `read_strands` does.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npz":
+        return [read_strands(path)]
+    if not path.is_file():
+        raise StrandFileError(f"{path}: no such file")
+    try:
+        return read_npz_poses(path)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise StrandFileError(f"{path}: {error}") from error
 
 
 def write_strands(path: str | Path, strands: Strands) -> None:

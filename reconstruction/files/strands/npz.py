@@ -1,4 +1,7 @@
-"""NumPy archives: `points (N, 3)`, `offsets (S + 1,)` and, optionally, `radius` () or (N,)."""
+"""NumPy archives: `points (N, 3)`, `offsets (S + 1,)` and, optionally, `radius` () or (N,).
+
+Poses of moving strands are `points (T, N, 3)`.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,23 @@ DEFLATE_AT_BEST = 1032
 
 def read_npz(path: Path) -> Strands:
     """Read an archive; other members than `points`, `offsets`, `radius` are not looked at."""
+    points, offsets, radius = _members(path)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise StrandFileError(f"points must be (N, 3), got {points.shape}")
+    return Strands(points, offsets, radius)
+
+
+def read_npz_poses(path: Path) -> list[Strands]:
+    """Read the poses of an archive, one where its points are `(N, 3)`."""
+    points, offsets, radius = _members(path)
+    if points.ndim == 2:
+        points = points[None]
+    if points.ndim != 3 or points.shape[2] != 3 or not len(points):
+        raise StrandFileError(f"points must be (N, 3) or (T, N, 3), got {points.shape}")
+    return [Strands(pose, offsets, radius) for pose in points]
+
+
+def _members(path: Path) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | float]:
     try:
         with zipfile.ZipFile(path) as archive:
             points = _member(archive, "points", "f")
@@ -33,11 +53,9 @@ def read_npz(path: Path) -> Strands:
         raise StrandFileError(f"not a whole .npz archive ({e})") from e
     except RuntimeError as e:  # encrypted, or packed in a way that is not known
         raise StrandFileError(f"not a whole .npz archive ({e})") from e
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise StrandFileError(f"points must be (N, 3), got {points.shape}")
     if isinstance(radius, np.ndarray) and radius.ndim == 0:
         radius = float(radius)
-    return Strands(points, offsets, radius)
+    return points, offsets, radius
 
 
 def write_npz(path: Path, strands: Strands) -> None:

@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any
 from stage_service.cli.support.commands import Commands, Output, add_command, progress_bar
 
 if TYPE_CHECKING:
+    from appearance import Environment, FittedModel, Sampling
     from appearance.model.interpolated import InterpolationOptions, Pose
-    from reconstruction import Camera, Capture, Light, Model, Progress
+    from reconstruction import Camera, Capture, Light, Model, Progress, Strands
     from reconstruction.arrays import Floats
 
 FIELDS = ("none", "modulation", "additive", "interpolation")
-SIZE = 512
-"""Pixels across, where no camera of a rig says."""
+SIZE, FILM_SIZE = 512, 192
+"""Pixels across of a picture and of an animation, where no camera of a rig says."""
+SPP, FILM_SPP = 64, 6
 
 
 def add(commands: Commands) -> None:
@@ -38,7 +40,8 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--out",
         type=Path,
-        help=".png (exposed, sRGB) or .exr (linear), instead of MODEL/render.png",
+        help=".png (exposed, sRGB) or .exr (linear), instead of MODEL/render.png; .webp of an "
+        "animation, instead of MODEL/render.webp",
     )
     render.add_argument(
         "--field",
@@ -56,9 +59,23 @@ def add(commands: Commands) -> None:
         "--refine", action="store_true", help="turn the guide's tangents to each camera's frames"
     )
     render.add_argument(
-        "--strands", type=Path, help="a strand file of another pose: the same strands, moved"
+        "--strands",
+        type=Path,
+        help="a strand file of another pose: the same strands, moved; an .npz of poses (T, N, 3) "
+        "becomes an animation",
     )
-    render.add_argument("--spp", type=int, default=64, help="samples a pixel")
+    moves = render.add_mutually_exclusive_group()
+    moves.add_argument(
+        "--turntable", action="store_true", help="an animation: the model and the room turn"
+    )
+    moves.add_argument(
+        "--sway", type=float, metavar="DEGREES", help="an animation: the hair swings, at the tips"
+    )
+    render.add_argument("--frames", type=int, default=24, help="of a turntable or a sway")
+    render.add_argument("--size", type=int, help="pixels across, where no --camera says")
+    render.add_argument(
+        "--spp", type=int, help="samples a pixel; default: 64, in an animation 6, smoothed"
+    )
     render.add_argument("--seed", type=int, default=0)
 
 
@@ -67,7 +84,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, where
     there are any), in the pose of its capture or of other --strands. With a field, its hair is what
-    the capture's frames say of it.
+    the capture's frames say of it. A turntable, hair that sways, or strands of several poses become
+    a WebP animation, their indirect light smoothed.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
@@ -78,45 +96,48 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
 def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Render what was asked for; returns what was written."""
-    from appearance import Environment, FittedModel, Sampling, render_mixed
-    from appearance.model.interpolated import InterpolationOptions, Pose, all_lights
+    from appearance import Environment, FittedModel, Sampling
     from appearance.model.relight import environment_map, three_quarter_view
-    from reconstruction import Capture, Model, read_strands
+    from reconstruction import Capture, Model
     from reconstruction.files.durable import writing
+    from reconstruction.files.strands import read_poses
     from stage_service.model_page import write_page
 
     start = time.perf_counter()
-    if args.out is not None and args.out.suffix not in (".png", ".exr"):
-        raise ValueError(f"--out {args.out}: expected .png or .exr")
     if args.seed < 0:
         raise ValueError(f"--seed {args.seed}: expected 0 or more")
+    if args.size is not None and args.size < 16:
+        raise ValueError(f"--size {args.size}: expected 16 or more")
     capture = Capture(args.capture) if args.capture is not None else None
     if capture is None and (args.camera is not None or args.light):
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
     if capture is None and args.field == "interpolation":
         raise ValueError("--field interpolation needs the frames: say whose with --capture")
+    poses: list[Strands] = [] if args.strands is None else read_poses(args.strands)
+    moves = args.turntable or args.sway is not None or len(poses) > 1
+    _check_animation(args, len(poses), moves)
     progress("building the scene", 0.0)
     model = Model(args.model)
     of_model = None if args.field == "interpolation" else args.field
     fitted = FittedModel.load(model, capture).with_field_of(model, of_model)
-    pose = Pose(fitted, read_strands(args.strands) if args.strands is not None else None)
-    camera = three_quarter_view(fitted.strands, SIZE)
+    camera = three_quarter_view(fitted.strands, args.size or (FILM_SIZE if moves else SIZE))
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
     environment = args.environment or (None if args.light else "studio")
     maps = [] if environment is None else [Environment(environment_map(environment))]
     lights = fitted.lights(args.light) if args.light else []
-    progress("rendering", 0.2)
-    sampling = Sampling(args.spp, seed=args.seed)
-    image = render_mixed(fitted.scene(pose.strands), camera, lights, maps, sampling)
+    sampling = Sampling(args.spp or (FILM_SPP if moves else SPP), seed=args.seed)
+    out: Path = args.out or model.file("render.webp" if moves else "render.png")
     found: dict[str, Any] = {"warnings": []}
-    if capture is not None and args.field == "interpolation":
-        lit = camera, all_lights(lights, maps)
-        options = InterpolationOptions(guide=args.guide, refine=args.refine)
-        image, found = _interpolated(image, options, (pose, model, capture), lit, progress)
-    out: Path = args.out or model.file("render.png")
-    with writing(out) as part:
-        _write(part, image)
+    if moves:
+        found |= _animate(args, fitted, poses, (camera, lights, maps, sampling), out, progress)
+    else:
+        whose = fitted, model, capture
+        lit = camera, lights, maps, sampling
+        image, told = _still(args, whose, poses[0] if poses else None, lit, progress)
+        found |= told
+        with writing(out) as part:
+            _write(part, image)
     if args.out is None:
         write_page(model)
     progress("written", 1.0)
@@ -129,6 +150,68 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         **found,
         "seconds": time.perf_counter() - start,
     }
+
+
+def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
+    """`ValueError` for options that do not go together."""
+    suffixes = (".webp",) if moves else (".png", ".exr")
+    if args.out is not None and args.out.suffix not in suffixes:
+        what = "an animation" if moves else "a picture"
+        raise ValueError(f"--out {args.out}: {what} is {' or '.join(suffixes)}")
+    if not moves:
+        return
+    if args.field == "interpolation":
+        raise ValueError("an animation shows the model or its field, not --field interpolation")
+    if poses and (args.turntable or args.sway is not None):
+        raise ValueError("--strands of other poses goes without --turntable and --sway")
+    if args.turntable and (args.light or args.camera):
+        raise ValueError("--turntable goes round under a map: without --light and --camera")
+    if not 2 <= args.frames <= 1000:
+        raise ValueError(f"--frames {args.frames}: expected 2 to 1000")
+
+
+def _animate(
+    args: argparse.Namespace,
+    fitted: FittedModel,
+    poses: Sequence[Strands],
+    lit: tuple[Camera, Sequence[Light], Sequence[Environment], Sampling],
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write the animation that was asked for; what there is to tell of it."""
+    from appearance.model.animation import moving, sway, turntable, write_animation
+
+    camera, lights, maps, sampling = lit
+    if args.turntable:
+        frames = turntable(fitted, maps[0], args.frames, camera.width, sampling, progress)
+    else:
+        shown = poses or sway(fitted.strands, args.frames, args.sway)
+        frames = moving(fitted, shown, camera, (lights, maps), sampling, progress)
+    write_animation(out, frames)
+    return {"frames": len(frames)}
+
+
+def _still(
+    args: argparse.Namespace,
+    whose: tuple[FittedModel, Model, Capture | None],
+    strands: Strands | None,
+    lit: tuple[Camera, Sequence[Light], Sequence[Environment], Sampling],
+    progress: Progress,
+) -> tuple[Floats, dict[str, Any]]:
+    """One picture, and what there is to tell of it."""
+    from appearance import render_mixed
+    from appearance.model.interpolated import InterpolationOptions, Pose, all_lights
+
+    fitted, model, capture = whose
+    pose = Pose(fitted, strands)
+    progress("rendering", 0.2)
+    image = render_mixed(fitted.scene(pose.strands), *lit)
+    if capture is None or args.field != "interpolation":
+        return image, {}
+    camera, lights, maps, _ = lit
+    options = InterpolationOptions(guide=args.guide, refine=args.refine)
+    all_lit = camera, all_lights(lights, maps)
+    return _interpolated(image, options, (pose, model, capture), all_lit, progress)
 
 
 def _interpolated(

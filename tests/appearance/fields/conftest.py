@@ -11,8 +11,8 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.anchors import Grid, Places
 from appearance.fields.field import Field
-from appearance.fields.fit import Pictures
 from appearance.fields.hits import HitOptions, find_hits
+from appearance.fields.pictures import Pictures
 from appearance.render.coverage import coverage
 from appearance.render.harmonics import count_of
 from reconstruction import Camera, Light

@@ -18,8 +18,10 @@ from reconstruction import Light
 
 LEVELS = ((2, 3, 3), (4, 6, 6))
 EXACT = FieldOptions(
-    degree=1, levels=LEVELS, ridges=(1e-5, 1e-3, 0.1), tolerance=1e-4, iterations=100
+    degree=1, levels=LEVELS, ridges=(1e-5, 1e-3, 0.1), tolerance=1e-4, iterations=100, folds=2
 )
+ROUGH = replace(EXACT, levels=LEVELS[:1], tolerance=1e-2, iterations=15)
+"""Where the answer does not ask for the minimum."""
 
 
 def fitted(planted, views, options=EXACT, monitor=None):
@@ -34,7 +36,7 @@ def test_a_planted_field_is_found_back(planted, kind):
     found = fitted(planted, views, options)
     for group in ("new lights", "new views", "both new"):
         scores = found.validation[group]
-        assert scores["with"] > scores["without"] + 20, group
+        assert scores["with"] > scores["without"] + 8, group
     far = [replace(x, position=2 * x.position, intensity=4 * x.intensity) for x in views[0].lights]
     for view in views[::2]:
         wanted, have = (f.at(view.hits).lit(view.rendered, far) for f in (truth, found.field))
@@ -116,18 +118,18 @@ def test_conjugate_gradients_and_adam_go_to_the_same_minimum(planted):
 
 def test_a_ridge_without_end_leaves_the_pictures_as_they_are(planted):
     views = planted.views(planted.truth())
-    found = fitted(planted, views, replace(EXACT, ridges=(1e12,)))
+    found = fitted(planted, views, replace(ROUGH, ridges=(1e12,)))
     lit = found.field.at(views[0].hits).lit(views[0].rendered, views[0].lights)
     np.testing.assert_allclose(lit, views[0].rendered, rtol=1e-4, atol=1e-6)
     assert any("strongest ridge" in w for w in found.warnings)
-    none = fitted(planted, views, replace(EXACT, ridges=(1e-20,)))
+    none = fitted(planted, views, replace(ROUGH, ridges=(1e-20,)))
     assert np.isfinite(none.field.values).all()
     assert any("weakest ridge" in w for w in none.warnings)
 
 
 def test_anchors_that_no_camera_sees_are_zero(planted):
     views = planted.views(planted.truth())
-    options = replace(EXACT, levels=((4, 6, 6),))
+    options = replace(ROUGH, levels=((4, 6, 6),), ridges=(1e-3,))
     found = fitted(planted, views, options)
     seen = set()
     for view in views:
@@ -157,28 +159,54 @@ def test_odd_data_give_a_field_or_a_sentence(planted):
             for v in views[:cameras]
         ]
 
-    alone = fitted(planted, cut([3], 1))
+    alone = fitted(planted, cut([3], 1), ROUGH)
     assert np.isfinite(alone.field.values).all()
     assert alone.validation == {}
-    assert any("nothing can be held out" in w for w in alone.warnings)
-    assert set(fitted(planted, cut([3])).validation) == {"new views"}
-    twins = fitted(planted, cut([0, 0, 1, 1, 2, 2, 3, 3]))
+    assert any("nothing can be left out" in w for w in alone.warnings)
+    assert alone.doubts()
+    assert set(fitted(planted, cut([3]), ROUGH).validation) == {"new views"}
+    twins = fitted(planted, cut([0, 0, 1, 1, 2, 2, 3, 3]), ROUGH)
     assert np.isfinite(twins.field.values).all()
     saturated = [replace(v, valid=np.zeros_like(v.valid)) for v in views]
-    assert not fitted(planted, saturated).field.values.any()
+    assert not fitted(planted, saturated, ROUGH).field.values.any()
     # pixels that are black without the field say nothing, and no number is lost over them
     black = [
         replace(v, rendered=np.where(np.arange(16)[:, None, None] < 8, v.rendered, 0))
         for v in views
     ]
-    dark = fitted(planted, black)
+    dark = fitted(planted, black, ROUGH)
     assert np.isfinite(dark.field.values).all()
     assert (dark.field.at(views[0].hits).lit(black[0].rendered, black[0].lights)[8:] == 0).all()
     inside = tuple(Light(x.name, 0.01 * x.position, 1e-4 * x.intensity) for x in views[0].lights)
-    near = fitted(planted, [replace(v, lights=inside) for v in views])
+    near = fitted(planted, [replace(v, lights=inside) for v in views], ROUGH)
     assert np.isfinite(near.field.values).all()
     with pytest.raises(ValueError, match="needs a view"):
-        fitted(planted, [])
+        fitted(planted, [], ROUGH)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_field_is_kept_for_what_is_there_and_not_for_noise(planted, seed):
+    """Frames with noise of 10 %: of a field that is there, and of none."""
+    rng = np.random.default_rng(seed)
+    options = replace(ROUGH, ridges=(1e-3, 1e-2, 0.1, 1.0, 10.0), folds=3)
+    gains = []
+    for there in (True, False):
+        views = planted.views(planted.truth())
+        noisy = []
+        for v in views:
+            frames = v.captured if there else v.rendered
+            noise = 1 + 0.1 * rng.normal(size=frames.shape)
+            noisy.append(replace(v, captured=np.maximum(frames * noise, 0).astype(np.float32)))
+        found = fitted(planted, noisy, options)
+        assert not (there and found.doubts())
+        field = found.field.at(views[0].hits).lit(views[0].rendered, views[0].lights)
+        wanted = views[0].captured if there else views[0].rendered
+        off = [float(((x - wanted) ** 2).mean()) for x in (field, views[0].rendered)]
+        gains.append(off[0] - off[1])
+        if not there:
+            assert found.doubts()
+            assert found.gain[0] < 3 * found.gain[1] + 0.02
+    assert gains[0] < 0
 
 
 def test_saturated_pixels_weigh_nothing(planted):
@@ -188,8 +216,8 @@ def test_saturated_pixels_weigh_nothing(planted):
         bad = np.random.default_rng(0).uniform(size=v.valid.shape) < 0.2
         captured = np.where(bad[..., None], 50.0, v.captured)
         spoilt.append(replace(v, captured=captured.astype(np.float32), valid=~bad))
-    found = fitted(planted, spoilt)
-    assert found.validation["both new"]["with"] > found.validation["both new"]["without"] + 15
+    found = fitted(planted, spoilt, replace(EXACT, iterations=40))
+    assert found.validation["both new"]["with"] > found.validation["both new"]["without"] + 6
 
 
 def test_frames_that_no_factor_explains_are_told(planted):
@@ -198,27 +226,26 @@ def test_frames_that_no_factor_explains_are_told(planted):
     x = np.array([light.position[0] for light in views[0].lights])
     lit = np.where(x > 0, 1, 0)[:, None, None] * np.ones(3)
     half = [replace(v, captured=(v.rendered * lit).astype(np.float32)) for v in views]
-    found = fitted(planted, half, replace(EXACT, degree=2))
+    found = fitted(planted, half, replace(ROUGH, degree=2))
     assert found.clamped > 0.01
     assert any("modulated below black" in w for w in found.warnings)
     assert found.validation["new lights"]["with"] > found.validation["new lights"]["without"]
 
 
 def test_a_fit_that_was_killed_goes_on_behind_the_ridges_it_had_done(planted, tmp_path):
-    views, told = planted.views(planted.truth()), []
+    views = planted.views(planted.truth())
 
     def killed(what, share):
-        told.append(what)
-        if what.startswith("ridge 0.001: held-out"):
+        if what.startswith("ridge 0.001: left-out"):
             raise KeyboardInterrupt
 
-    options = replace(EXACT, ridges=(1e-5, 1e-3, 0.1, 10.0))
+    options = replace(ROUGH, ridges=(1e-5, 1e-3, 0.1, 10.0))
     checkpoint = tmp_path / "field.checkpoint.npz"
     with pytest.raises(KeyboardInterrupt):
         fitted(planted, views, options, Monitor(killed, checkpoint))
     again = []
     found = fitted(planted, views, options, Monitor(lambda w, s: again.append(w), checkpoint))
-    assert not [w for w in again if w.startswith(("ridge 10:", "ridge 0.1:"))]
+    assert not [w for w in again if w.startswith(("ridge 10", "ridge 0.1"))]
     whole = fitted(planted, views, options)
     assert found.errors == whole.errors
     np.testing.assert_array_equal(found.field.values, whole.field.values)

@@ -147,7 +147,7 @@ def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
 
     def worse(*args):
         found = fit(*args)
-        scores = {g: {"without": 30.0, "with": 29.5} for g in ("new lights",)}
+        scores = {"new lights": {"without": 30.0, "with": 29.5, "spread": 0.1}}
         return replace(found, validation=scores)
 
     monkeypatch.setattr(validated, "fit_field", worse)

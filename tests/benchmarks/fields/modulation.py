@@ -19,10 +19,11 @@ from appearance import Exposure, build_scene
 from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.anchors import Grid, Places, nested
 from appearance.fields.basis import ViewBasis
-from appearance.fields.fit import GROUPS, Pictures, fit_pictures
+from appearance.fields.fit import fit_pictures
 from appearance.fields.grams import Gram
 from appearance.fields.hits import HitOptions, find_hits
 from appearance.fields.options import FieldOptions
+from appearance.fields.pictures import Pictures
 from appearance.fields.solver import (
     AdamOptions,
     LeastSquares,
@@ -30,6 +31,7 @@ from appearance.fields.solver import (
     adam,
     conjugate_gradients,
 )
+from appearance.fields.validation import GROUPS
 from appearance.metrics.scores import srgb
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat, render_olat_parts
@@ -53,8 +55,8 @@ FIELDS = {
     ),
     "additive (GroomLight's), degree 3": FieldOptions("additive", degree=3, iterations=12),
     "modulation, degree 0": FieldOptions(degree=0),
-    "modulation, degree 1": FieldOptions(degree=1),
-    "modulation, degree 2": FieldOptions(),
+    "modulation, degree 1": FieldOptions(),
+    "modulation, degree 2": FieldOptions(degree=2),
 }
 SIZES = {"full": STAGE, "quick": SmallStage(12, cameras=4, lights=8, spp=16, max_depth=3)}
 
@@ -207,8 +209,8 @@ def rows_of(
             "cpu_seconds": seconds,
             "ridge": found.ridge,
             "clamped": found.clamped,
-            "kept": bool(found.validation)
-            and all(v["with"] >= v["without"] for v in found.validation.values()),
+            "kept": not found.doubts(),
+            "validation": found.validation,
             "warnings": found.warnings,
         }
     return rows

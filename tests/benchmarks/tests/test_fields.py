@@ -7,7 +7,7 @@ from benchmarks.fields.modulation import FIELDS, SIZES, frames_of, rows_of, solv
 from benchmarks.subjects import Subject
 
 from appearance import HairAppearance
-from appearance.fields.fit import GROUPS
+from appearance.fields.validation import GROUPS
 from reconstruction import silent
 
 
