@@ -43,7 +43,8 @@ export function open(view) {
 
   let steps = null; // of the capture that is shown
   let stepsOf = null;
-  const lacking = () => new Set((steps ?? []).filter((s) => (!busy() && s.lacks.length && s.index < S.capture.step) || S.missing.some((x) => !x.shot_again && x.step === s.index)).map((s) => s.light).filter(Boolean));
+  let stepsAtEnd = false; // whether they were asked for when it was over
+  const lacking = () => new Set((steps ?? []).filter((s) => (stepsAtEnd && !busy() && s.lacks.length && s.index < S.capture.step) || S.missing.some((x) => !x.shot_again && x.step === s.index)).map((s) => s.light).filter(Boolean));
 
   async function steer(action) {
     await ask(`POST /captures/${S.capture.id}/${action}`, action === "resume" ? {} : undefined);
@@ -66,10 +67,11 @@ export function open(view) {
       picture.show({});
       return;
     }
-    if (stepsOf !== c.id && S.connected) {
-      stepsOf = c.id;
-      steps = null;
-      get(`/captures/${c.id}/steps`).then((list) => { steps = list; update(); }).catch(() => { stepsOf = null; });
+    const of = `${c.id} ${busy()}`; // once more at its end: then it is known what each step lacks
+    if (stepsOf !== of && S.connected) {
+      stepsOf = of;
+      if (steps?.of !== c.id) steps = null;
+      get(`/captures/${c.id}/steps`).then((list) => { if (stepsOf === of) { steps = list; steps.of = c.id; stepsAtEnd = !busy(); update(); } }).catch(() => { stepsOf = null; });
     }
     headline(c);
     meter.hidden = false;
@@ -106,7 +108,7 @@ export function open(view) {
     const dark = S.health?.lamps === "dark";
     say(word, S.health?.latch ? "UNSAFE" : dark ? "Dark, verified" : "Not known to be dark");
     const how = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" }[c.outcome];
-    say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error ? ` ${c.error}` : ""}`);
+    say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`);
   }
 
   const lamps = () => ["Lamps", h(S.health?.lamps === "unknown, unsafe" ? "b.bad" : "span", { title: S.health?.lamps_detail }, S.health?.lamps === "dark" ? "dark, verified" : S.health?.lamps ?? "–")];
