@@ -235,6 +235,30 @@ def test_frames_are_those_of_the_capture(http, tmp_path):
     assert http.get(f"/captures/{done['id']}/frames/0/cam_1.exr").status_code == 200
 
 
+def test_what_a_page_shows_of_a_capture(http, rig_file):
+    done = capture_done(http, {"plan": SHORT})
+    frames = f"/captures/{done['id']}/frames"
+    steps = http.get(f"/captures/{done['id']}/steps").json()
+    assert [s["light"] for s in steps if s["kind"] == "olat"] == SHORT["lights"]
+    assert all(s["lacks"] == [] for s in steps)
+    (step,) = [s["index"] for s in steps if s["light"] == "light_003"]
+    figures = http.get(f"{frames}/{step}/cam_0.json").json()
+    exact, _ = read_exr(Path(done["path"]) / f"frames/{step:05d}/cam_0.exr")
+    assert figures["largest"] == pytest.approx(float(exact.max()))
+    assert (figures["width"], figures["height"]) == (exact.shape[1], exact.shape[0]) == (8, 6)
+    assert sum(figures["histogram"]) == exact.size
+    assert figures["saturated"] == 0
+    white = {"white": 2 * figures["largest"], "size": 8}
+    png = np.frombuffer(http.get(f"{frames}/{step}/cam_0.png", params=white).content, np.uint8)
+    brightest = cv2.imdecode(png, cv2.IMREAD_COLOR).max()
+    assert brightest == round(255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055)), "half of white, in sRGB"
+    rig = http.get("/rig").json()
+    assert [x["name"] for x in rig["lights"]] == [x.name for x in rig_file.rig.lights]
+    camera = rig_file.rig.cameras[0]
+    ahead = camera.rays([[(camera.width - 1) / 2, (camera.height - 1) / 2]])[0]
+    assert rig["cameras"][0]["towards"] == pytest.approx(ahead.tolist(), abs=1e-6)
+
+
 def read_events(http: httpx.Client, count: int, headers: dict[str, str]) -> list[dict[str, Any]]:
     """The first `count` events of the stream, each checked against its frame."""
     events: list[dict[str, Any]] = []
