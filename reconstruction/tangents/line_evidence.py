@@ -17,6 +17,10 @@ NEARLY_PARALLEL = 0.1
 """`spread` under which a line may turn freely within the planes: they cross at some ten degrees."""
 
 
+FINER = 8
+"""Angles at which support is looked up between two of the bank: 0.9 degrees for 24 filters."""
+
+
 def half_sphere(count: int) -> Array:
     """`count` nearly evenly spaced unit vectors `(N, 3)` of the half sphere z >= 0."""
     if count < 1:
@@ -59,6 +63,20 @@ def seen_by(evidence: LineEvidence, points: AnyFloats, tolerance: float) -> Bool
     return np.asarray(on & evidence.mask[y, x] & (there > 0) & (depth <= there + tolerance))
 
 
+def finer(support: AnyFloats) -> Floats:
+    """Support `(N, 8 K)` at eight times as many angles as `support (N, K)`, by Fourier's series.
+
+    A bank's answer is smooth in the angle and has a period of half a turn: the peak between two
+    bins comes out where it is.
+    """
+    count = support.shape[1]
+    series = np.fft.rfft(support, axis=1)
+    if count % 2 == 0:
+        series[:, -1] /= 2  # the highest frequency stands for itself and its mirror
+    many = np.fft.irfft(series, FINER * count, axis=1)
+    return np.asarray(FINER * many, np.float32)
+
+
 def line_scores(
     evidence: LineEvidence, points: AnyFloats, candidates: Array, seen: Bools
 ) -> Floats:
@@ -66,6 +84,7 @@ def line_scores(
 
     A candidate is looked up at the angle of its projection and weighted by the squared sine of
     its angle to the viewing ray: a line along the ray is a dot that no texture speaks about.
+    Between the bank's angles support runs as its Fourier series does.
     Points that are not `seen (N,)` get 0.
     """
     camera = evidence.camera
@@ -83,11 +102,11 @@ def line_scores(
     flow = t[None, :, :2] - slope[:, :, None].transpose(0, 2, 1).astype(np.float32) * t[None, :, 2:]
     u = camera.K[0, 0] * flow[..., 0] + camera.K[0, 1] * flow[..., 1]
     v = camera.K[1, 1] * flow[..., 1]
-    angle = np.arctan2(v, u)
-    count = len(evidence.support)
-    bins = np.rint(angle * (count / np.pi)).astype(np.int64) % count
+    support = finer(evidence.support[:, y, x].T)
+    count = support.shape[1]
+    bins = np.rint(np.arctan2(v, u) * (count / np.pi)).astype(np.int64) % count
     sine2 = 1 - (rays.astype(np.float32) @ candidates.T.astype(np.float32)) ** 2
-    out[which] = sine2 * evidence.support[bins, y[:, None], x[:, None]]
+    out[which] = sine2 * np.take_along_axis(support, bins, axis=1)
     return out
 
 

@@ -11,6 +11,7 @@ from reconstruction.tangents.line_evidence import (
     LineEvidence,
     Tangents,
     decide,
+    finer,
     half_sphere,
     line_scores,
     line_support,
@@ -69,6 +70,18 @@ def test_cameras_fix_a_direction(direction: tuple[float, float, float]) -> None:
     found = decide(scores, candidates)
     assert degrees_between(found.directions[0], t) < 6  # the support is 13 degrees wide
     assert found.confidence[0] > 0.5
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.2, 0.37, 0.5])
+@pytest.mark.parametrize("count", [11, 24])
+def test_peaks_between_two_angles_of_the_bank_are_found(count: int, offset: float) -> None:
+    true = (5 + offset) * np.pi / count
+    away = np.cos(2 * (np.arange(count) * np.pi / count - true))
+    fine = finer(np.exp(2 * away)[None])[0]
+    peak = fine.argmax() * np.pi / len(fine)
+    assert np.degrees(abs(peak - true)) <= 90 / len(fine) + 1e-6  # half of its own spacing
+    at = np.cos(2 * (np.arange(len(fine)) * np.pi / len(fine) - true))
+    np.testing.assert_allclose(fine, np.exp(2 * at), atol=0.01)
 
 
 def test_one_camera_leaves_a_plane() -> None:
