@@ -132,13 +132,26 @@ def _storage(path: Path) -> dict[str, Any]:
     return data
 
 
+def _matrix(node: Any) -> Any:
+    """A matrix from its numbers: OpenCV's own reader ends the process where they are too few."""
+    keys = node.keys()
+    sizes = _node(node.getNode("sizes"), 8) if "sizes" in keys else None
+    shape = sizes or [node.getNode(k).real() for k in ("rows", "cols")]
+    data = node.getNode("data")
+    values = [data.at(i).real() for i in range(data.size())] if data.isSeq() else []
+    whole = [int(n) for n in shape if isinstance(n, float) and 0 < n <= len(values)]
+    if len(whole) != len(shape) or np.prod(whole) != len(values):
+        return None
+    return np.array(values).reshape(whole)
+
+
 def _node(node: Any, depth: int = 0) -> Any:
-    if depth > 8:
+    if depth > 9:
         return None
     if node.isMap():
         keys = node.keys()
         if "data" in keys and ("rows" in keys or "sizes" in keys):
-            return node.mat()
+            return _matrix(node)
         return {k: _node(node.getNode(k), depth + 1) for k in keys}
     if node.isSeq():
         return [_node(node.at(i), depth + 1) for i in range(node.size())]

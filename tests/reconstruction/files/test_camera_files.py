@@ -153,6 +153,10 @@ def test_what_opencv_did_not_write_is_refused(tmp_path: Path) -> None:
         ("not: [yaml", "OpenCV cannot read it"),
         ("%YAML:1.0\n---\nwidth: 3\n", "has one of K, camera_matrix"),
         ('%YAML:1.0\n---\nK: "text"\n', "K must be .* finite numbers"),
+        (
+            "%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [1, 2]\n",
+            "K must be .* finite numbers",
+        ),
     ):
         path.write_text(text)
         with pytest.raises(CameraFileError, match=words):
