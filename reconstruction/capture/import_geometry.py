@@ -49,12 +49,17 @@ class GeometryFiles:
 
 
 def read_geometry(files: GeometryFiles) -> Geometry:
-    """Read, place and check; without cameras nothing is checked.
+    """Read, place and check; nothing where neither is named.
 
     Raises `ValueError` that says what is wrong and which option or file would mend it.
     """
     cameras: list[Camera] = []
     notes: list[str] = []
+    if files.cameras is None and files.lights is not None:
+        raise PlacementError(
+            "--lights goes with --cameras, which they are held against; beside cameras.json lights "
+            "are in the folder's lights.json"
+        )
     if files.cameras is not None:
         read = read_cameras(files.cameras)
         cameras = placed(read.cameras, files.placement, read.axes)

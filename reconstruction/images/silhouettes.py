@@ -85,10 +85,13 @@ def lit_rgb(capture: Capture, camera: str) -> Floats:
 
 
 def silhouette(capture: Capture, camera: str) -> Bools:
-    """Pixels `(H, W)` where the subject adds light: above the noise, specks removed, holes filled.
+    """Pixels `(H, W)` of the subject: as the capture has it told from the background, else where it
+    adds light: above the noise, specks removed, holes filled.
 
     Raises `NoSilhouette` where the camera has no frame to tell from.
     """
+    if (told := capture.subject(camera)) is not None:
+        return told
     if camera in capture.lenses:  # resampled, the faintest light spreads by a pixel
         return capture.mask_in_view(camera, silhouette(capture.view(undistorted=False), camera))
     image = lit_image(capture, camera)

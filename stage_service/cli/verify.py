@@ -126,7 +126,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
         return Import.of(args.folder, take.geometry, settings, found), take.geometry.notes
     asked = {f: getattr(args, f) for f in ("cameras", "lights", "light_distance")}
     named = parse_options(GeometryFiles, {**asked, "placement": given}, "import")
-    geometry = read_geometry(named) if args.cameras else None
+    geometry = read_geometry(named) if args.cameras or args.lights else None
     settings = settings_of(args.folder, args.settings)
     if args.pictures is not None:
         patterns = replace(settings.pictures, olat=args.pictures)

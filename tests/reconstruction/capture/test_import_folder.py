@@ -14,7 +14,7 @@ import pytest
 from reconstruction import Capture, CaptureError, import_folder, read_exr, verify, write_exr
 from reconstruction.capture.import_folder import ImportProblem
 from reconstruction.capture.import_geometry import GeometryFiles, read_geometry
-from reconstruction.geometry.placement import PlacementOptions
+from reconstruction.geometry.placement import PlacementError, PlacementOptions
 
 CAMERAS = ("cam_00", "left")
 LIGHTS = ("light_00", "light_07")
@@ -228,3 +228,8 @@ def test_a_capture_rendered_by_cycles(shared_data: Callable[[str], Path], tmp_pa
         assert mask is not None
         assert 0.1 < mask.mean() < 0.6
     assert verify(tmp_path / "out") == []
+
+
+def test_lights_without_cameras_are_not_left_unread(folder: Path) -> None:
+    with pytest.raises(PlacementError, match="--lights goes with --cameras"):
+        read_geometry(GeometryFiles(lights=folder / "lights.json"))

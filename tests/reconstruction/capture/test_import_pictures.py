@@ -17,6 +17,7 @@ from reconstruction import Capture, import_folder, verify
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
+from reconstruction.images.silhouettes import silhouette
 
 SIZE = 24  # pixels on a side
 CAMERAS, LIGHTS = ("left", "right"), ("light_000", "light_001", "light_002")
@@ -177,13 +178,12 @@ def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
             for name, image in (("plate", wall), ("olat", shot)):
                 noisy = image + rng.normal(0, 2e-4, image.shape)
                 save(folder / name / camera / f"{n}.png", noisy.astype(np.float32), np.uint16)
-    settings(
-        folder,
-        'pictures.olat = "olat/{camera}/{light}.png"\n'
-        'pictures.clean_plate = "plate/{camera}/{light}.png"',
-    )
+    olat = 'pictures.olat = "olat/{camera}/{light}.png"\n'
+    settings(folder, olat)
+    assert silhouette(import_folder(folder, tmp_path / "walled"), "left").all()
+    settings(folder, olat + 'pictures.clean_plate = "plate/{camera}/{light}.png"')
     capture = import_folder(folder, tmp_path / "out")
-    np.testing.assert_array_equal(capture.subject("left"), inside)
+    np.testing.assert_array_equal(silhouette(capture, "left"), inside)
     image, _ = capture.light("light_002", "left")
     assert abs(image[~inside].mean()) < 1e-3
     np.testing.assert_allclose(image[inside], 0.6, atol=2e-3)
