@@ -63,9 +63,9 @@ def merge(pictures: Mapping[float, Picture], scale: float = 1.0) -> Merged:
         step = np.maximum(np.float32(picture.quantum), np.float32(1e-6))
         variance = step**2 / 12 + np.maximum(about, 0) * np.float32(s / FULL_WELL)
         weight = np.float32(s) ** 2 / variance * ~picture.saturated[..., None]
-        total += weight * picture.light / np.float32(s)
+        total += weight * (picture.light / np.float32(s) - about)  # exact for one exposure
         weights += weight
-    radiance = np.where(weights > 0, total / np.maximum(weights, 1e-30), about) * np.float32(scale)
+    radiance = (about + total / np.maximum(weights, 1e-30)) * np.float32(scale)
     deviation = np.where(weights > 0, np.maximum(weights, 1e-30) ** -0.5, np.inf) * scale
     same = [np.ndim(p.quantum) == 0 for p in pictures.values()]
     quantum = float(pictures[seconds[-1]].quantum) / seconds[-1] * scale if all(same) else 0.0

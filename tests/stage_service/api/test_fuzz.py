@@ -22,7 +22,7 @@ schemathesis = pytest.importorskip("schemathesis", reason="pip install 'hairstag
 openapi_checks = pytest.importorskip("schemathesis.specs.openapi.checks")
 
 
-@schemathesis.serializer("model/obj", "application/octet-stream")  # type: ignore[misc, unused-ignore]
+@schemathesis.serializer("model/obj", "image/x-exr", "application/octet-stream")  # type: ignore[misc, unused-ignore]
 def as_it_is(context: Any, value: Any) -> bytes:
     return value if isinstance(value, bytes) else str(value).encode()
 
