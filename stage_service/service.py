@@ -18,6 +18,7 @@ from reconstruction.containment import inside, is_file_name, plain_file
 from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.catalogue import UnknownCapture
 from stage_service.acquisition.control import Caller, Control
+from stage_service.acquisition.snapshots import SNAPSHOT, one_step
 from stage_service.acquisition.states import CaptureStatus, Outcome
 from stage_service.config import RigFile
 from stage_service.jobs.follower import JobFollower
@@ -46,6 +47,7 @@ from stage_service.service_models import (
     QueueRequest,
     RenewRequest,
     RigView,
+    SnapshotRequest,
     StepView,
 )
 from stage_service.storage import Removed, Storage
@@ -245,6 +247,13 @@ class Service:
         end = max(0, len(known) - offset)
         return [self._view(status) for status in known[max(0, end - limit) : end]]
 
+    def snapshot(self, request: SnapshotRequest, by: Caller) -> CaptureView:
+        """Begin one exposure to look at: the capture "snapshot", which the next one replaces.
+        Raises `PlanError`, `Busy`, `Unsafe`, `Leased`."""
+        plan = one_step(self.rig_file, request.light, request.exposure, request.level)
+        work, detail = partial(self._captures.snapshot, plan), request.light or "all lights"
+        return self._view(self._control.do(by, "snapshot", work, SNAPSHOT, detail=detail))
+
     def pause(self, capture_id: str, by: Caller) -> CaptureView:
         """Pause at the next step boundary. Raises `UnknownCapture`, `WrongState`, `Leased`."""
         work = partial(self._captures.pause, capture_id)
@@ -362,6 +371,8 @@ class Service:
         return self._control.do(by, "job.submit", work, job, detail=what, steers=False)
 
     def _submit(self, job: str, request: JobRequest) -> Job:
+        if request.capture == SNAPSHOT:
+            raise BadInput("capture: a snapshot is kept until the next one only: shoot a capture")
         path = self.capture_path(request.capture)
         capture = Capture(path)
         if capture.manifest is None:

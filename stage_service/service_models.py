@@ -14,7 +14,7 @@ from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.capture_queue import Entry
 from stage_service.acquisition.latch import Latched
 from stage_service.acquisition.states import CaptureStatus
-from stage_service.config import CaptureDefaults, RigFile, Strict
+from stage_service.config import CaptureDefaults, Exposure, Level, RigFile, Strict
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 
@@ -61,6 +61,15 @@ class QueueRequest(_Wanted):
     )
 
     place: Place | None = None
+
+
+class SnapshotRequest(Strict):
+    """One exposure to look at: in a light of this name, or in all; seconds and level, the rig
+    file's where they are not given."""
+
+    light: Annotated[str, Field(max_length=LONGEST_NAME)] | None = None
+    exposure: Exposure | None = None
+    level: Level | None = None
 
 
 class MoveRequest(Strict):

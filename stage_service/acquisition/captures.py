@@ -6,7 +6,8 @@ import logging
 import secrets
 import shutil
 import threading
-from collections import Counter
+import time
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cached_property
@@ -21,6 +22,7 @@ from stage_service.acquisition.capture_run import CaptureRun, plan_of
 from stage_service.acquisition.catalogue import Catalogue
 from stage_service.acquisition.latch import Latch, Unsafe
 from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
+from stage_service.acquisition.snapshots import APART_S, SNAPSHOT
 from stage_service.acquisition.states import (
     OUTCOMES,
     CaptureStatus,
@@ -110,6 +112,8 @@ class CaptureManager:
             "frames": Counter(written=0, missing=0, again=0),
             "device_faults": Counter(),
         }
+        self._by_device: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._looked = -APART_S
         self._stay_on_exit = off_on_exit(self.close)
 
     @cached_property
@@ -165,6 +169,24 @@ class CaptureManager:
         self._launch(capture_id, make, unless_dark_since)
         return capture_id
 
+    def snapshot(self, plan: ResolvedPlan) -> CaptureStatus:
+        """Shoot the plan as the capture `SNAPSHOT`, in place of the last one; it is in no list, and
+        nothing follows it. Raises `Busy`, `Unsafe`."""
+        folder = self.folder.parent / SNAPSHOT
+        cost = plan.cost.model_dump(mode="json")
+        told = {"steps": list(plan.steps), "cost": cost, "started": utc_now()}
+
+        def make() -> CaptureRun:
+            time.sleep(max(0.0, self._looked + APART_S - time.monotonic()))
+            self._looked = time.monotonic()
+            self.catalogue.take(SNAPSHOT)
+            shutil.rmtree(folder, ignore_errors=True)
+            writer = CaptureWriter.create(folder, self.rig_file.rig, told)
+            return self._run_of(SNAPSHOT, plan, self._devices, writer, None)
+
+        self._launch(SNAPSHOT, make)
+        return self.get(SNAPSHOT)
+
     def _continue(self, capture_id: str, armed_by: str | None) -> None:
         """Shoot what a capture lacks that is done and did not complete."""
         done = self.get(capture_id)
@@ -216,7 +238,8 @@ class CaptureManager:
         except BaseException:
             if run is not None:
                 run.give_up()
-                self.catalogue.adopt(capture_id)
+                if capture_id != SNAPSHOT:
+                    self.catalogue.adopt(capture_id)
             raise
         finally:
             with self._lock:
@@ -253,6 +276,14 @@ class CaptureManager:
                 frames.update(self._running.frames())
             return {**{k: dict(v) for k, v in self._counts.items()}, "frames": dict(frames)}
 
+    def _since_start(self, device: str) -> dict[str, int]:
+        with self._lock:
+            counts = Counter(timeouts=0, faults=0)
+            counts.update(self._by_device[device])
+            if self._running is not None:
+                counts.update(dict(self._running.sequencer.by_device.get(device, {})))
+            return dict(counts)
+
     def devices_seen(self) -> dict[str, str]:
         """Each device's state when it was last asked, by kind or a camera's name; asks nobody."""
         if self.rig_file.devices is None:
@@ -276,7 +307,7 @@ class CaptureManager:
             known = self.catalogue.list()
             if self._running is not None:
                 known.append(_not_yet_over(self._running.status()))
-            return sorted(known, key=lambda c: c.id)
+            return sorted((c for c in known if c.id != SNAPSHOT), key=lambda c: c.id)
 
     def path(self, capture_id: str) -> Path:
         """The capture's folder. Raises `UnknownCapture`."""
@@ -332,9 +363,18 @@ class CaptureManager:
         """Per device kind: {"state": "ok" | "unreachable" | "in use", "error"?: str, figures};
         under "cameras" one such table per camera. They are asked anew, but not waited for: "age_s"
         is how old the answer is. "safety" has the state after the last blackout, and whether it is
-        latched."""
-        seen = {"age_s": None} if self.rig_file.devices is None else self._seen.get()
-        return {**seen, "safety": self.safety()}
+        latched. "since_start" counts what a device did to captures since the service started:
+        "faults" and "timeouts" ended one; a camera "missed" frames, and was "late" with some."""
+        no_stage = self.rig_file.devices is None
+        seen: dict[str, Any] = {"age_s": None} if no_stage else self._seen.get()
+        cameras = {
+            name: {**entry, "since_start": self._since_start(name)}
+            for name, entry in seen.get("cameras", {}).items()
+        }
+        for kind, entry in seen.items():
+            if isinstance(entry, dict) and "name" in entry:
+                seen[kind] = {**entry, "since_start": self._since_start(entry["name"])}
+        return {**seen, **({"cameras": cameras} if cameras else {}), "safety": self.safety()}
 
     def waits_for(self) -> str | None:
         """What keeps a capture from beginning that nobody stands by; None: nothing does."""
@@ -471,8 +511,10 @@ class CaptureManager:
             self._learn(run.sequencer.blackout)
         status = run.status()
         result = status.outcome or status.state
-        self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
-        if status.outcome == "completed" and self._on_complete is not None:
+        kept = run.id != SNAPSHOT
+        if kept or result != "completed":
+            self.audit.record(SERVICE, "capture.end", run.id, result, status.error or "")
+        if kept and status.outcome == "completed" and self._on_complete is not None:
             # Before anybody sees the capture as done: its job is named from then on.
             try:
                 self._on_complete(status)
@@ -481,10 +523,14 @@ class CaptureManager:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
         with self._lock:
-            self._counts["captures"][result] += 1
-            self._counts["frames"].update(run.frames())
+            if kept:
+                self._counts["captures"][result] += 1
+                self._counts["frames"].update(run.frames())
             self._counts["device_faults"].update(run.sequencer.faults)
-            self.ended = status
+            for device, counts in run.sequencer.by_device.items():
+                self._by_device[device].update(counts)
+            if kept or result != "completed":
+                self.ended = status
             self.catalogue.put(status)
             self._running = None
         self.events.publish("capture.over", {"id": run.id, "outcome": result})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -22,7 +22,7 @@ from stage_service.acquisition.timings import Timings
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import CameraDevice, Frame
 from stage_service.devices.device_set import DeviceSet
-from stage_service.devices.errors import Cancelled, DeviceError, IndexShift
+from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.plan.resolved import ResolvedPlan
 from stage_service.plan.stepping import SHORTEST_RUN
@@ -69,6 +69,9 @@ class Sequencer:
         self.devices = devices
         self.error: str | None = None
         self.faults: list[str] = []  # the names of devices that failed
+        self.by_device: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        for camera in devices.cameras:
+            self.by_device[camera.name].update(frames=0, missed=0, late=0)
         self.blackout: Blackout | None = None
         self.steps_done = 0
         shot = Counter(camera for (_, camera), r in writer.records.items() if r.file is not None)
@@ -342,11 +345,14 @@ class Sequencer:
         with self._timings.on("storage"):
             frames.put(shot)
         self._unchecked[shot.camera].append(shot.step)
+        self.by_device[shot.camera]["frames"] += 1
 
     def _tell_missing(self, step: Step, cameras: set[str], attempt: int) -> None:
         if cameras:
             lost = {"step": step.index, "cameras": sorted(cameras), "attempt": attempt}
             again = attempt < self._retries
+            for camera in cameras:
+                self.by_device[camera]["missed"] += 1
             self.progress.again += len(cameras) * again
             self._notify("capture.frame_missing", {**lost, "shot_again": again})
 
@@ -378,6 +384,7 @@ class Sequencer:
         try:
             while (frame := camera.read(self._cancel)) is not None:
                 self._accounts[camera.name].late(frame.block_id)
+                self.by_device[camera.name]["late"] += 1
         except IndexShift:
             self._withdrawn[camera.name] = self._unchecked[camera.name]
             raise
@@ -415,7 +422,11 @@ class Sequencer:
 
     def _fail(self, error: BaseException) -> None:
         all_of = error.exceptions if isinstance(error, BaseExceptionGroup) else (error,)
-        self.faults += [e.device for e in all_of if isinstance(e, DeviceError)]
+        for failed in (e for e in all_of if isinstance(e, DeviceError)):
+            self.faults.append(failed.device)
+            theirs = (c.name for c in self.devices.cameras if f" {c.name} " in f" {failed.device} ")
+            counts = self.by_device[next(theirs, failed.device)]
+            counts["timeouts" if isinstance(failed, DeviceTimeout) else "faults"] += 1
         text = str(error) or type(error).__name__
         self.error = text if self.error is None else f"{self.error}; {text}"
         self._move("fail")

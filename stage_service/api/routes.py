@@ -26,6 +26,7 @@ from stage_service.service_models import (
     JobRequest,
     ResumeRequest,
     RigView,
+    SnapshotRequest,
     StepView,
 )
 from stage_service.watching import text_of
@@ -48,6 +49,13 @@ def start_capture(
     view = service.start_capture(body, by)
     response.headers["Location"] = f"/captures/{view.id}"
     return view
+
+
+@router.post("/snapshot", status_code=status.HTTP_202_ACCEPTED, tags=["captures"])
+def take_snapshot(body: SnapshotRequest, service: OnService, by: Steers) -> CaptureView:
+    """Begin one exposure to look at. It is the capture "snapshot" until the next one, in no list
+    of captures, and can be asked for its frames like any."""
+    return service.snapshot(body, by)
 
 
 @reading.get("/captures", tags=["captures"])

@@ -2,7 +2,8 @@
 
 import { attempt, notice } from "./acts.js";
 import { ask, get } from "./ask.js";
-import { button, clock, h, keyed, number, percent, say, seconds, svg } from "./dom.js";
+import { button, clock, h, keyed, number, say, seconds } from "./dom.js";
+import { pictures } from "./pictures.js";
 import { S, events } from "./state.js";
 
 const PAGE = 50;
@@ -77,13 +78,12 @@ function captureOf(view, id) {
   const figures = h("input", { type: "checkbox", onchange: show });
   const play = button("film", toggleFilm, { kind: "quiet" });
   const grid = h(".grid");
-  const cells = new Map();
+  const shown = pictures(grid, controller.signal);
   let chosen = [];
   view.replaceChildren(title, facts, acts,
     h(".scrub", h(".line", kinds, play), slider, where),
     h(".line", h("label.check", same, h("span", "one exposure for all lights")), h("label.check", marked, h("span", "mark what is saturated")), h("label.check", figures, h("span", "histogram, focus"))),
     grid);
-  grid.style.setProperty("--cell", S.rig.cameras.length > 12 ? "10rem" : "14rem");
 
   async function load() {
     try {
@@ -126,7 +126,7 @@ function captureOf(view, id) {
     if (film) return stopFilm();
     say(play, "stop");
     film = setInterval(() => {
-      if ([...cells.values()].some((cell) => cell.busy)) return; // no faster than pictures come
+      if (shown.busy) return; // no faster than pictures come
       slider.value = (Number(slider.value) + 1) % chosen.length;
       show();
     }, FILM_MS);
@@ -147,7 +147,10 @@ function captureOf(view, id) {
     say(where, `${words(step)} · step ${step.index}${step.exposure ? ` · ${seconds(step.exposure)}` : ""}`);
     slider.setAttribute("aria-valuetext", words(step));
     if (same.checked && white === null) await exposure();
-    for (const camera of S.rig.cameras) cellOf(camera).show(step);
+    shown.show((camera) => `/captures/${id}/frames/${step.index}/${camera}`, {
+      words: words(step), lacks: step.lacks, figures: figures.checked,
+      query: [marked.checked ? "mark=true" : "", same.checked && white ? `white=${white}` : ""].filter(Boolean),
+    });
   }
 
   /** What is white in all of them: the brightest of a few frames, of one camera. */
@@ -156,47 +159,6 @@ function captureOf(view, id) {
     const some = [0.1, 0.3, 0.5, 0.7, 0.9].map((at) => chosen[Math.floor(at * chosen.length)]);
     const found = await Promise.all(some.map((s) => get(`/captures/${id}/frames/${s.index}/${S.rig.cameras[0].name}.json`, { signal: controller.signal }).catch(() => null)));
     white = Math.max(0, ...found.filter(Boolean).map((f) => f.white));
-  }
-
-  function cellOf(camera) {
-    if (cells.has(camera.name)) return cells.get(camera.name);
-    const image = h("img", { alt: "", width: camera.width, height: camera.height });
-    const text = h("figcaption", camera.name);
-    const plot = svg("svg", { class: "histogram", viewBox: "0 0 64 20", preserveAspectRatio: "none", "aria-hidden": "true" });
-    const figure = h(`figure${camera.width < 320 ? ".pixels" : ""}`, image, text);
-    grid.append(figure);
-    const cell = {
-      busy: false, next: null,
-      show(step) {
-        cell.next = step;
-        if (step.lacks.includes(camera.name)) {
-          image.removeAttribute("src");
-          say(text, `${camera.name}: no frame`);
-          return;
-        }
-        if (cell.busy) return; // the newest that was asked for comes next
-        cell.busy = true;
-        const done = () => { cell.busy = false; if (cell.next !== step) cell.show(cell.next); };
-        const options = [`size=${Math.min(Math.max(camera.width, camera.height), 480)}`, marked.checked ? "mark=true" : "", same.checked && white ? `white=${white}` : ""].filter(Boolean).join("&");
-        image.onload = done;
-        image.onerror = () => { say(text, `${camera.name}: no frame`); done(); };
-        image.alt = `${camera.name}, ${words(step)}`;
-        image.src = `/captures/${id}/frames/${step.index}/${camera.name}.png?${options}`;
-        say(text, camera.name);
-        if (figures.checked) cell.tell(step);
-        else plot.remove();
-      },
-      async tell(step) {
-        const f = await get(`/captures/${id}/frames/${step.index}/${camera.name}.json`, { signal: controller.signal }).catch(() => null);
-        if (!f || cell.next !== step) return;
-        const top = Math.log1p(Math.max(...f.histogram));
-        plot.replaceChildren(...f.histogram.map((n, i) => svg("path", { class: i === 63 && f.saturated ? "full" : "", d: `M${i} 20V${(20 - (19 * Math.log1p(n)) / (top || 1)).toFixed(2)}h.9V20z` })));
-        if (!plot.parentNode) figure.append(plot);
-        say(text, `${camera.name} · saturated ${percent(f.saturated)} · focus ${number(f.focus)} · 99.5 % at ${number(f.white)}`);
-      },
-    };
-    cells.set(camera.name, cell);
-    return cell;
   }
 
   load();

@@ -7,11 +7,12 @@ import { S, begin, busy, changed, load, mine, onChange, releaseLease, takeLease 
 import { blackScreen } from "./black.js";
 import * as now from "./now.js";
 import * as plan from "./plan.js";
+import * as cameras from "./cameras.js";
 import * as frames from "./frames.js";
 import * as stage from "./stage.js";
 import * as jobs from "./jobs.js";
 
-const VIEWS = { now: ["Now", now], plan: ["Plan", plan], frames: ["Frames", frames], stage: ["Stage", stage], jobs: ["Jobs", jobs] };
+const VIEWS = { now: ["Now", now], plan: ["Plan", plan], cameras: ["Cameras", cameras], frames: ["Frames", frames], stage: ["Stage", stage], jobs: ["Jobs", jobs] };
 const STATES = {
   idle: "starting", running: "shooting", pausing: "pausing …", paused: "paused", aborting: "aborting …",
   finishing: "finishing …",

@@ -160,8 +160,12 @@ export function open(view) {
     keyed(line, q.waiting, (x) => x.id, (x) => {
       const go = steering("start now", () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: prompt("Who at the stage answers for the flashes?") } : undefined), { kind: "quiet" });
       const up = steering("first", () => ask(`PATCH /queue/${x.id}`, { place: 0 }), { kind: "quiet" });
+      const at = () => S.queue.waiting.findIndex((y) => y.id === x.id);
+      const place = (text, by, more) => steering(text, () => ask(`PATCH /queue/${x.id}`, { place: at() + by }), { kind: "quiet", ready: () => S.queue.waiting[at() + by] !== undefined, ...more });
+      const sooner = place("↑", -1, { "aria-label": "sooner" });
+      const later = place("↓", 1, { "aria-label": "later" });
       const out = steering("remove", () => ask(`DELETE /queue/${x.id}`), { kind: "quiet" });
-      const parts = [go, up, out];
+      const parts = [go, up, sooner, later, out];
       return { element: h("li", h("span", planWords(x.request.plan), h("small", ` by ${x.by}, ${clock(x.added)}${x.needs_arming ? " · flashes: start it at the stage" : ""}`)), parts.map((b) => b.element)), tell: () => parts.forEach((b) => b.update()) };
     });
   }

@@ -37,7 +37,8 @@ export function open(view) {
         element.className = `device ${d.state === "unreachable" ? "unreachable" : d.state === "ok" ? "" : "asked"}`;
         say(name, kind);
         say(state, h(d.state === "unreachable" ? "b.bad" : "span", d.state), d.error ? ` ${d.error}` : "");
-        say(figures, ...Object.entries(d).filter(([k]) => !["name", "state", "error"].includes(k)).map(([k, v]) => h("div", h("dt", words(k)), h("dd", Array.isArray(v) ? v.map((x) => (typeof x === "object" ? JSON.stringify(x) : x)).join(", ") : String(v)))));
+        const told = { ...d, ...d.since_start };
+        say(figures, ...Object.entries(told).filter(([k]) => !["name", "state", "error", "since_start"].includes(k)).map(([k, v]) => h("div", h("dt", words(k)), h("dd", Array.isArray(v) ? v.map((x) => (typeof x === "object" ? JSON.stringify(x) : x)).join(", ") : String(v)))));
       } };
     });
   }

@@ -83,11 +83,17 @@ export const load = {
   newest: () => fresh("newest", "/captures?limit=1", (list) => { if (list.length) takeCapture(list.at(-1)); else S.capture = null; }),
 };
 
+const SNAPSHOT = "snapshot"; // it is no capture but while it is taken
+
 function takeCapture(status) {
+  if (status.id === SNAPSHOT && status.state === "done") {
+    if (S.capture?.id === SNAPSHOT) load.newest().catch(() => {});
+    return;
+  }
   if (S.capture?.id !== status.id) {
-    if (S.capture && status.id < S.capture.id && status.state === "done") return; // an older one
+    if (S.capture && S.capture.id !== SNAPSHOT && status.id < S.capture.id && status.state === "done") return; // an older one
     S.missing = [];
-    S.failed = null;
+    if (S.capture?.id !== SNAPSHOT) S.failed = null;
   }
   S.capture = status;
   if (status.state !== "done") S.failed = null;

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,37 @@ def test_devices_and_blackout(http, world):
     assert not world.lit
 
 
+def snapshot(http: httpx.Client) -> dict[str, Any]:
+    answer: dict[str, Any] = http.get("/captures/snapshot").json()
+    return answer
+
+
+def test_a_snapshot_shows_one_light_and_is_no_capture(http, world):
+    begun = http.post("/snapshot", json={"light": "light_003", "exposure": 0.02})
+    assert (begun.status_code, begun.json()["id"]) == (202, "snapshot")
+    ended = partial(until, lambda: s if (s := snapshot(http))["state"] == "done" else None)
+    first = ended()
+    assert (first["outcome"], first["frames_written"], world.pulses) == ("completed", 3, 1)
+    (step,) = http.get("/captures/snapshot/steps").json()
+    assert (step["light"], step["exposure"], step["lacks"]) == ("light_003", 0.02, [])
+    counts = http.get("/captures/snapshot/frames/0/cam_0.json").json()["largest"]
+    assert counts * 1e4 * 0.02 == pytest.approx(2 * 4)  # the cameras' gain; see `SHORT`
+    assert not world.lit
+
+    problem(http.post("/snapshot", json={"light": "light_999"}), "invalid-plan")
+    job = {"capture": "snapshot", "pipeline": {"name": "fit"}}
+    problem(http.post("/jobs", json=job), "bad-input")
+    http.post("/snapshot", json={})
+    second = ended()
+    assert second["started"] > first["started"]
+    assert http.get("/captures/snapshot/steps").json()[0]["kind"] == "all_on"
+    assert http.get("/captures").json() == []
+    world.stuck_lamps, world.lit = True, {3}
+    assert http.post("/devices/blackout").json()["safe"] is False
+    problem(http.post("/snapshot", json={}), "unsafe")
+    assert sum(r.startswith("PULSE") for r in world.requests) == 2
+
+
 def test_artifacts_stay_inside_the_model_folder(http, server, tmp_path):
     model = server.service.root / "models" / "m"
     (model / "masks").mkdir(parents=True)
@@ -375,6 +407,7 @@ def test_every_route_of_the_api_is_there_and_documented(http):
     assert routes == {
         "POST /plans:validate",
         "POST /captures",
+        "POST /snapshot",
         "GET /captures",
         "GET /captures/{capture}",
         "GET /captures/{capture}/steps",

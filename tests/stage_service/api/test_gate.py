@@ -35,6 +35,7 @@ SEE = (
 )
 NEEDS = {
     "POST /captures": "steer",
+    "POST /snapshot": "steer",
     "POST /captures/x/pause": "steer",
     "POST /captures/x/resume": "steer",
     "POST /lease": "steer",

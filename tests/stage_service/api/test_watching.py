@@ -60,7 +60,13 @@ def test_frames_captures_and_faults_are_counted(rig_file, world, tmp_path):
         (fault,) = [k for k in after if k[0] == "device_faults_total"]
         assert "cam_2" in fault[1]
         assert after[fault] == 1
-        assert http.get("/devices").json()["lights"]["state"] == "ok"
+        devices = http.get("/devices").json()
+        assert devices["lights"]["state"] == "ok"
+        counts = {name: d["since_start"] for name, d in devices["cameras"].items()}
+        assert counts["cam_0"] == {"frames": 6, "missed": 0, "late": 0, "timeouts": 0, "faults": 0}
+        assert counts["cam_1"] == {"frames": 6, "missed": 1, "late": 0, "timeouts": 0, "faults": 0}
+        assert counts["cam_2"] == {"frames": 6, "missed": 0, "late": 0, "timeouts": 1, "faults": 0}
+        assert devices["lights"]["since_start"] == {"timeouts": 0, "faults": 0}
         assert figures(http)["device_reachable", "lights"] == 1
 
 

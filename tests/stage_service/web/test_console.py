@@ -207,6 +207,53 @@ def test_a_list_of_ten_thousand_captures_is_paged(console, tmp_path):
     page.wait_for_selector(f".list button >> text={one.id}")
 
 
+def test_cameras_show_a_snapshot_and_the_stage_what_each_missed(console):
+    http, pages = console(Fault("camera", "drop", 1, "cam_b"))
+    page = pages.open("cameras")
+    page.select_option("[name=light]", "light_003")
+    page.click("text=Take a snapshot")
+    picture = page.wait_for_selector("figure img[src*='/snapshot/']")
+    until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
+    page.wait_for_selector("figcaption:has-text('cam_b: no frame')")
+    page.wait_for_selector(".quiet:has-text('light_003, ')")
+    page.wait_for_selector("figcaption:has-text('focus')")
+    assert http.get("/captures").json() == []
+    page.click("nav >> text=Stage")
+    card = page.wait_for_selector(".device:has(h3:text-is('camera cam_b'))").text_content()
+    assert "missed1" in card
+    assert "frames0" in card
+
+
+def test_what_waits_is_put_elsewhere(console):
+    http, pages = console()
+    http.post("/queue:hold")
+    names = [f"light_{n:03d}" for n in range(3)]
+    for n in (1, 2, 3):
+        http.post("/queue", json={"plan": {**PACED, "lights": names[:n]}})
+    page = pages.open()
+
+    def line(*lights: int) -> None:
+        """Wait until captures of so many lights wait, on the page and in the service."""
+        until(
+            lambda: (
+                [row[0] for row in page.locator(".queue li").all_text_contents()]
+                == [str(n) for n in lights]
+            ),
+            20,
+        )
+        waiting = http.get("/queue").json()["waiting"]
+        assert [len(x["request"]["plan"]["lights"]) for x in waiting] == list(lights)
+
+    line(1, 2, 3)
+    page.click(".queue li >> nth=2 >> button[aria-label='sooner']")
+    line(1, 3, 2)
+    assert page.locator(".queue li >> nth=0 >> button[aria-label='sooner']").is_disabled()
+    page.click(".queue li >> nth=0 >> button[aria-label='later']")
+    line(3, 1, 2)
+    page.click(".queue li >> nth=1 >> button:text-is('remove')")
+    line(3, 2)
+
+
 def test_axe_finds_nothing_to_complain_of(console):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe here").Axe()
     http, pages = console()
@@ -216,6 +263,7 @@ def test_axe_finds_nothing_to_complain_of(console):
     for view, there in (
         ("now", "h1.big"),
         ("plan", ".cost .facts"),
+        ("cameras", "form"),
         ("frames", "figure"),
         ("stage", ".device"),
         ("jobs", "#view p"),

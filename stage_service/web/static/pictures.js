@@ -1,0 +1,63 @@
+// All cameras side by side: a frame of each, how it is exposed, and what is drawn over it.
+
+import { get } from "./ask.js";
+import { h, number, percent, say, svg } from "./dom.js";
+import { S } from "./state.js";
+
+/** Cells in `grid`, one a camera. `show(path, more)` shows the frame `path(camera)`; `query` is how it is
+ * exposed, `words` what it is, `lacks` the cameras without, `figures` whether they are asked for, `over`
+ * what is drawn on top: `over(camera)`, SVG in pixels. A slow frame is left out for the newest. */
+export function pictures(grid, signal) {
+  const cells = new Map();
+  grid.style.setProperty("--cell", S.rig.cameras.length > 12 ? "10rem" : "14rem");
+
+  function cellOf(camera) {
+    if (cells.has(camera.name)) return cells.get(camera.name);
+    const { name, width, height } = camera;
+    const image = h("img", { alt: "", width, height });
+    const text = h("figcaption", name);
+    const plot = svg("svg", { class: "histogram", viewBox: "0 0 64 20", preserveAspectRatio: "none", "aria-hidden": "true" });
+    const drawn = svg("svg", { class: "over", viewBox: `-.5 -.5 ${width} ${height}`, "aria-hidden": "true" });
+    const figure = h(`figure${width < 320 ? ".pixels" : ""}`, h(".shown", image, drawn), text);
+    grid.append(figure);
+    const cell = { busy: false, next: null, show };
+    cells.set(name, cell);
+    return cell;
+
+    function show(path, more) {
+      const next = { path: path(name), more };
+      cell.next = next;
+      if (more.lacks?.includes(name)) {
+        image.removeAttribute("src");
+        say(text, `${name}: no frame`);
+        return;
+      }
+      if (cell.busy) return; // the newest that was asked for comes next
+      cell.busy = true;
+      const done = () => { cell.busy = false; if (cell.next !== next) cell.show(() => cell.next.path, cell.next.more); };
+      image.onload = done;
+      image.onerror = () => { say(text, `${name}: no frame`); done(); };
+      image.alt = `${name}, ${more.words}`;
+      image.src = `${next.path}.png?${[`size=${Math.min(Math.max(width, height), 480)}`, ...more.query].join("&")}`;
+      say(text, name);
+      drawn.replaceChildren(...(more.over?.(name) ?? []));
+      if (more.figures) tell(next);
+      else plot.remove();
+    }
+
+    async function tell(next) {
+      const f = await get(`${next.path}.json`, { signal }).catch(() => null);
+      if (!f || cell.next !== next) return;
+      const top = Math.log1p(Math.max(...f.histogram));
+      plot.replaceChildren(...f.histogram.map((n, i) => svg("path", { class: i === 63 && f.saturated ? "full" : "", d: `M${i} 20V${(20 - (19 * Math.log1p(n)) / (top || 1)).toFixed(2)}h.9V20z` })));
+      if (!plot.parentNode) figure.append(plot);
+      say(text, `${name} · saturated ${percent(f.saturated)} · focus ${number(f.focus)} · 99.5 % at ${number(f.white)}`);
+    }
+  }
+
+  return {
+    show(path, more) { for (const camera of S.rig.cameras) cellOf(camera).show(path, more); },
+    caption(name, text) { say(grid.children[S.rig.cameras.findIndex((c) => c.name === name)].querySelector("figcaption"), text); },
+    get busy() { return [...cells.values()].some((cell) => cell.busy); },
+  };
+}
