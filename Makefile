@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# or each of the many processes that tests start compiles the product anew
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help setup demo test test-all run-tests test-peers bench lint clean
 

@@ -45,7 +45,10 @@ def test_all_are_found_together(plain, tufted, start):
     np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.25)
 
 
-@pytest.mark.parametrize(("beta_m", "beta_n"), [(0.05, 0.3), (0.7, 0.7), (0.8, 0.3)])
+@pytest.mark.parametrize(
+    ("beta_m", "beta_n"),
+    [(0.05, 0.3), (0.8, 0.3), pytest.param(0.7, 0.7, marks=pytest.mark.slow)],
+)
 def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
     problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)

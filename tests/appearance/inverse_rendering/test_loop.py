@@ -71,7 +71,7 @@ def test_a_volume_is_coloured_before_it_gets_correctives(plain, original):
 
 
 def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_path):
-    options = replace(original, steps=20)
+    options = replace(original, steps=11)
     whole = run(plain, START, options=options, seed=1)
     file = tmp_path / "fit.npz"
 

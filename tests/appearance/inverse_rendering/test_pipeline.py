@@ -33,9 +33,9 @@ REQUEST = parse_options(
         "max_depth": 5,
         "fit": {
             "variant": "lights",
-            "steps": 12,
+            "steps": 6,
             "shape": [2, 2, 2],
-            "check_every": 5,
+            "check_every": 2,
             "effort": {"pixels": 60, "spp": 8, "gradient_spp": 2},
         },
     },
@@ -78,7 +78,7 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
 
     def killed(what, share):
         told.append((what, share))
-        if what.startswith("step 10"):
+        if what.startswith("step 4"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -93,7 +93,7 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
         progress=lambda what, share: again.append((what, share)),
     )
     steps = [what for what, _ in again if what.startswith("step")]
-    assert steps[-1].startswith("step 10: error 0.")
+    assert steps[-1].startswith("step 4: error 0.")
     assert [share for _, share in again] == sorted(share for _, share in again)
     assert set(result["held_out"]) == {"start", "inverse_rendering"}
     before, after = (
@@ -166,7 +166,7 @@ def test_the_head_that_was_laid_under_points_casts_its_shadow(made, small, tmp_p
     below = [x.name for x in capture.rig.lights if x.position[2] < -0.2]
     board = small.plane()
     board = replace(board, vertices=board.vertices + np.array([0, 0, -0.035]))
-    request = replace(REQUEST, fit=replace(REQUEST.fit, variant="original"))
+    request = replace(REQUEST, fit=replace(REQUEST.fit, variant="original", steps=1))
     errors = []
     for head in (None, board):
         other = Model(tmp_path / str(head is None))

@@ -46,7 +46,7 @@ def errors(paths: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_noisy_lines_become_strands_that_are_better_than_they() -> None:
-    lines = lock(4000, 4e-4, 12.0)
+    lines = lock(2500, 4e-4, 12.0)
     paths = surface_strands(lines)
     distance, angle = errors(paths)
     assert np.median(angle) < 5  # the lines themselves: 12 or so
@@ -74,7 +74,7 @@ def test_a_strand_crosses_others_without_turning_into_them() -> None:
 
 
 def test_the_same_seed_gives_the_same_strands() -> None:
-    lines = lock(1000, 2e-4, 5.0)
+    lines = lock(500, 2e-4, 5.0)
     a, b = surface_strands(lines, seed=3), surface_strands(lines, seed=3)
     assert len(a) == len(b)
     assert all(np.array_equal(p, q) for p, q in zip(a, b, strict=True))

@@ -118,7 +118,7 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
     assert stage.figures["used_share"] > 0.95
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 35.0])
+@pytest.mark.parametrize("turn_deg", [pytest.param(0.0, marks=pytest.mark.slow), 35.0])
 def test_a_head_is_laid_under_the_skin_that_was_seen(capture: Capture, turn_deg: float) -> None:
     cloud, masks = cloud_of(capture, turn_deg)
     skin = skin_points(MaskedCapture(capture, masks), cloud)

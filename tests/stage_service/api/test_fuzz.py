@@ -86,11 +86,11 @@ def fuzz(
     return for_all, others
 
 
-@pytest.mark.parametrize("who", ["token", "nobody"])
+@pytest.mark.parametrize("who", ["token", pytest.param("nobody", marks=pytest.mark.slow)])
 def test_a_few_requests_of_every_kind(live, who):
     headers = {"Authorization": f"Bearer {OWN}"} if who == "token" else {}
-    for_all, others = fuzz(live, 70, headers, 1)
-    assert for_all.total() + others.total() >= 70
+    for_all, others = fuzz(live, 40, headers, 1)
+    assert for_all.total() + others.total() >= 40
     assert set(for_all) <= {200, 400, 401, 415, 422}  # a token that is none of ours
     if who == "nobody":
         assert set(others) == {401}

@@ -33,7 +33,7 @@ def postgresql() -> Iterator[str]:
         pytest.skip(str(error))
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
 def shared(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every root of the test, and every worker, has the same database."""
     url = f"sqlite:///{tmp_path}/shared.sqlite"
