@@ -118,7 +118,7 @@ class ReconstructOptions:
 
     held_out: tuple[str, ...] = ()
     grid: Length = 2e-3
-    roots: Count = 8000
+    roots: Annotated[int, Field(ge=1, le=1_000_000)] = 8000
     max_length: Length = 0.3
     margin: Factor = 2e-3
     network: NetworkOptions | None = None

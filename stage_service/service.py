@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import cv2
 
+from appearance.model.relight import PROCEDURAL
 from reconstruction import Capture, CaptureError, Model, Rig, read_obj
 from reconstruction.containment import inside, is_file_name, plain_file
 from stage_service.acquisition.captures import CaptureManager
@@ -201,7 +202,7 @@ class Service:
                 raise BadInput("upload: give this, or head and masks; not both")
             given, folder = self.storage.uploaded(request.upload)
         if request.pipeline is not None:
-            _check_names(request.pipeline, self.rig_file.rig)
+            _check_named(request.pipeline, self.rig_file.rig)
             if "reconstruct" not in PIPELINES[request.pipeline.name]:
                 raise BadInput(
                     f"pipeline: {request.pipeline.name!r} works on strands that are there already; "
@@ -381,7 +382,7 @@ class Service:
             raise NotFinished(
                 f"capture {request.capture} is {outcome}, not completed: resume it, or shoot anew"
             )
-        _check_names(request.pipeline, capture.rig)
+        _check_named(request.pipeline, capture.rig)
         model = Model(self.root / "models" / (request.model or job))
         rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
         if not rebuilds and not model.has("strands.npz"):
@@ -550,11 +551,26 @@ class Service:
         return masks
 
 
-def _check_names(pipeline: PipelineRequest, rig: Rig) -> None:
+def _check_named(pipeline: PipelineRequest, rig: Rig) -> None:
+    """Raises `BadInput` where options name what the rig has not, or a file that is not there."""
+    options = pipeline.options
     for kind, wanted, known in (
-        ("held_out_cameras", pipeline.options.held_out_cameras, rig.cameras),
-        ("held_out_lights", pipeline.options.held_out_lights, rig.lights),
+        ("held_out_cameras", options.held_out_cameras, rig.cameras),
+        ("held_out_lights", options.held_out_lights, rig.lights),
     ):
         unknown = set(wanted) - {x.name for x in known}
         if unknown:
             raise BadInput(f"pipeline.options.{kind}: the rig has no {sorted(unknown)}")
+    asked = options.reconstruct
+    for field, file in (
+        ("truth", options.truth),
+        ("environment", None if options.environment in PROCEDURAL else options.environment),
+        ("reconstruct.head_mesh", asked.head_mesh),
+        ("reconstruct.scalp_points", asked.scalp_points),
+        ("reconstruct.network.file", asked.network.file if asked.network else None),
+    ):
+        try:
+            if file is not None and not (field == "truth" and Path(file).is_dir()):
+                plain_file(file)
+        except (OSError, ValueError) as error:
+            raise BadInput(f"pipeline.options.{field}: {error}") from error

@@ -364,6 +364,14 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
         refused = http.post("/captures", json={"pipeline": {"name": pipeline}, **given})
         assert why in problem(refused, "bad-input")["detail"]
     done = capture_done(http, {"plan": SHORT})
+    for options, why in (
+        ({"truth": "/nowhere/truth.npz"}, "options.truth: [Errno 2]"),
+        ({"environment": "dawn"}, "options.environment: [Errno 2]"),
+        ({"reconstruct": {"head_mesh": "/dev/zero"}}, "head_mesh: /dev/zero is no plain file"),
+    ):
+        pipeline = {"name": "light_planes", "options": options}
+        refused = http.post("/jobs", json={"capture": done["id"], "pipeline": pipeline})
+        assert why in problem(refused, "bad-input")["detail"]
     refused = http.post("/jobs", json={"capture": done["id"], "pipeline": {"name": "fit"}})
     assert "a model with strands" in problem(refused, "bad-input")["detail"]
 
@@ -374,6 +382,7 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
         ({"heldout": []}, "heldout"),
         ({"seed": -1}, "seed"),
         ({"reconstruct": {"seed": 3}}, "reconstruct"),
+        ({"reconstruct": {"roots": 10**15}}, "reconstruct.roots"),
         ({"reconstruct": {"measure": {"thinn": 1}}}, "reconstruct.measure.thinn"),
         (
             {"reconstruct": {"measure": {"bank": {"wavelength": 1.0}}}},
