@@ -15,12 +15,15 @@ import cv2
 
 from appearance.model.relight import PROCEDURAL
 from reconstruction import Capture, CaptureError, Model, Rig, read_obj
+from reconstruction.calibration.boards import CalibrationError
 from reconstruction.containment import inside, is_file_name, plain_file
+from reconstruction.geometry.rig import RigError
 from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.catalogue import UnknownCapture
 from stage_service.acquisition.control import Caller, Control
 from stage_service.acquisition.snapshots import SNAPSHOT, one_step
 from stage_service.acquisition.states import CaptureStatus, Outcome
+from stage_service.calibrating import BoardView, Calibrating, CalibrationView
 from stage_service.config import RigFile
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.pipelines import PIPELINES
@@ -37,6 +40,8 @@ from stage_service.records.lease import Lease
 from stage_service.service_models import (
     AcknowledgeRequest,
     Artifact,
+    BoardQuery,
+    CalibrationRequest,
     CaptureRequest,
     CaptureView,
     Health,
@@ -51,7 +56,7 @@ from stage_service.service_models import (
     SnapshotRequest,
     StepView,
 )
-from stage_service.storage import Removed, Storage
+from stage_service.storage import NotThere, Removed, Storage
 from stage_service.verification import Verification, Verifier
 from stage_service.viewer import Viewed, Viewing
 from stage_service.watching import NotReady, Watching
@@ -118,6 +123,7 @@ class Service:
             lambda: [c for c in self._captures.list() if c.outcome == "completed"],
             verify_days,
         )
+        self.calibrating = Calibrating(root / "calibration", rig_file, self.events)
         self._submitting = threading.Lock()
         self._closing = threading.Lock()
         self._closed = threading.Event()
@@ -169,6 +175,7 @@ class Service:
                 return
             self.queue.close()
             self._verifier.close()
+            self.calibrating.close()
             try:
                 self._captures.close()
             finally:
@@ -315,6 +322,31 @@ class Service:
             StepView(**step.to_dict(), lacks=[n for n in names if (step.index, n) not in there])
             for step in capture.steps
         ]
+
+    def board(self, capture_id: str, camera: str, board: BoardQuery) -> BoardView:
+        """What a camera saw of a calibration's board. Raises as `frame`, and `BadInput`."""
+        capture = Capture(self.capture_path(capture_id))
+        if camera not in [c.name for c in capture.rig.cameras]:
+            raise UnknownFrame(f"{capture_id} has no camera {camera!r}")
+        try:
+            return self.calibrating.look(capture, camera, board, board.calibrated)
+        except (CalibrationError, RigError) as error:
+            raise BadInput(str(error)) from error
+
+    def calibrate(self, request: CalibrationRequest, by: Caller) -> CalibrationView:
+        """Begin to calibrate the rig. Raises `UnknownCapture`, `NotFinished`, `BadInput`."""
+        work = partial(self.calibrating.begin, request, self.done_capture)
+        what = f"{len(request.boards)} boards, {len(request.diffuse + request.mirror)} spheres"
+        try:
+            return self._control.do(by, "calibrate", work, "rig", detail=what, steers=False)
+        except CalibrationError as error:
+            raise BadInput(str(error)) from error
+
+    def calibrated(self) -> Path:
+        """The calibrated rig file. Raises `NotThere`."""
+        if not self.calibrating.rig.is_file():
+            raise NotThere("no rig was calibrated here yet: POST /calibration")
+        return self.calibrating.rig
 
     def done_capture(self, capture_id: str) -> Path:
         """The folder of a capture that nobody shoots. Raises `UnknownCapture`, `NotFinished`."""

@@ -72,6 +72,47 @@ class SnapshotRequest(Strict):
     level: Level | None = None
 
 
+class BoardSize(Strict):
+    """A ChArUco board: squares across and down, the edges of squares and markers, and OpenCV's name
+    of the markers."""
+
+    columns: Annotated[int, Field(ge=3, le=64)] = 9
+    rows: Annotated[int, Field(ge=3, le=64)] = 7
+    square_mm: Annotated[float, Field(gt=0, le=1000)] = 27.0
+    marker_mm: Annotated[float, Field(gt=0, le=1000)] = 21.0
+    dictionary: Annotated[str, Field(pattern=r"^DICT_[A-Z0-9_]{1,40}$")] = "DICT_4X4_50"
+
+
+class BoardQuery(BoardSize):
+    """The board, and whether the lenses are those that were calibrated or those of the capture."""
+
+    calibrated: bool = False
+
+
+CaptureNames = Annotated[
+    list[Annotated[str, Field(min_length=1, max_length=LONGEST_NAME)]], Field(max_length=200)
+]
+Albedo = Annotated[float, Field(gt=0, le=1)]
+RadiusMm = Annotated[float, Field(gt=0, le=1000)]
+
+
+class CalibrationRequest(Strict):
+    """Captures to calibrate the rig by: of a board, one a pose, and of spheres, one a place. What
+    stood there is as for `hairstage calibrate rig`."""
+
+    model_config = with_example(boards=["20261121-093000-1f2e", "20261121-093110-a0c4"])
+
+    boards: Annotated[CaptureNames, Field(min_length=1)]
+    diffuse: CaptureNames = Field(default_factory=list)
+    mirror: CaptureNames = Field(default_factory=list)
+    board: BoardSize = BoardSize()
+    paper_albedo: Albedo | None = None
+    diffuse_albedo: Albedo = 0.8
+    diffuse_radius_mm: RadiusMm = 50.0
+    mirror_radius_mm: RadiusMm = 50.0
+    keep_lens: bool = False
+
+
 class MoveRequest(Strict):
     """Where in the queue, from 0."""
 

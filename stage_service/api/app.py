@@ -16,7 +16,16 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
-from stage_service.api import event_stream, login, queueing, routes, steering, store, viewing
+from stage_service.api import (
+    calibration,
+    event_stream,
+    login,
+    queueing,
+    routes,
+    steering,
+    store,
+    viewing,
+)
 from stage_service.api.connections import LOOPBACK, QUEUED, limits, listening
 from stage_service.api.downloads import Heads
 from stage_service.api.gate import OWN_NAMES, Access, Gate
@@ -58,9 +67,9 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     access = access or Access()
     app.state.service, app.state.lanes, app.state.access = service, Lanes(), access
     app.state.feed, app.state.viewing = event_stream.Feed(service.events), service.viewing
-    for part in (routes, steering, queueing, store, event_stream):
+    for part in (routes, steering, queueing, store, calibration, event_stream):
         app.include_router(part.reading)
-    for more in (routes, steering, queueing, store, login):
+    for more in (routes, steering, queueing, store, calibration, login):
         app.include_router(more.router)
     for shown in (login.open_to_all, pages.router):
         app.include_router(shown)

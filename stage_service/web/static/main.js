@@ -7,12 +7,13 @@ import { S, begin, busy, changed, load, mine, onChange, releaseLease, takeLease 
 import { blackScreen } from "./black.js";
 import * as now from "./now.js";
 import * as plan from "./plan.js";
+import * as calibrate from "./calibrate.js";
 import * as cameras from "./cameras.js";
 import * as frames from "./frames.js";
 import * as stage from "./stage.js";
 import * as jobs from "./jobs.js";
 
-const VIEWS = { now: ["Now", now], plan: ["Plan", plan], cameras: ["Cameras", cameras], frames: ["Frames", frames], stage: ["Stage", stage], jobs: ["Jobs", jobs] };
+const VIEWS = { now: ["Now", now], plan: ["Plan", plan], cameras: ["Cameras", cameras], frames: ["Frames", frames], stage: ["Stage", stage], jobs: ["Jobs", jobs], calibrate: ["Calibrate", calibrate] };
 const STATES = {
   idle: "starting", running: "shooting", pausing: "pausing …", paused: "paused", aborting: "aborting …",
   finishing: "finishing …",

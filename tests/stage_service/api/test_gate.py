@@ -44,6 +44,7 @@ NEEDS = {
     "DELETE /lease?force=true": "admin",
     "POST /devices/acknowledge": "arm",
     "POST /jobs": "jobs",
+    "POST /calibration": "jobs",
     "DELETE /jobs/x": "jobs",
 }
 

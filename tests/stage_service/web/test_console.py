@@ -267,6 +267,7 @@ def test_axe_finds_nothing_to_complain_of(console):
         ("frames", "figure"),
         ("stage", ".device"),
         ("jobs", "#view p"),
+        ("calibrate", ".poses"),
     ):
         page.click(f"nav a[href='#{view}']")
         page.wait_for_selector(there)
