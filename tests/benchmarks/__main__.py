@@ -23,6 +23,7 @@ MODULES = {
     "appearance": "benchmarks.appearance.ablations",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "captures": "benchmarks.acquisition.listing",
+    "console": "benchmarks.service.watched",
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",

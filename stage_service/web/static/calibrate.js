@@ -45,7 +45,7 @@ export function open(view) {
     }, { ready: () => !busy() });
     return {
       kind, rows, shoot,
-      element: h("section", h("h2", title), h("p.quiet", hint), h(".wide", { tabindex: "0", role: "region", "aria-label": `captures: ${title}` }, h("table.poses", kind === "boards" ? h("thead", h("tr", h("th", "capture"), S.rig.cameras.map((c) => h("th", c.name)), h("th", ""))) : "", rows)), h(".line", shoot.element)),
+      element: h("section", h("h2", title), h("p.quiet", hint), h(".wide", { tabindex: "0", role: "region", "aria-label": `captures: ${title}` }, h("table.poses", kind === "boards" ? h("thead", h("tr", h("th", "capture"), S.rig.cameras.map((c) => h("th", c.name)), h("td"))) : "", rows)), h(".line", shoot.element)),
     };
   }
 

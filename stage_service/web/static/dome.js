@@ -41,7 +41,10 @@ export function dome(rig, { onpick = null, label = "" } = {}) {
     svg("circle", { class: "equator", r: Math.SQRT1_2 }),
     svg("path", { class: "head", d: "M-.05.025C-.05-.075.05-.075.05.025L.02.06 0 .085-.02.06Z" }),
     ...devices, ...spots);
-  let lit = null;
+  let before = [null, null, null, null, null];
+  // The one that is lit is another circle over all of them, which moves: nothing else is drawn anew.
+  const named = svg("title");
+  const over = svg("circle", { class: "light lit", r: radius.toFixed(4) }, named);
 
   function mark(device, kind, path) {
     const [x, y] = place(device.position);
@@ -52,22 +55,26 @@ export function dome(rig, { onpick = null, label = "" } = {}) {
 
   return {
     element,
-    show({ lit: now = null, shot = null, missing = null, chosen = null, projector = null }) {
-      if (now !== lit) {
-        for (const spot of now === "all" || lit === "all" ? lights.values() : [lights.get(lit)]) spot?.classList.toggle("lit", now === "all");
-        const spot = lights.get(now);
+    show({ lit = null, shot = null, missing = null, chosen = null, projector = null }) {
+      const now = [lit, ...[shot, missing, chosen].map((set) => set && [...set].join()), projector];
+      const same = now.map((x, i) => x === before[i]);
+      before = now;
+      if (!same[0]) {
+        element.classList.toggle("all", lit === "all");
+        const spot = lights.get(lit);
         if (spot) {
-          spot.classList.add("lit");
-          spot.parentNode.append(spot); // over its neighbours
-        }
-        lit = now;
+          for (const at of ["cx", "cy"]) over.setAttribute(at, spot.getAttribute(at));
+          named.textContent = lit;
+          if (!over.parentNode) element.append(over);
+        } else over.remove();
       }
+      if (!same[4]) for (const [name, made] of projectors) made.classList.toggle("on", projector === "all" || projector === name);
+      if (same[1] && same[2] && same[3]) return;
       for (const [name, spot] of lights) {
         spot.classList.toggle("shot", shot?.has(name) ?? false);
         spot.classList.toggle("lacks", missing?.has(name) ?? false);
         spot.classList.toggle("chosen", chosen?.has(name) ?? false);
       }
-      for (const [name, made] of projectors) made.classList.toggle("on", projector === "all" || projector === name);
     },
   };
 }

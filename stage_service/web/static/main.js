@@ -37,6 +37,7 @@ function bar() {
   const detail = h("span.detail");
   const steering = h("span.steering");
   const links = Object.entries(VIEWS).map(([name, [title]]) => h("a", { href: `#${name}` }, title));
+  const going = h("span");
   const held = button("", () => attempt(async () => {
     if (mine()) await releaseLease();
     else await takeLease(await askName());
@@ -46,6 +47,7 @@ function bar() {
   const black = button("", blackScreen, { kind: "quiet", "aria-keyshortcuts": "F7", title: "nothing on this screen shines (F7)" });
   say(black, "Black", h("kbd", "F7"));
   say(stop, "Abort", h("kbd", "F8"));
+  say(dark, going, h("kbd", "F9"));
   top.replaceChildren(
     h(".where", { role: "status" }, state, detail),
     h("nav", { "aria-label": "views" }, links),
@@ -71,7 +73,7 @@ function bar() {
     say(held, mine() ? "release" : "take");
     held.hidden = other || !(S.who?.scopes.includes("steer"));
     stop.disabled = !busy() || c.state === "aborting" || c.state === "finishing";
-    say(dark, darkening ? (darkening.tries > 1 ? `Blackout: try ${darkening.tries}` : "going dark …") : "Blackout", h("kbd", "F9"));
+    say(going, darkening ? (darkening.tries > 1 ? `Blackout: try ${darkening.tries}` : "going dark …") : "Blackout");
     dark.classList.toggle("going", darkening !== null);
   };
 }

@@ -92,20 +92,24 @@ export function open(view) {
     ]);
     showLights(c, p);
     framesBy(c, p);
-    keyed(missing, S.missing.slice(0, 12), (x) => `${x.step}/${x.attempt}/${x.cameras}`, (x) => ({
+    // A page that was opened later has heard nothing of them: then by what each step lacks.
+    const lost = S.missing.length || busy() ? S.missing : (steps ?? []).filter((s) => s.lacks.length && s.index < c.step).map((s) => ({ step: s.index, cameras: s.lacks, attempt: 0, shot_again: false }));
+    keyed(missing, lost.slice(0, 12), (x) => `${x.step}/${x.attempt}/${x.cameras}`, (x) => ({
       element: h("li", `step ${x.step}${steps?.[x.step]?.light ? ` (${steps[x.step].light})` : ""}: ${x.cameras.join(", ")} — `, x.shot_again ? "shot again" : h("b.bad", "given up")),
     }));
-    if (!S.missing.length && !missing.childElementCount) missing.append(h("li.quiet", "none"));
-    else if (S.missing.length) missing.querySelector(".quiet")?.remove();
+    if (!lost.length && !missing.childElementCount) missing.append(h("li.quiet", "none"));
+    else if (lost.length) missing.querySelector(".quiet")?.remove();
   }
 
   function headline(c) {
     if (busy()) {
+      word.classList.remove("bad");
       say(word, { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" }[c.state]);
       say(said, SAID[c.state]);
       return;
     }
     const dark = S.health?.lamps === "dark";
+    word.classList.toggle("bad", !dark);
     say(word, S.health?.latch ? "UNSAFE" : dark ? "Dark, verified" : "Not known to be dark");
     const how = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" }[c.outcome];
     say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`);
@@ -117,7 +121,15 @@ export function open(view) {
     return ["Disk", free === null ? h("b.bad", "does not answer") : `${bytes(free)} free`];
   }
   function tell(rows) {
-    say(facts, ...rows.filter(Boolean).map(([name, value]) => h("div", h("dt", name), h("dd", value))));
+    keyed(facts, rows.filter(Boolean), ([name]) => name, ([name]) => {
+      const dd = h("dd");
+      let last = null;
+      return { element: h("div", h("dt", name), dd), tell([, value]) {
+        const now = value instanceof Node ? value.outerHTML : String(value);
+        if (now !== last) say(dd, value);
+        last = now;
+      } };
+    });
   }
 
   function showLights(c, p) {

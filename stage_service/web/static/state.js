@@ -19,22 +19,30 @@ export const S = {
 };
 
 const listeners = new Set();
-let due = false;
+const SOON_MS = 30;
+const CALM_MS = 250; // a capture tells its progress five times a second: drawing that is work, for nobody's eye
+let due = 0; // when it is drawn next; 0: nothing is to be
+let drawn = 0;
+let timer = 0;
 
-/** `fn()` is called after changes, at most once a frame. Returns what ends that. */
+/** `fn()` is called soon after a change; where only progress was made, four times a second. Returns what
+ * ends that. */
 export function onChange(fn) {
   listeners.add(fn);
   return () => listeners.delete(fn);
 }
 
-export function changed() {
-  if (due) return;
-  due = true;
+export function changed(calm = false) {
+  const now = performance.now();
+  const at = Math.max(now + SOON_MS, calm ? drawn + CALM_MS : 0);
+  if (due && due <= at) return;
+  due = at;
+  clearTimeout(timer);
   // Not by requestAnimationFrame alone: a window that is covered must still show an alarm in its title.
-  setTimeout(() => {
-    due = false;
+  timer = setTimeout(() => {
+    [due, drawn] = [0, performance.now()];
     for (const fn of listeners) fn();
-  }, 30);
+  }, at - now);
 }
 
 export const events = new EventTarget(); // each of the service's, by its kind
@@ -133,7 +141,7 @@ function heard(kind, data) {
     if (known) known.progress = progress;
   } else if (about === "job") load.jobs();
   events.dispatchEvent(new CustomEvent(kind, { detail: data }));
-  if (kind !== "capture.step") changed();
+  if (kind !== "capture.step") changed(kind === "capture.progress" || kind === "job.progress");
 }
 
 /** Ask for everything: at the start, and whenever the line was lost. */

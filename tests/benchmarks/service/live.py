@@ -196,20 +196,35 @@ def console(live: Live) -> Iterator[None]:
                 for path in ("/health", "/captures?limit=50", "/devices", "/queue", "/metrics"):
                     http.get(path).raise_for_status()
 
-    def follow() -> None:
-        with live.client(live.http.base_url) as http, http.stream("GET", "/events") as events:
-            for _ in events.iter_lines():
-                if over.is_set():
-                    return
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        with follower(live):
+            yield
+    finally:
+        over.set()
+        thread.join()
 
-    threads = [threading.Thread(target=work, daemon=True) for work in (look, follow)]
-    for thread in threads:
-        thread.start()
+
+@contextlib.contextmanager
+def follower(live: Live) -> Iterator[None]:
+    """A client that follows the events, and reads what comes."""
+    link = socket.create_connection((live.http.base_url.host, live.http.base_url.port or 80), 5)
+    link.sendall(live.request("/events"))
+
+    def read() -> None:
+        with contextlib.suppress(OSError):
+            while link.recv(1 << 16):
+                pass
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
     try:
         yield
     finally:
-        over.set()
-        threads[0].join()
+        link.shutdown(socket.SHUT_RDWR)
+        thread.join()
+        link.close()
 
 
 LOADS: dict[str, Callable[[Live], AbstractContextManager[None]]] = {

@@ -120,6 +120,46 @@ def test_a_capture_from_its_plan_to_darkness(console):
     assert [a["action"] for a in http.get("/audit").json()][-1] == "blackout"
 
 
+def tab_to(page: Any, condition: str) -> None:
+    """Press Tab until the element that has the focus, `x`, is the one."""
+    for _ in range(150):
+        page.keyboard.press("Tab")
+        if page.evaluate(f"(x => {condition})(document.activeElement)"):
+            return
+    raise AssertionError(f"Tab leads to nothing of which {condition}")
+
+
+def test_a_capture_by_the_keyboard_alone(console):
+    http, pages = console()
+    page = pages.open()
+    says(page, "Dark, verified")
+    tab_to(page, "x.textContent === 'Plan'")
+    page.keyboard.press("Enter")
+    page.wait_for_selector(".cost .facts")
+    for field, keys in (("projectors", "none"), ("stepping", "s"), ("rate_hz", "8")):
+        tab_to(page, f"x.name === {field!r}")
+        page.keyboard.type(keys)
+    page.wait_for_selector(".cost:has-text('8 Hz')")
+    tab_to(page, "x.textContent === 'Start now'")
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("dialog input:focus")
+    page.keyboard.type("Ada")
+    page.keyboard.press("Enter")
+    says(page, "Shooting")
+    tab_to(page, "x.textContent === 'Pause'")
+    page.keyboard.press("Enter")
+    says(page, "Paused")
+    tab_to(page, "x.textContent === 'Resume'")
+    page.keyboard.press("Space")
+    says(page, "Shooting")
+    page.keyboard.press("F7")
+    page.wait_for_selector(".black:focus")
+    page.keyboard.press("F9")
+    says(page, "Dark, verified")
+    assert http.service.captures(1)[0].outcome == "aborted"
+
+
 def test_a_lamp_that_stays_lit_cannot_be_missed(console):
     http, pages = console(Fault("lights", "stuck", 4))
     page = pages.open()
