@@ -58,7 +58,8 @@ export async function blackout() {
 }
 
 export function left(c) {
-  if (c.state === "aborting" || c.state === "finishing") return "nothing more is lit";
+  if (c.state === "aborting") return "ends after this step";
+  if (c.state === "finishing") return "nothing more is lit";
   if (c.state === "paused") return "dark";
   const s = c.progress?.seconds_left;
   return s === null || s === undefined ? "time left: not known yet" : `${seconds(s)} left`;
@@ -82,9 +83,8 @@ export async function askName() {
 }
 
 /** A button that steers: off, and saying why, while this page may not. */
-export function steering(text, work, more = {}) {
+export function steering(text, work, { ready = () => true, ...more } = {}) {
   const made = button(text, () => attempt(work), more);
-  const ready = more.ready ?? (() => true);
   return {
     element: made,
     update() {

@@ -138,7 +138,7 @@ function jobOf(view, id) {
 /** Error against run time, both from 0 or by powers of ten where it spans more than one. */
 function curve(title, series) {
   const points = series.points.filter(([, e]) => Number.isFinite(e));
-  const [width, height, pad] = [440, 190, 44];
+  const [width, height, pad] = [440, 190, 56];
   const errors = points.map(([, e]) => e);
   const log = Math.min(...errors) > 0 && Math.max(...errors) / Math.min(...errors) > 10;
   const f = log ? Math.log10 : (x) => x;
