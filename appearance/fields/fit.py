@@ -16,7 +16,7 @@ from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures, irradiance
 from appearance.fields.solver import ignore
-from appearance.fields.validation import Data, Folds, Verdict, cross_validated
+from appearance.fields.validation import GROUPS, Data, Folds, Verdict, cross_validated
 from appearance.render.harmonics import harmonics
 from reconstruction import Progress, silent
 from reconstruction.arrays import Bools, Floats
@@ -59,7 +59,8 @@ class FieldFit:
     def doubts(self) -> list[str]:
         """Why its pictures may be no better than those without it; empty where they are better.
 
-        They are where every group gains, and all together more than `MARGIN` spreads.
+        They are where every group gains, views and lights that are both new more than their own
+        spread, and all together more than `MARGIN` spreads.
         """
         if not self.validation:
             return ["nothing could be left out, so nothing says whether it is better"]
@@ -69,6 +70,12 @@ class FieldFit:
             for group, score in self.validation.items()
             if not score["with"] > score["without"]
         ]
+        both = self.validation.get(GROUPS[-1])
+        if not out and both and not both["with"] - both["without"] > both["spread"]:
+            out = [
+                f"{GROUPS[-1]}: its gain may be chance, {both['with'] - both['without']:.2f} dB "
+                f"with a spread of {both['spread']:.2f}"
+            ]
         gain, spread = self.gain
         if not out and not gain > MARGIN * spread:
             out = [f"its gain may be chance, {gain:.2f} dB with a spread of {spread:.2f}"]

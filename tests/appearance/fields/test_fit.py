@@ -209,6 +209,27 @@ def test_a_field_is_kept_for_what_is_there_and_not_for_noise(planted, seed):
     assert gains[0] < 0
 
 
+def per_view(planted, seed, noise=0.05):
+    """Each view has a factor of its own: new lights gain by it, new views cannot."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for view in planted.views(planted.truth()):
+        c = 0.2 * rng.normal(size=(1, 4, 3))
+        y = [harmonics(x.position - view.hits.middle(), 1) for x in view.lights]
+        factor = 1 + np.einsum("lpn,xnc->lpc", y, c)
+        frames = view.rendered * factor * (1 + noise * rng.normal(size=factor.shape))
+        out.append(replace(view, captured=np.maximum(frames, 0).astype(np.float32)))
+    return out
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_each_view_has_for_itself_is_no_field(planted, seed):
+    """Fitted to some views it is wrong in others, whose factors were drawn on their own."""
+    options = replace(ROUGH, ridges=(1e-2, 0.1, 1.0), folds=3)
+    found = fitted(planted, per_view(planted, seed), options)
+    assert found.doubts()
+
+
 def test_saturated_pixels_weigh_nothing(planted):
     views = planted.views(planted.truth())
     spoilt = []

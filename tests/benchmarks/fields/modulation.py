@@ -1,15 +1,19 @@
 """Fields of reflectance beside what they have to beat, and their solver beside Adam.
 
 On the wavy groom with a truth finer than the fit, and inverse rendering emulated: strands bent by
-5°, coarse colours, β_M 7 % and β_N 10 % off. Leaves `fields.json` and `fields.md`.
+5°, coarse colours, β_M 7 % and β_N 10 % off. Frames interpolated on the bent strands are judged on
+the same pixels. Under environments, lights of the dome stand for the map about them; "brightest"
+adds what an additive field has from the map's brightest direction alone, with all of its light.
+Leaves `fields.json` and `fields.md`.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,30 +21,27 @@ import numpy as np
 
 from appearance import Exposure, build_scene
 from appearance.bsdf.maps import MappedStrands, scalp_coordinates
-from appearance.fields.anchors import Grid, Places, nested
-from appearance.fields.basis import ViewBasis
+from appearance.fields.anchors import Places
+from appearance.fields.field import Field
 from appearance.fields.fit import fit_pictures
-from appearance.fields.grams import Gram
 from appearance.fields.hits import HitOptions, find_hits
+from appearance.fields.interpolation import Interpolation
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
-from appearance.fields.solver import (
-    AdamOptions,
-    LeastSquares,
-    Seen,
-    adam,
-    conjugate_gradients,
-)
+from appearance.fields.reflectance import CapturedView, ReflectanceField
+from appearance.fields.search import searched
 from appearance.fields.validation import GROUPS
 from appearance.metrics.scores import srgb
+from appearance.model.relight import environment_map
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_olat, render_olat_parts
 from appearance.render.smoothed import smoothed
 from benchmarks.appearance.known_subjects import SmallStage, bent, dome, dyed, ring
 from benchmarks.command import SUBJECT, Benchmark, option
+from benchmarks.fields.solvers import cost, curves, ratio
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
-from reconstruction import Progress, silent
+from reconstruction import Light, Progress, Strands, silent
 from reconstruction.arrays import AnyFloats, Array, Floats
 
 STAGE = SmallStage(size=24, cameras=8, lights=18, spp=48, max_depth=6, truth=(12, 48, 48))
@@ -49,6 +50,9 @@ COARSE = (4, 8, 8)
 DIRECT = 8
 """Times as many paths for the light of the first hit, which no smoothing frees of noise."""
 HELD_VIEWS = (0, 4)
+MAPS = ("studio", "sky")
+MAPPED, BRIGHTEST = "maps", "maps, brightest"
+Pair = tuple[AnyFloats, AnyFloats]
 FIELDS = {
     "GaussianHair's: dual harmonics of the whole picture, degree 3": FieldOptions(
         "whole", degree=3, iterations=12
@@ -66,6 +70,7 @@ class Frames:
     """A subject: `halves` of the truth's and of inverse rendering's pictures, views by number.
 
     Each is two independent pictures `(L, P, 3)`; `pictures` have the means, under all lights.
+    `mapped` holds the bent `strands`.
     """
 
     pictures: tuple[Pictures, ...]
@@ -75,6 +80,8 @@ class Frames:
     scale: float
     held_views: tuple[int, ...]
     held_lights: tuple[int, ...]
+    mapped: MappedStrands
+    strands: Strands
 
     def training(self) -> list[Pictures]:
         """What a fit sees."""
@@ -92,8 +99,11 @@ class Frames:
             if k not in self.held_views
         ]
 
-    def psnr(self, pictures: Mapping[int, tuple[AnyFloats, AnyFloats]]) -> dict[str, float]:
-        """PSNR without noise by group of `GROUPS`: products of errors of independent halves."""
+    def psnr(self, pictures: Mapping[int, Pair]) -> dict[str, float]:
+        """PSNR without noise by group of `GROUPS`: products of errors of independent halves.
+
+        With `MAPPED`, that of held-out views under environments, where all of them are given.
+        """
         found: dict[str, list[Array]] = {g: [] for g in GROUPS}
         for k, (one, other) in pictures.items():
             a, b = (
@@ -107,10 +117,14 @@ class Frames:
                 found[GROUPS[2]].append(product[new].ravel())
             else:
                 found[GROUPS[0]].append(product[new].ravel())
-        return {
+        out = {
             g: float(-10 * np.log10(max(float(np.concatenate(v).mean()), 1e-6)))
             for g, v in found.items()
+            if v
         }
+        if set(self.held_views) <= set(pictures):
+            out[MAPPED] = under_maps(self, lambda k, weights: summed(pictures[k], weights))
+        return out
 
 
 def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
@@ -180,7 +194,97 @@ def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
         scale,
         held,
         held_lights,
+        mapped,
+        noisy,
     )
+
+
+def interpolated(frames: Frames, progress: Progress) -> dict[str, dict[str, float]]:
+    """Rows of interpolated frames: three nearest lights, standard, and guided (Photobooth §4)."""
+    lights = frames.pictures[0].lights
+    kept = [i for i in range(len(lights)) if i not in frames.held_lights]
+    own = [k for k in range(len(frames.pictures)) if k not in frames.held_views]
+    seen = [frames.pictures[k] for k in own]
+    tables = [p.captured[kept].astype(np.float16) for p in seen]
+    cameras = zip(seen, tables, strict=True)
+    views = tuple(CapturedView(p.hits.camera, p.hits.pixels, t) for p, t in cameras)
+    field = ReflectanceField(tuple(lights[i] for i in kept), views, 1.0)
+    standard = Interpolation.of(field, frames.mapped, frames.strands)
+    names = [light.name for light in field.lights]
+    guide = searched(standard, names[1::3], cameras=1, progress=progress)
+    rows = {}
+    towards = np.array([x.position / np.linalg.norm(x.position) for x in lights])
+    cosine = np.clip(towards @ towards[kept].T, -1, 1)
+    order = np.argsort(-cosine, axis=1)[:, :3]
+    weights = 1 / np.maximum(np.arccos(np.take_along_axis(cosine, order, axis=1)), 1e-6)
+    weights /= weights.sum(axis=1, keepdims=True)
+    near = {}
+    for k, table in zip(own, tables, strict=True):
+        mixed = np.einsum("ln,lnpc->lpc", weights, table[order].astype(float))
+        near[k] = mixed, mixed
+    rows["three nearest lights"] = frames.psnr(near)
+    for name, one in (
+        ("standard interpolation (Photobooth's)", standard),
+        ("model-based interpolation (Photobooth's)", replace(standard, model=guide.best)),
+    ):
+        lit = {}
+        for k, p in enumerate(frames.pictures):
+            hits = one.sources[own.index(k)].hits if k in own else p.hits
+            made = one.seen_by(hits).under(lights)[0]
+            lit[k] = made, made
+        rows[name] = frames.psnr(lit)
+    return rows
+
+
+def under_maps(frames: Frames, made: Callable[[int, Array], Pair]) -> float:
+    """PSNR without noise of held-out views under `MAPS`, each exposed by its truth's mean.
+
+    `made(view, weights)` is a view's pair of pictures `(P, 3)` under all lights times weights.
+    """
+    products = []
+    for name in MAPS:
+        weights = map_weights(name, frames.pictures[0].lights)
+        for k in frames.held_views:
+            true = summed(frames.true[k], weights)
+            scale = 0.3 / float(np.mean(true))
+            pairs = zip(made(k, weights), true, strict=True)
+            a, b = (srgb(x * scale) - srgb(t * scale) for x, t in pairs)
+            products.append((a * b).ravel())
+    return float(-10 * np.log10(max(float(np.concatenate(products).mean()), 1e-6)))
+
+
+def summed(pair: Pair, weights: Array) -> Pair:
+    """Two pictures `(P, 3)` of two stacks `(L, P, 3)`."""
+    one, other = (np.tensordot(weights, x, 1) for x in pair)
+    return one, other
+
+
+def in_brightest(frames: Frames, field: Field, k: int, weights: Array) -> Pair:
+    """View k with the field's answer to the brightest light, for the light of all of them."""
+    view = frames.pictures[k]
+    at, light = field.at(view.hits), view.lights[int(np.argmax(weights))]
+    one, other = summed(frames.rendered[k], weights)
+    answer = at.answer(light)
+    if not at.additive:
+        return one * np.maximum(1 + answer, 0), other * np.maximum(1 + answer, 0)
+    given = sum(w * at.irradiance(x) for w, x in zip(weights, view.lights, strict=True))
+    return np.maximum(one + answer * given, 0), np.maximum(other + answer * given, 0)
+
+
+def map_weights(name: str, lights: Sequence[Light]) -> Array:
+    """Of each of the lights, the part of a map that is nearer to it than to others `(L,)`."""
+    envmap = environment_map(name).astype(float).mean(axis=2)
+    height, width = envmap.shape
+    z = np.cos(np.pi * (np.arange(height) + 0.5) / height)
+    angle = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
+    flat = np.sqrt(1 - z**2)[:, None]
+    texels = np.stack(
+        np.broadcast_arrays(flat * np.cos(angle), flat * np.sin(angle), z[:, None]), axis=-1
+    )
+    towards = np.array([x.position / np.linalg.norm(x.position) for x in lights])
+    nearest = (texels @ towards.T).argmax(axis=-1)
+    sums = np.bincount(nearest.ravel(), (envmap * flat).ravel(), len(lights))
+    return np.asarray(sums, float)
 
 
 def rows_of(
@@ -193,6 +297,7 @@ def rows_of(
     rows: dict[str, Any] = {
         "mean colour": frames.psnr(flat),
         "inverse rendering": frames.psnr(dict(enumerate(frames.rendered))),
+        **interpolated(frames, progress),
     }
     for name, options in fields.items():
         progress(name, 0.5)
@@ -206,6 +311,7 @@ def rows_of(
             lit[k] = one, other
         rows[name] = {
             **frames.psnr(lit),
+            BRIGHTEST: under_maps(frames, partial(in_brightest, frames, found.field)),
             "cpu_seconds": seconds,
             "ridge": found.ridge,
             "clamped": found.clamped,
@@ -214,45 +320,6 @@ def rows_of(
             "warnings": found.warnings,
         }
     return rows
-
-
-def solvers(frames: Frames, quick: bool = False) -> dict[str, list[dict[str, float]]]:
-    """Objective above its minimum, as a share of that of no field, against CPU seconds."""
-    options = FieldOptions()
-    training = frames.training()
-    grids = [Grid.of(level, len(frames.places.fitted)) for level in options.levels]
-    samples = [p.samples(options, frames.scale) for p in training]
-    begun = time.process_time()
-    grams = [Gram.of(s, options.degree) for s in samples]
-    reducing = time.process_time() - begun
-    seen = [
-        Seen(ViewBasis.of(p.hits, grids[-1], frames.places, options.degree, in_strands=True), g)
-        for p, g in zip(training, grams, strict=True)
-    ]
-    system = LeastSquares(seen, nested(grids, frames.places), options.degree, 0.03)
-    least = system.objective(conjugate_gradients(system, 12 if quick else 80, 1e-6))
-    start = system.objective(np.zeros(system.shape, np.float32))
-    curves: dict[str, list[dict[str, float]]] = {}
-
-    def watch(name: str, every: int, offset: float) -> Any:
-        curve = curves.setdefault(name, [])
-        clock = [time.process_time() - offset]
-
-        def note(done: int, x: Floats, _: float) -> None:
-            if done % every == 0:
-                now = time.process_time()
-                above = (system.objective(x) - least) / (start - least)
-                curve.append({"cpu_seconds": now - clock[0], "above": float(above)})
-                clock[0] += time.process_time() - now
-
-        return note
-
-    conjugate_gradients(system, 24, 1e-6, None, watch("conjugate gradients", 4, reducing))
-    for rate in (0.003, 0.01, 0.03):
-        steps = 30 if quick else 120
-        note = watch(f"Adam, rate {rate:g}", max(1, steps // 6), 0.0)
-        adam(system, samples, AdamOptions(rate, steps), note)
-    return curves
 
 
 def run_bench(
@@ -274,7 +341,10 @@ def run_bench(
             {"frames_cpu_seconds": made, "rows": rows_of(frames, FIELDS, progress)}
         )
         if k == len(subjects) - 1:
-            result["solvers"] = solvers(frames, quick=rig is SIZES["quick"])
+            training = frames.training()
+            quick = rig is SIZES["quick"]
+            result["solvers"] = curves(training, frames.places, frames.scale, quick=quick)
+            result["ratio"] = ratio(result["solvers"])
         save(out / "fields.json", result)
     (out / "fields.md").write_text(report(result))
     return result
@@ -286,25 +356,42 @@ def report(result: Mapping[str, Any]) -> str:
     lines = []
     for name in seeds[0]:
         cells = []
-        for group in (*GROUPS, "cpu_seconds"):
+        for group in (*GROUPS, MAPPED, BRIGHTEST, "cpu_seconds"):
             values = [rows[name][group] for rows in seeds if group in rows[name]]
             found = spread(values) if values else {}
             sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
             cells.append(f"{found['mean']:.2f}{sd}" if values else "")
         kept = [rows[name]["kept"] for rows in seeds if "kept" in rows[name]]
         lines.append([name, *cells, f"{sum(kept)} of {len(kept)}" if kept else ""])
-    text = markdown(["model", *GROUPS, "fit, CPU s", "kept"], lines) + "\n"
+    text = markdown(["model", *GROUPS, MAPPED, BRIGHTEST, "fit, CPU s", "kept"], lines) + "\n"
     for name, curve in result["solvers"].items():
         points = ", ".join(f"{p['cpu_seconds']:.2f} s: {p['above']:.1e}" for p in curve)
         text += f"- {name}: {points}\n"
+    least = result["ratio"]
+    if "cpu_seconds" in least:
+        text += (
+            f"- to {least['above']:.1e}: {least['cpu_seconds']:.2f} s, "
+            f"Adam {least['adam_cpu_seconds']:.2f} s\n"
+        )
     return text
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    if args.cost:
+        result = cost(tuple(args.cost), args.out, args.seed, progress)
+        save(args.out / "fields_cost.json", result)
+        return result
     rig = SIZES["quick"] if args.quick else STAGE
     count = 1 if args.quick else args.seeds
     subjects = [simulated(args.rig, args.subject, args.head, args.seed + k) for k in range(count)]
     return run_bench(args.out, subjects, rig, seed=args.seed, progress=progress)
 
 
-BENCHMARK = Benchmark(_bench, (*SUBJECT, option("--seeds", "of the table", type=int, default=3)))
+SEEDS = option("--seeds", "of the table", type=int, default=3)
+COST = option(
+    "--cost",
+    "only what a whole fit to synthetic pictures takes: hair pixels a view, views, lights",
+    type=int,
+    nargs=3,
+)
+BENCHMARK = Benchmark(_bench, (*SUBJECT, SEEDS, COST))

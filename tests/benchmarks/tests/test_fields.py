@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from benchmarks.fields.modulation import FIELDS, SIZES, frames_of, rows_of, solvers
+from benchmarks.fields.modulation import FIELDS, SIZES, frames_of, rows_of
+from benchmarks.fields.solvers import curves
 from benchmarks.subjects import Subject
 
 from appearance import HairAppearance
@@ -25,7 +26,7 @@ def test_rows_are_of_pictures_that_no_fit_saw(small):
     name = "modulation, degree 0"
     rows = rows_of(frames, {name: FIELDS[name]}, silent)
     assert set(rows) == {"mean colour", "inverse rendering", name}
-    curves = solvers(frames, quick=True)
-    above = [p["above"] for p in curves["conjugate gradients"]]
+    found = curves(training, frames.places, frames.scale, quick=True)
+    above = [p["above"] for p in found["conjugate gradients"]]
     assert above == sorted(above, reverse=True)
-    assert above[-1] < curves["Adam, rate 0.01"][-1]["above"]
+    assert above[-1] < found["Adam, rate 0.01"][-1]["above"]
