@@ -52,9 +52,11 @@ class Groom:
     ) -> Groom:
         """The groom of a model, with what its points and its scalp's map say of it.
 
-        `capture` gives the head where none was laid. Raises `ModelError` naming what is missing.
+        `capture` gives the head where none was laid. A model that was never fitted gets the usual
+        brown (`FittedModel.unfitted`). Raises `ModelError` naming what is missing.
         """
-        fitted = FittedModel.load(model, capture)
+        made = FittedModel.load if model.has("appearance.json") else FittedModel.unfitted
+        fitted = made(model, capture)
         measured = model.points().points if model.has("points.npz") else None
         groom = cls.of(fitted, options or ExportOptions(), measured)
         if fitted.head is None or not model.has("scalp_map.npz"):

@@ -47,7 +47,7 @@ BASELINE_PIXELS, BASELINE_LIGHTS = 100, 48  # of each camera: what mean colour a
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """One frame by every method, radiance `(H, W, 3)`, and where the hair is."""
+    """One frame by every method, radiance `(H, W, 3)`, and where the hair is, unless saturated."""
 
     camera: Camera
     light: Light
@@ -206,9 +206,11 @@ class _Comparison:
         }
         out = []
         for i, n in enumerate(names):
-            frames: dict[str, AnyFloats] = {"captured": capture.light(n, name)[0]}
+            captured, saturated = capture.light(n, name)
+            frames: dict[str, AnyFloats] = {"captured": captured}
             frames |= {method: rendered[i] for method, rendered in images.items()}
-            out.append(_Compared(camera, capture.rig.light(n), frames, mask))
+            if (judged := mask & ~saturated).any():
+                out.append(_Compared(camera, capture.rig.light(n), frames, judged))
         return out
 
     def _interpolate(self, images: Sequence[_Compared], scene: HairScene, *, own: bool) -> None:
@@ -221,7 +223,8 @@ class _Comparison:
             if own:
                 continue
             if camera.name not in views:
-                views[camera.name] = NearestCameras.of(self.training, camera, scene, image.mask)
+                mask = self.model.mask(camera.name, "hair", self.capture)
+                views[camera.name] = NearestCameras.of(self.training, camera, scene, mask)
             view = views[camera.name]
             if view is not None:
                 image.frames["nearest_cameras"] = view(light)

@@ -17,6 +17,7 @@ from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction import Camera, Capture, Light
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
+SATURATED = 1e-3  # the weight of what is saturated: it counts where all is
 CAMERAS = 3
 """Nearest cameras that are asked; lights are three, too."""
 
@@ -27,7 +28,8 @@ def three_nearest(
     """`camera`'s frames `(H, W, 3)` under the three `training` lights nearest to `light`, mixed.
 
     Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
-    distance to what `light` would give. `light` itself is never among the three.
+    distance to what `light` would give. `light` itself is never among the three. A pixel that is
+    saturated in some of them is mixed of the others.
     """
     names = [n for n in training if n != light.name and capture.has_light(n, camera)]
     others = [capture.rig.light(n) for n in names]
@@ -35,13 +37,15 @@ def three_nearest(
     distance = np.linalg.norm(positions, axis=1)
     own = float(np.linalg.norm(light.position))
     nearest, weights = _nearest(positions, light.position, 3)
-    total = np.zeros(1)
+    total, known = np.zeros(1), np.zeros(1)
     for k, weight in zip(nearest, weights, strict=True):
         here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
         gain = here / np.maximum(there, 1e-12)
         gain *= (distance[k] / own) ** 2
-        total = total + weight * gain * capture.light(names[k], camera)[0]
-    return np.asarray(total)
+        frame, saturated = capture.light(names[k], camera)
+        share = weight * np.where(saturated, SATURATED, 1.0)[..., None]
+        total, known = total + share * gain * frame, known + share
+    return np.asarray(total / np.maximum(known, 1e-12))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,16 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from appearance.bsdf.absorption import of_melanin
 from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.fields.field import FIELD_FILE, Field, FieldOnStrands
 from appearance.inverse_rendering.found_lights import LIGHTS_FILE, lights_as_found
+from appearance.metrics.scores import Exposure
+from appearance.observations import HeldOut
 from appearance.render.mixed import Environment, render_mixed
 from appearance.render.tracing import SAMPLING, Sampling
+from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Camera, Capture, Light, Mesh, Model, ModelError, Rig, Strands
 from reconstruction.arrays import Array, Floats
+
+BROWN = 1.3, 0.0
+"""Eumelanin and pheomelanin of brown hair (d'Eon et al. 2011, as in pbrt)."""
+SKIN = 0.5, 0.35, 0.28
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +76,21 @@ class FittedModel:
                 f"holds {len(strands)}: fit again"
             )
         return cls(strands, model.head(capture), appearance, maps, placed, rig, found, field)
+
+    @classmethod
+    def unfitted(cls, model: Model, capture: Capture | None = None) -> FittedModel:
+        """The strands and head of a model without a fit, as brown hair: for who wants strands.
+
+        Raises `ModelError` where it has no strands.
+        """
+        strands, hair = model.strands(), HairAppearance(of_melanin(*BROWN), 0.3, 0.3)
+        colour = tuple(float(c) for c in colour_of_absorption(hair.sigma_a, hair.beta_n))
+        v = float(variance_of_roughness(hair.beta_m))
+        r, g, b = colour
+        appearance = FittedAppearance(hair, (r, g, b), SKIN, Exposure(1.0), v, v, v, HeldOut())
+        maps, head = HairMaps.of(hair), model.head(capture)
+        rig = None if capture is None else capture.rig
+        return cls(strands, head, appearance, maps, model.root_uv(strands), rig, (), None)
 
     @classmethod
     def alternatives(cls, model: Model, capture: Capture) -> dict[str, FittedModel]:

@@ -321,19 +321,23 @@ class Capture:
         """Steps of one kind in the order they were shot."""
         return tuple(s for s in self.steps if s.kind == kind)
 
-    def olat(self, camera: str, lights: list[str] | None = None) -> Floats:
+    def olat(self, camera: str, lights: list[str] | None = None) -> tuple[Floats, Bools]:
         """Responses `(L, H, W, 3)` to single lights, in the order of `lights` (default: rig order).
 
-        Raises `MissingFrame` when one of them was not shot.
+        Also where they are known `(L, H, W)`: not where saturated, nor, with zeros, where the frame
+        is missing. Raises `MissingFrame` where the plan never had one of the lights.
         """
         names = self.olat_lights() if lights is None else lights
         absent = [n for n in names if n not in self._of_light]
         if absent:
             raise MissingFrame(f"{self.path}: the plan has no frame for the lights {absent[:5]}")
-        out = np.empty((len(names), *self._shape(camera), 3), np.float32)
+        out = np.zeros((len(names), *self._shape(camera), 3), np.float32)
+        known = np.zeros(out.shape[:3], bool)
         for i, name in enumerate(names):
-            out[i] = self.light(name, camera)[0]
-        return out
+            if self.has_light(name, camera):
+                out[i], saturated = self.light(name, camera)
+                known[i] = ~saturated
+        return out, known
 
     def olat_lights(self) -> list[str]:
         """Names of the lights that were shot one at a time, in rig order."""

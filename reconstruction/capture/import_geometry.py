@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -46,6 +46,34 @@ class GeometryFiles:
     lights: Path | None = None
     light_distance: Annotated[float, Field(gt=0, le=FURTHEST)] | None = None
     placement: PlacementOptions = PlacementOptions()
+
+
+CAMERA_FILES = ("sparse/0", "sparse", "transforms.json", "cameras.xml")
+LIGHT_FILES = ("lights.csv", "lights.txt", "light_pos.npy")
+
+
+def files_in(folder: Path, said: GeometryFiles) -> GeometryFiles:
+    """`said`, its paths in `folder`; unsaid, the first of `CAMERA_FILES` and `LIGHT_FILES` there.
+
+    Neither is looked for beside the folder's own cameras.json and lights.json. Raises
+    `PlacementError` where no file says where the cameras are, or the lights.
+    """
+    cameras, lights = (None if p is None else folder / p for p in (said.cameras, said.lights))
+    if cameras is None and folder.is_dir() and not (folder / "cameras.json").is_file():
+        cameras = next((p for n in CAMERA_FILES if (p := folder / n).exists()), None)
+        if cameras is None:
+            raise PlacementError(
+                f"{folder}: nothing says where the cameras are: give --cameras (COLMAP's folder, "
+                "transforms.json, Metashape's or OpenCV's file), or put cameras.json there"
+            )
+    if cameras is not None and lights is None and not (folder / "lights.json").is_file():
+        lights = next((p for n in LIGHT_FILES if (p := folder / n).exists()), None)
+        if lights is None:
+            raise PlacementError(
+                f"{folder}: nothing says where the lights are: give --lights (.csv, .json, .npy or "
+                ".obj of their positions or directions), or put lights.json there"
+            )
+    return replace(said, cameras=cameras, lights=lights)
 
 
 def read_geometry(files: GeometryFiles) -> Geometry:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from reconstruction.capture.folder import CaptureError, Step, StepKind
+from reconstruction.capture.import_geometry import GeometryFiles
 from reconstruction.files.pictures import FORMATS, LOSSY, Positive, Sensor
 from reconstruction.geometry.rig import Rig
 from reconstruction.options import BadOptions, options, parse_options
@@ -51,7 +52,8 @@ class ImportSettings:
     `exposure` in seconds is that of pictures whose pattern has no `{exposure}`; `exposures` names
     others. `first_light`: the number in a picture's name that stands for the first light of the
     list, those after it following; None: the number that the light's own name ends in. `units`:
-    whether a full channel at 1 s is `scale` W/(sr m²), or unknown.
+    whether a full channel at 1 s is `scale` W/(sr m²), or unknown. `geometry`: the files of cameras
+    and lights, relative to the folder.
     """
 
     pictures: Patterns = Patterns()
@@ -61,6 +63,7 @@ class ImportSettings:
     first_light: int | None = None
     units: Literal["radiance", "relative"] | None = None
     scale: Positive = 1.0
+    geometry: GeometryFiles = GeometryFiles()
 
 
 def read_settings(path: Path) -> ImportSettings:

@@ -50,9 +50,9 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     """How each pixel of `subject` answers single lights: `(4, H, W)`, 0 outside.
 
     The log of the gloss, see `matte_fit`; log ratios of red to green and of green to blue under all
-    lights together; the log of the matte surface's albedo. Gloss and albedo of answers averaged
-    over 3×3 pixels. At most about `lights` of the lights are read. None where fewer than
-    `FEWEST_LIGHTS` were shot, or the subject is empty.
+    lights that do not saturate the pixel together; the log of the matte surface's albedo. Gloss and
+    albedo of answers averaged over 3×3 pixels. At most about `lights` of the lights are read. None
+    where fewer than `FEWEST_LIGHTS` were shot, or the subject is empty.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
     if len(names) < FEWEST_LIGHTS or not subject.any():
@@ -60,18 +60,21 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     names = names[:: max(1, len(names) // lights)]
     near = ndimage.uniform_filter(subject.astype(np.float64), 3)[subject]
     values = np.empty((int(subject.sum()), len(names)), np.float32)
+    known = np.empty(values.shape, bool)
     colour, noise = np.zeros((len(values), 3)), 0.0
     for k, name in enumerate(names):
         intensity = capture.rig.light(name).intensity_towards(np.zeros(3)).mean()
-        image = capture.light(name, camera)[0] / np.float32(max(intensity, 1e-12))
-        colour += image[subject]
+        image, saturated = capture.light(name, camera)
+        image = image / np.float32(max(intensity, 1e-12))
+        colour += np.where(saturated[subject][:, None], 0, image[subject])
+        known[:, k] = ~ndimage.maximum_filter(saturated & subject, 3)[subject]
         grey = image.mean(axis=-1)
         noise += background_noise(grey) ** 2 / 9
         smooth = ndimage.uniform_filter(np.where(subject, grey, np.float32(0)), 3)
         values[:, k] = smooth[subject] / near
     directions = np.stack([capture.rig.light(n).position for n in names])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    gloss, albedo = matte_fit(values, directions, noise)
+    gloss, albedo = matte_fit(values, directions, noise, known)
     faint = max(1e-3 * float(np.median(colour)), 1e-12)
     logs = np.log(np.maximum(colour, faint))
     out = np.zeros((4, *subject.shape))
@@ -81,25 +84,29 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     return out
 
 
-def matte_fit(values: AnyFloats, directions: Array, noise: float = 0.0) -> tuple[Array, Array]:
+def matte_fit(
+    values: AnyFloats, directions: Array, noise: float = 0.0, known: Bools | None = None
+) -> tuple[Array, Array]:
     """Gloss and albedo `(N,)` of pixels that answer `values (N, L)` to lights from `directions`.
 
     The matte surface `max(g·l, 0)` that fits best, with what answers less than half of it taken as
     shadowed. Gloss is the root of the energy above that surface as a share of all of it, less
     `noise`, the variance of the noise summed over lights; the albedo is |g|, in `values`' units.
-    `directions (L, 3)` are unit vectors.
+    `directions (L, 3)` are unit vectors. Values that are not `known (N, L)` are saturated: they do
+    not move the matte surface, and what they have above it is the least that they may have.
     """
     outer = (directions[:, :, None] * directions[:, None]).reshape(len(directions), 9)
     gloss, albedo = np.zeros((2, len(values)))
     for begin in range(0, len(values), _BLOCK):
         block = np.s_[begin : begin + _BLOCK]
         v = np.asarray(values[block], np.float64)
-        lit = v > 0.25 * np.quantile(v, 0.95, axis=1, keepdims=True)
+        whole = np.ones(v.shape, bool) if known is None else known[block]
+        lit = whole & (v > 0.25 * np.quantile(v, 0.95, axis=1, keepdims=True))
         for _ in range(4):
             moments = (lit @ outer).reshape(-1, 3, 3) + 1e-2 * np.eye(3)
             g = np.linalg.solve(moments, ((lit * v) @ directions)[..., None])[..., 0]
             matte = np.maximum(g @ directions.T, 0)
-            lit = (v > _SHADOWED * matte) & (matte > 0)
+            lit = whole & (v > _SHADOWED * matte) & (matte > 0)
         # half of the noise about zero lies above it
         above = (np.maximum(v - matte, 0) ** 2).sum(axis=1) - noise / 2
         energy = np.maximum((v**2).sum(axis=1) - noise, np.finfo(float).tiny)

@@ -132,7 +132,10 @@ def texture(image: AnyFloats, mask: Bools, scale: float = 4.0) -> Floats:
 
 
 def orientations(
-    images: AnyFloats, mask: Bools, bank: LogGaborBank = LogGaborBank()
+    images: AnyFloats,
+    mask: Bools,
+    bank: LogGaborBank = LogGaborBank(),
+    known: Bools | None = None,
 ) -> OrientationMap:
     """The orientation at every pixel of `mask (H, W)` from `images (N, H, W)`, one per lighting.
 
@@ -140,7 +143,8 @@ def orientations(
     faint to win under any one light still adds up under many. (Sun Eq. 2 averages each lighting's
     winner.) The isotropic part of that sum, which noise leaves, does not count for confidence.
 
-    A winner is refined below the bank's bins by the parabola through its neighbours.
+    Where a lighting is not `known (N, H, W)`, as it is saturated, it has no detail. A winner is
+    refined below the bank's bins by the parabola through its neighbours.
     """
     images = np.asarray(images)
     if images.ndim == 2:
@@ -151,10 +155,11 @@ def orientations(
     answers = np.empty((bank.count, *mask.shape), np.float32)
     total = np.zeros_like(answers)
     bright = float(np.abs(images[:, mask]).mean()) if mask.any() and len(images) else 0.0
-    for image in images:
+    for k, image in enumerate(images):
         local = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), 4.0)
         lit = np.maximum(local, 0) / max(bright, 1e-30)
-        _answer(bank, texture(image, mask) * lit, answers)
+        told = mask if known is None else mask & known[k]
+        _answer(bank, texture(image, told) * lit, answers)
         total += answers
     said = total.max(axis=0) > _FAINTEST
     total -= total.min(axis=0)

@@ -11,6 +11,8 @@ from reconstruction.capture.folder import Capture, Step
 
 NOISE_FACTOR = 5.0
 FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light, even without noise
+DARKEST = 0.05  # of the 95th percentile: what is densest above it is the subject
+MOST_SATURATED = 0.02
 SMALLEST = 6  # pixels: smaller specks are noise
 
 
@@ -57,13 +59,41 @@ def _dark_of(capture: Capture, step: Step, camera: str) -> Floats:
 
 
 def background_noise(image: AnyFloats) -> float:
-    """Standard deviation of the unlit pixels of a dark-subtracted `image (...)`.
+    """Standard deviation of the unlit pixels of a dark-subtracted `image (...)`."""
+    return background(image)[1]
+
+
+def background(image: AnyFloats) -> tuple[float, float]:
+    """Level and standard deviation of the unlit pixels of a dark-subtracted `image (...)`.
 
     Noise about zero is symmetric and the subject only adds light, so the values below zero are the
-    lower half of the noise's distribution. 0 where nothing is below zero.
+    lower half of the noise's distribution. Where none is below zero, black was clipped: what is
+    left of the noise is above it, most densely at the half-sample mode (Robertson and Cryer 1974),
+    and symmetric about that, unless it is still cut at zero. Both are 0 where zeros lie side by
+    side, black without noise, and where that mode is no darkness.
     """
     below = -image[image < 0]
-    return 1.4826 * float(np.median(below)) if below.size else 0.0
+    if below.size:
+        return 0.0, 1.4826 * float(np.median(below))
+    zero = image <= 0
+    cut = zero.mean() > 0.01
+    if cut and (zero[..., :-1] & ~zero[..., 1:]).sum() < 0.3 * zero[..., :-1].sum():
+        return 0.0, 0.0  # zeros lie side by side: black without noise
+    values = np.sort(image[~zero], axis=None)
+    level = _half_sample_mode(values)
+    if not 0 < level < DARKEST * float(np.quantile(values, 0.95)):
+        return 0.0, 0.0
+    noise = 1.4826 * float(np.median(level - values[values <= level]))
+    return level, max(noise, level) if cut else noise
+
+
+def _half_sample_mode(values: AnyFloats) -> float:
+    """Where sorted `values (N,)` are densest: the densest half of the densest half, and so on."""
+    while len(values) > 2:
+        half = (len(values) + 1) // 2
+        first = int(np.argmin(values[half - 1 :] - values[: len(values) - half + 1]))
+        values = values[first : first + half]
+    return float(np.mean(values)) if len(values) else 0.0
 
 
 def lit_image(capture: Capture, camera: str) -> Floats:
@@ -74,14 +104,26 @@ def lit_image(capture: Capture, camera: str) -> Floats:
 def lit_rgb(capture: Capture, camera: str) -> Floats:
     """The subject under as many lights as the capture has, less the dark frame `(H, W, 3)`.
 
-    The all-on frames' mean at full level, else the sum of the OLAT frames, else the first tracking
-    frame. Raises `NoSilhouette` where the camera has none of them.
+    The all-on frame at full level, else the sum of the OLAT frames, else the first tracking frame;
+    one that is saturated in over `MOST_SATURATED` of what is lit only where no other kind is there.
+    Raises `NoSilhouette` where the camera has none of them.
     """
+    blown: list[Step] = []
     for kind, first in (("all_on", True), ("olat", False), ("tracking", True)):
         steps = [s for s in capture.steps if s.kind == kind and capture.has(s, camera)]
+        if first and steps and _blown(capture, camera, steps[0]):
+            blown, steps = blown or steps[:1], []
         if steps:
             return _sum(capture, camera, steps[:1] if first else steps)
+    if blown:
+        return _sum(capture, camera, blown)
     raise NoSilhouette(f"{capture.path}: {camera} has no all_on, olat or tracking frame")
+
+
+def _blown(capture: Capture, camera: str, step: Step) -> bool:
+    image, saturated = capture.response_and_saturated(step, camera)
+    lit = int((image.mean(axis=-1) > 0.1 * float(image.max(initial=0.0))).sum())
+    return int(saturated.sum()) > MOST_SATURATED * max(lit, 1)
 
 
 def silhouette(capture: Capture, camera: str) -> Bools:
@@ -97,7 +139,8 @@ def silhouette(capture: Capture, camera: str) -> Bools:
     image = lit_image(capture, camera)
     positive = image[image > 0]
     bright = float(np.percentile(positive, 95)) if positive.size else 0.0
-    noise = background_noise(image)
+    level, noise = background(image)
+    image, bright = image - np.float32(level), bright - level
     if bright <= NOISE_FACTOR * noise:
         return np.zeros(image.shape, bool)
     mask = image > max(NOISE_FACTOR * noise, FAINTEST * bright)

@@ -138,11 +138,16 @@ def _view(
 ) -> View:
     at = np.asarray(subject, float)
     lights = [capture.rig.light(n) for n in names]
-    images = np.empty((len(names), camera.height, camera.width), np.float32)
+    images = np.zeros((len(names), camera.height, camera.width), np.float32)
     clipped = np.zeros(images.shape, bool)
+    shot = np.array([capture.has_light(n, camera.name) for n in names])
+    if not shot.any():
+        raise CaptureError(f"{capture.path}: {camera.name} has no frame of a single light")
     noise = 0.0
     dark = dark_frame(capture, camera.name)
     for i, (name, light) in enumerate(zip(names, lights, strict=True)):
+        if not shot[i]:
+            continue
         image, clipped[i] = capture.light(name, camera.name)
         irradiance = float(light.intensity_towards(at).mean())
         irradiance /= float(((light.position - at) ** 2).sum())
@@ -153,9 +158,10 @@ def _view(
             )
         images[i] = (image.mean(axis=-1) - dark) / irradiance
         noise = max(noise, background_noise(images[i]))
-    found = orientations(images, mask, bank)
-    furthest = int(np.argmax([np.linalg.norm(x.position - camera.center) for x in lights]))
+    found = orientations(images[shot], mask, bank, known=~clipped[shot])
+    away = [np.linalg.norm(x.position - camera.center) for x in lights]
+    furthest = int(np.argmax(np.where(shot, away, -1.0)))
     smooth = along_lines(images, found.angle)
-    codes = code_map(smooth, mask, furthest, noise, clipped)
+    codes = code_map(smooth, mask, furthest, noise, clipped, shot)
     lines = line_vectors(found.angle, found.confidence)
     return View(camera, mask, lines, codes, light_beside(camera, lights, at))

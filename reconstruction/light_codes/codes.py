@@ -23,11 +23,13 @@ class CodeMap:
     others say nothing within this view. `threshold` is the response at which a pixel counts as
     lit, `noise` the part of it that the sensor's noise asked for. `reached`, packed alike, marks
     the lights of which anything arrives: by reciprocity, what stands beside them sees the pixel.
+    `shot (words,)` marks the lights of which there is a frame: of the others nothing is known.
     """
 
     words: Words
     reached: Words
     varying: Words
+    shot: Words
     threshold: float
     noise: float
 
@@ -86,6 +88,7 @@ def code_map(
     furthest: int,
     noise: float = 0.0,
     saturated: Bools | None = None,
+    shot: Bools | None = None,
 ) -> CodeMap:
     """Lightcodes from responses `(L, H, W)` to single lights of equal irradiance on the subject.
 
@@ -93,11 +96,13 @@ def code_map(
     one furthest from the camera, which shows what a shadow looks like; and three times `noise`,
     the responses' standard deviation; and `LEAST_LIT`, where the head itself stands before that
     light and its median is next to nothing. It is reached by a light that brings it `LEAST_REACHED`
-    and more than the noise. `saturated (L, H, W)` pixels are both whatever their value. Raises
-    `ValueError` where shapes disagree.
+    and more than the noise. `saturated (L, H, W)` pixels are both whatever their value. `shot (L,)`
+    says of which lights there is a frame (all): the others' bits are 0. Raises `ValueError` where
+    shapes disagree.
     """
     if responses.ndim != 3 or responses.shape[1:] != mask.shape:
         raise ValueError(f"expected responses (L, {mask.shape}), got {responses.shape}")
+    shot = np.ones(len(responses), bool) if shot is None else shot
     shadow = float(np.median(responses[furthest][mask])) if mask.any() else 0.0
     brightest = responses.max(axis=0)[mask]
     faint = LEAST_LIT * float(np.median(brightest)) if len(brightest) else 0.0
@@ -106,10 +111,13 @@ def code_map(
     full = np.array([np.percentile(r[mask], 95) if mask.any() else 0.0 for r in responses])
     least = np.maximum(LEAST_REACHED * full, 3 * noise)
     reached = (responses > least[:, None, None]) & mask
+    lit &= shot[:, None, None]
+    reached &= shot[:, None, None]
     if saturated is not None:
         lit |= saturated & mask
         reached |= saturated & mask
     bits = np.moveaxis(lit, 0, -1)
     inside = bits[mask]
     varying = np.asarray(inside.any(axis=0) & ~inside.all(axis=0))
-    return CodeMap(pack(bits), pack(np.moveaxis(reached, 0, -1)), pack(varying), threshold, noise)
+    reaching = pack(np.moveaxis(reached, 0, -1))
+    return CodeMap(pack(bits), reaching, pack(varying), pack(shot), threshold, noise)

@@ -58,8 +58,11 @@ class DeviceViews:
         self.geometry = u(geometry.astype(np.uint32).ravel())
         self.lines = u(fixed[:, 0].astype(np.uint32) | fixed[:, 1].astype(np.uint32) << 16)
         self.words = [u(np.ascontiguousarray(w)) for w in words.T]
-        varying = np.stack([v.codes.varying for v in views])
-        self.varying = [u(np.ascontiguousarray(w)) for w in varying.T]
+        varying, shot = (
+            np.stack([getattr(v.codes, name) for v in views]).T for name in ("varying", "shot")
+        )
+        self.varying = [u(np.ascontiguousarray(w)) for w in varying]
+        self.shot = [u(np.ascontiguousarray(w)) for w in shot]
 
     def projection(self, view: Any, point: Any, weight: float) -> Any:
         """Homogeneous pixels of `point` (weight 1) or of a direction (weight 0) in `view`."""
@@ -84,9 +87,14 @@ class DeviceViews:
         )
 
     def asked(self, view: Any, reference: Any) -> list[Any]:
-        """The lights by which a pair of views is compared, as words."""
+        """The lights by which a pair of views is compared, as words: those shot in both."""
         u = self.types.UInt32
-        return [dr.gather(u, w, view) | dr.gather(u, w, reference) for w in self.varying]
+
+        def both(words: Any) -> tuple[Any, Any]:
+            return dr.gather(u, words, view), dr.gather(u, words, reference)
+
+        pairs = [(*both(w), *both(s)) for w, s in zip(self.varying, self.shot, strict=True)]
+        return [(a | b) & (c & d) for a, b, c, d in pairs]
 
     def corner(self, view: Any) -> tuple[Any, Any, Any]:
         """Width, height and offset in the flat arrays."""

@@ -66,13 +66,15 @@ class DepthSearch:
     def visible(self, view: int, y: Ints, x: Ints) -> Bools:
         """Which neighbours see the pixels `(P, N)`: a light beside them reaches the pixel.
 
-        A neighbour without a light beside it is taken to see what it stands near to.
+        A neighbour without a light beside it, or without a frame of that light, is taken to see
+        what it stands near to.
         """
         own = self.views[view]
         words = own.codes.reached[y, x]
         bits = unpack(words, 32 * words.shape[1])
+        shot = unpack(own.codes.shot, bits.shape[1])
         sees = [
-            bits[:, b] if (b := self.views[k].beside) >= 0 else np.ones(len(x), bool)
+            bits[:, b] if (b := self.views[k].beside) >= 0 and shot[b] else np.ones(len(x), bool)
             for k in self.neighbours[view]
         ]
         return np.stack(sees, axis=1) if sees else np.zeros((len(x), 0), bool)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.capture.folder import CaptureError
+from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.orientation import responses, texture
 from reconstruction.masks import MaskedCapture
@@ -24,9 +25,10 @@ from reconstruction.tangents.line_evidence import (
     pool,
     seen_by,
 )
-from reconstruction.tangents.reflection import FEWEST_LIGHTS, reflection_scores
+from reconstruction.tangents.reflection import FEWEST_LIGHTS, Answers, reflection_scores
 
 CANDIDATES = 500  # directions that are scored at each point
+MOST_SATURATED = 0.1
 LIGHT_GROUPS = 24  # of neighbouring lights; the texture of each shows different fibres
 
 
@@ -69,6 +71,41 @@ def light_groups(lights: list[Light], count: int) -> Ints:
     return np.asarray(group, np.int64)
 
 
+def read_answers(capture: Capture, camera: Camera, lights: Sequence[str]) -> Answers:
+    """What `camera` saw under each of `lights` alone; what is missing or saturated is not known."""
+    olat = np.zeros((len(lights), camera.height, camera.width), np.float32)
+    known = np.zeros(olat.shape, bool)
+    for i, name in enumerate(lights):
+        if capture.has_light(name, camera.name):
+            image, saturated = capture.light(name, camera.name)
+            olat[i], known[i] = image.mean(axis=-1), ~saturated
+    return Answers(camera, olat, known)
+
+
+@dataclass
+class Saturation:
+    """How much of what hair answered to lights is left out as saturated."""
+
+    asked: int = 0
+    saturated: int = 0
+
+    def add(self, answers: Answers, hair: Bools) -> None:
+        """Count one camera's on its `hair (H, W)`."""
+        known = answers.known[answers.shot][:, hair]
+        self.asked += known.size
+        self.saturated += known.size - int(known.sum())
+
+    def tell(self, stage: Stage) -> None:
+        """Leave the share in the report; warn where it is much."""
+        share = self.saturated / max(self.asked, 1)
+        stage.figures["saturated"] = share
+        if share > MOST_SATURATED:
+            stage.warn(
+                f"{share:.0%} of the hair's answers to single lights are saturated and left out: "
+                "shoot them at a shorter exposure too"
+            )
+
+
 def measure_tangents(
     masked: MaskedCapture,
     points: Array,
@@ -90,16 +127,19 @@ def measure_tangents(
     lights = [capture.rig.light(n) for n in names]
     group = light_groups(lights, LIGHT_GROUPS)
     cameras = [c for c in masked.cameras if masked.masks[c.name].hair.any()]
-    evidences, pictures = [], []
+    evidences, pictures, left_out = [], [], Saturation()
     for done, camera in enumerate(cameras):
         progress("texture", done / len(cameras))
         mask = masked.masks[camera.name].hair
-        olat = capture.olat(camera.name, names).mean(axis=-1)
-        pictures.append((camera, olat))
+        answers = read_answers(capture, camera, names)
+        pictures.append(answers)
+        left_out.add(answers, mask)
         details = [
-            texture(olat[group == g].sum(axis=0), mask, options.texture_scale)
+            texture(answers.olat[of].sum(axis=0), mask & whole, options.texture_scale)
             for g in np.unique(group)
-        ]
+            if (of := (group == g) & answers.shot).any()
+            and (whole := answers.known[of].all(axis=0)).any()
+        ] or [np.zeros(mask.shape, np.float32)]
         support = line_support(responses(options.bank, np.stack(details)))
         evidences.append(LineEvidence(camera, support, mask, depths[camera.name]))
     points = thinned(
@@ -107,6 +147,7 @@ def measure_tangents(
     )
     seen = np.stack([seen_by(e, points, options.tolerance) for e in evidences], axis=1)
     points, seen = points[seen.any(axis=1)], seen[seen.any(axis=1)]
+    left_out.tell(stage)
     stage.figures["lines"] = condition_lines(evidences, points, seen).figures()
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")

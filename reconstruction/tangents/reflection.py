@@ -46,31 +46,49 @@ def surface_normals(points: Array, towards: Array, neighbours: int = 40) -> Arra
 
 
 @dataclass(frozen=True, eq=False)
+class Answers:
+    """What a camera saw under each of L single lights: `olat (L, H, W)`, `known (L, H, W)`.
+
+    Not known is what is saturated, and, with zeros, a frame that is missing.
+    """
+
+    camera: Camera
+    olat: AnyFloats
+    known: Bools
+
+    @property
+    def shot(self) -> Bools:
+        """Of which lights `(L,)` anything is known."""
+        return np.asarray(self.known.any(axis=(1, 2)))
+
+
+@dataclass(frozen=True, eq=False)
 class Observations:
     """One camera's answers at the points it sees.
 
     `index (P,)` into the points, `response (P, L)` to each light, corrected for the light's
-    distance and intensity and divided by the mean over the lights in front; `to_light (P, L, 3)`
-    and `to_camera (P, 3)` are unit vectors, `facing (P, L)` the cosines of the lights to the
-    surface's normal.
+    distance and intensity and divided by the mean over the lights in front; `known (P, L)` where
+    that says anything; `to_light (P, L, 3)` and `to_camera (P, 3)` are unit vectors, `facing
+    (P, L)` the cosines of the lights to the surface's normal.
     """
 
     index: Ints
     response: Floats
+    known: Bools
     to_light: Floats
     to_camera: Floats
     facing: Floats
 
 
 def observe(
-    camera: Camera,
-    olat: AnyFloats,
+    answers: Answers,
     lights: Sequence[Light],
     points: Array,
     normals: Array,
     seen: Bools,
 ) -> Observations:
-    """What `camera` saw under each light (`olat (L, H, W)`) at the `points (N, 3)` it sees."""
+    """What a camera saw under each light at those of `points (N, 3)` that it has `seen (N,)`."""
+    camera = answers.camera
     index = np.flatnonzero(seen)
     pixels, _ = camera.project(points[index])
     x, y = np.rint(pixels).astype(int).T
@@ -78,16 +96,20 @@ def observe(
     square = (away**2).sum(axis=2)
     to_light = (away / np.sqrt(square)[..., None]).astype(np.float32)
     strength = np.stack([x.intensity_towards(points[index]).mean(axis=-1) for x in lights], axis=1)
-    response = np.maximum(olat[:, y, x].T, 0) * square / np.maximum(strength, 1e-30)
+    known = answers.known[:, y, x].T
+    response = np.maximum(answers.olat[:, y, x].T, 0) * square / np.maximum(strength, 1e-30)
     facing = np.einsum("pld,pd->pl", to_light, normals[index].astype(np.float32))
-    front = facing > _GRAZING
+    front = (facing > _GRAZING) & known
     mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)
     response = response / np.maximum(mean, 1e-30)[:, None]
+    # a saturated highlight that is as bright as any is taken to be tells as much as a whole one
+    known |= (response >= _BRIGHTEST) & answers.shot
     to_camera = camera.center - points[index]
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     return Observations(
         index,
         np.minimum(response, _BRIGHTEST).astype(np.float32),
+        known,
         to_light,
         to_camera.astype(np.float32),
         facing,
@@ -127,8 +149,8 @@ class Reflection:
         """Fill the table from points that are `trusted (N,)` to lie along `directions (N, 3)`."""
         total, count = np.zeros(_FACINGS), np.zeros(_FACINGS)
         for o in observations:
-            cell = _facing_cell(o.facing).ravel()
-            total += np.bincount(cell, o.response.ravel(), _FACINGS)
+            cell = _facing_cell(o.facing)[o.known]
+            total += np.bincount(cell, o.response[o.known], _FACINGS)
             count += np.bincount(cell, minlength=_FACINGS)
         lit = np.maximum((total + 1e-3) / (count + 1e-3), 1e-3)
         size = _SUMS * _AZIMUTHS * _TILTS
@@ -140,7 +162,7 @@ class Reflection:
             sin_r = (o.to_camera[m] * t).sum(axis=1, keepdims=True)
             between = np.einsum("pld,pd->pl", o.to_light[m], o.to_camera[m])
             cell = _cell(sin_i, sin_r, between)
-            front = o.facing[m] > _GRAZING
+            front = (o.facing[m] > _GRAZING) & o.known[m]
             ratio = np.minimum(o.response[m] / lit[_facing_cell(o.facing[m])], _BRIGHTEST)
             total += np.bincount(cell[front], ratio[front], size)
             count += np.bincount(cell[front], minlength=size)
@@ -162,7 +184,7 @@ class Reflection:
         out = np.zeros((len(o.index), len(candidates)), np.float32)
         model = np.sqrt(self.lobe).astype(np.float32)
         c = candidates.astype(np.float32)
-        weight = np.where(o.facing > _GRAZING, self.lit[_facing_cell(o.facing)], 0)
+        weight = np.where((o.facing > _GRAZING) & o.known, self.lit[_facing_cell(o.facing)], 0)
         measured = np.sqrt(
             np.minimum(o.response / self.lit[_facing_cell(o.facing)], _BRIGHTEST)
         ).astype(np.float32)
@@ -188,7 +210,7 @@ class Reflection:
 
 
 def reflection_scores(
-    pictures: Sequence[tuple[Camera, AnyFloats]],
+    pictures: Sequence[Answers],
     lights: Sequence[Light],
     points: Array,
     seen: Bools,
@@ -197,18 +219,17 @@ def reflection_scores(
 ) -> tuple[Floats, Reflection]:
     """Scores `(N, D)` of the candidates at all points, and the table that they were read with.
 
-    `pictures` are C cameras, each with what it saw under every one of the L lights `(L, H, W)`;
+    `pictures` are C cameras' answers to the L lights;
     `seen (N, C)` says which camera sees which of `points (N, 3)`, `candidates (D, 3)` are unit
     directions. `first` are the N points' tangents from texture: the most confident ones fill the
     table.
     """
-    centers = np.stack([camera.center for camera, _ in pictures])
+    centers = np.stack([p.camera.center for p in pictures])
     away = seen @ centers - seen.sum(axis=1, keepdims=True) * points
     normals = surface_normals(points, away)
     trusted = first.confidence >= np.quantile(first.confidence, 1 - _TRUSTED)
     observations = [
-        observe(camera, olat, lights, points, normals, seen[:, k])
-        for k, (camera, olat) in enumerate(pictures)
+        observe(answers, lights, points, normals, seen[:, k]) for k, answers in enumerate(pictures)
     ]
     table = Reflection.learn(observations, first.directions, trusted)
     scores = np.zeros((len(points), len(candidates)), np.float32)

@@ -20,6 +20,7 @@ BENCHMARKS = {
     "fields": "fields of reflectance beside baselines on new lights and views; their solver",
     "frames": "the simulators' frames beside many paths: error against run time",
     "gradients": "path replay beside finite differences",
+    "importing": "strands of a capture written out as photographs, by damage",
     "interpolation": "captured frames interpolated on strands, standard and guided by a model",
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, beside baselines",

@@ -111,7 +111,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     from dataclasses import replace
 
     from reconstruction.capture.import_folder import Import, settings_of
-    from reconstruction.capture.import_geometry import GeometryFiles, read_geometry
+    from reconstruction.capture.import_geometry import GeometryFiles, files_in, read_geometry
     from reconstruction.capture.presets import PresetFiles, mean_light, read_preset, understood
     from reconstruction.geometry.placement import PlacementOptions
     from reconstruction.options import parse_options
@@ -120,14 +120,20 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     given = {f: value for f, value in where.items() if value is not None}
     if args.preset is not None:
         parse_options(PlacementOptions, given, "import")
-        files = PresetFiles(args.folder, args.take, args.cameras, args.lights)
-        take = read_preset(args.preset, files, mean_light, given)
+        of_set = PresetFiles(args.folder, args.take, args.cameras, args.lights)
+        take = read_preset(args.preset, of_set, mean_light, given)
         settings, found = understood(take)
         return Import.of(args.folder, take.geometry, settings, found), take.geometry.notes
-    asked = {f: getattr(args, f) for f in ("cameras", "lights", "light_distance")}
-    named = parse_options(GeometryFiles, {**asked, "placement": given}, "import")
-    geometry = read_geometry(named) if args.cameras or args.lights else None
     settings = settings_of(args.folder, args.settings)
+    said = settings.geometry
+    asked = {f: getattr(args, f) for f in ("cameras", "lights")}
+    asked = {f: path.resolve() for f, path in asked.items() if path is not None}
+    if args.light_distance is not None:
+        asked["light_distance"] = args.light_distance
+    where_said = {f: v for f, v in vars(said.placement).items() if v is not None}
+    named = {**vars(said), **asked, "placement": {**where_said, **given}}
+    files = files_in(args.folder, parse_options(GeometryFiles, named, "import"))
+    geometry = read_geometry(files) if files.cameras or files.lights else None
     if args.pictures is not None:
         patterns = replace(settings.pictures, olat=args.pictures)
         settings = replace(settings, pictures=patterns)

@@ -27,6 +27,7 @@ MODULES = {
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",
+    "importing": "benchmarks.importing.damages",
     "interpolation": "benchmarks.fields.interpolation",
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from reconstruction import Camera, Capture, Light, Mesh
+from reconstruction import Camera, Capture, CaptureWriter, Light, Mesh, Rig, Step
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.hair_features import (
@@ -19,7 +20,13 @@ from reconstruction.images.hair_features import (
     tell_apart,
     two_classes,
 )
-from reconstruction.images.silhouettes import NoSilhouette, background_noise, silhouette
+from reconstruction.images.silhouettes import (
+    NoSilhouette,
+    background,
+    background_noise,
+    lit_rgb,
+    silhouette,
+)
 from reconstruction.light_planes import PointCloud, triangulate
 from reconstruction.masks import (
     MOST_DISAGREEMENT,
@@ -101,6 +108,55 @@ def test_background_noise_is_measured_below_zero() -> None:
     image[:80] += 5
     assert background_noise(image) == pytest.approx(0.03, rel=0.05)
     assert background_noise(np.ones(4)) == 0
+
+
+@pytest.mark.parametrize("frames", [1, 40])
+def test_the_background_of_frames_whose_black_was_clipped_is_told(frames: int) -> None:
+    """Sums of frames that have lost what was below zero; 60 % is background, the subject dim."""
+    rng, sigma = np.random.default_rng(0), 0.01
+    subject = np.zeros((100, 100), bool)
+    subject[20:80, 20:80] = True
+    shots = rng.normal(0, sigma, (frames, 100, 100, 3)) + 0.2 * subject[..., None]
+    image = np.maximum(shots, 0).mean(axis=-1).sum(axis=0)
+    level, noise = background(image)
+    true = image[~subject]
+    assert level == pytest.approx(true.mean(), rel=0.35)
+    assert noise == pytest.approx(true.std(), rel=0.4)
+    assert iou(image > level + 5 * noise, subject) > 0.999
+    black = 1.0 * subject
+    assert background(black) == (0, 0)
+
+
+def test_a_saturated_highlight_does_not_move_the_matte_surface() -> None:
+    rng, lights = np.random.default_rng(3), dome()
+    matte = 0.4 * np.maximum(facing(rng, 300) @ lights.T, 0)
+    shine = np.zeros(matte.shape, bool)
+    shine[np.arange(300), matte.argmax(axis=1)] = True
+    cut = np.where(shine, 0.6, matte)  # where the sensor is full
+    gloss, albedo = matte_fit(cut, lights, known=~shine)
+    np.testing.assert_allclose(albedo, 0.4, rtol=0.03)
+    assert np.median(matte_fit(cut, lights)[1]) > 1.02 * np.median(albedo)
+    assert np.median(gloss) > np.median(
+        matte_fit(matte, lights)[0]
+    )  # what is above it still shines
+
+
+def test_a_blown_all_on_frame_is_not_what_lines_are_read_from(tmp_path: Path) -> None:
+    """The sum of single lights is, which holds what the other has lost."""
+    device = Camera.look_at("cam", 8, 8, (0, -1, 0), (0, 0, 0), 10.0)
+    lights = tuple(Light(n, np.array((x, -1.0, 0)), np.ones(3)) for n, x in (("a", 0), ("b", 1)))
+    steps = [Step(0, "all_on", 0.02), Step(1, "olat", 0.02, light="a")]
+    steps.append(Step(2, "olat", 0.02, light="b"))
+    truth = np.linspace(0.2, 0.9, 64, dtype=np.float32).reshape(8, 8, 1).repeat(3, axis=2)
+    for name, shown in (("blown", 0.5), ("whole", 5.0)):
+        rig = Rig("r", (device,), lights)
+        writer = CaptureWriter.create(tmp_path / name, rig, {"steps": steps})
+        for step in steps:
+            image = np.minimum(4 * truth if step.kind == "all_on" else truth, shown * 2)
+            writer.write_frame(step, "cam", image, full_scale=shown * 2)
+        writer.finish("completed", {})
+        found = lit_rgb(Capture(tmp_path / name), "cam")
+        np.testing.assert_allclose(found, (2 if name == "blown" else 4) * truth, rtol=1e-5)
 
 
 def test_light_and_lines_tell_fibres_from_skin(hairy_capture: Capture) -> None:

@@ -1,4 +1,4 @@
-"""`hairstage export`: a fitted model for other programs."""
+"""`hairstage export`: a model for other programs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIZE = 640
 def add(commands: Commands) -> None:
     """Add the command."""
     export = add_command(commands, "export", run)
-    export.add_argument("model", type=Path, help="fitted model folder")
+    export.add_argument("model", type=Path, help="model folder")
     export.add_argument("--to", choices=(*SUFFIXES, *FOLDERS), required=True)
     export.add_argument("--out", type=Path, required=True, help="file, or folder of several")
     export.add_argument("--capture", type=Path, help="the capture that gives rig and head")
@@ -46,13 +46,14 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """A fitted model for other programs.
+    """A model for other programs.
 
-    Write MODEL for others. usd: strands, head and MaterialX hair, z up; houdini: the same, y up;
-    blender: a folder with a script that makes Hair Curves with Principled Hair; unreal: Alembic in
-    centimetres with groom_ attributes; gltf: hair cards in three levels of detail; mitsuba: a
-    folder with a scene for stock Mitsuba 3; maps: an OpenEXR file for each layer of the hair maps;
-    abc, hair: the strands alone, for Alembic's and cyHair's readers.
+    Write MODEL for others, with its fit, or in an even brown without one. usd: strands, head and
+    MaterialX hair, z up; houdini: the same, y up; blender: a folder with a script that makes Hair
+    Curves with Principled Hair; unreal: Alembic in centimetres with groom_ attributes; gltf: hair
+    cards in three levels of detail; mitsuba: a folder with a scene for stock Mitsuba 3; maps: an
+    OpenEXR file for each layer of the hair maps; abc, hair: the strands alone, for the readers of
+    Alembic and cyHair.
     """
     from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions
@@ -76,6 +77,11 @@ def run(args: argparse.Namespace, output: Output) -> None:
         files = [out]
     else:
         groom = Groom.load(model, capture, options)
+        if not model.has("appearance.json"):
+            output.note(
+                f"warning: {model} has no fit: its hair goes out in an even brown; "
+                "'hairstage fit CAPTURE MODEL' first measures colour and roughness"
+            )
         if groom.head is None:
             output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
         files = _write(args, groom, capture)

@@ -150,10 +150,31 @@ def test_three_nearest_lights_are_training_lights(made):
     mixed = three_nearest(capture, "cam_0", light, training)
     positions = {x.name: x.position @ light.position for x in capture.rig.lights}
     nearest = sorted(set(positions) - {"l4", "l7"}, key=lambda n: -positions[n])[:3]
-    frames = capture.olat("cam_0", nearest)
+    frames, _ = capture.olat("cam_0", nearest)
     weights = 1 / np.arccos([positions[n] for n in nearest])
     want = np.tensordot(weights / weights.sum(), frames, 1)
     np.testing.assert_allclose(mixed, want, rtol=1e-5)
+
+
+def test_a_saturated_pixel_is_mixed_of_the_lights_that_do_not_saturate_it(tmp_path):
+    """Three equal lights about a fourth; under one of them a pixel is at full scale."""
+    cameras = tuple(
+        Camera.look_at(f"cam_{i}", 4, 4, (i - 0.5, -1, 0), (0, 0, 0), 10.0) for i in range(2)
+    )
+    places = [(0, -1, 0.1), (0.1, -1, 0), (-0.1, -1, 0)]
+    lights = tuple(Light(f"l{i}", np.array(p), np.ones(3)) for i, p in enumerate(places))
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights)]
+    rig = Rig("r", cameras, (*lights, Light("new", np.array((0.0, -1.005, 0)), np.ones(3))))
+    writer = CaptureWriter.create(tmp_path / "c", rig, {"steps": steps})
+    for step, value in zip(steps, (1.0, 2.0, 3.0), strict=True):
+        image = np.full((4, 4, 3), value, np.float32)
+        image[0, 0] = 4.0 if step.index == 0 else value
+        writer.write_frame(step, "cam_0", image, full_scale=4.0)
+        writer.record_missing(step, "cam_1", reason="none")
+    writer.finish("completed", {})
+    mixed = three_nearest(Capture(tmp_path / "c"), "cam_0", rig.light("new"), ["l0", "l1", "l2"])
+    np.testing.assert_allclose(mixed[1:], 2.0, rtol=0.02)
+    np.testing.assert_allclose(mixed[0, 0], 2.5, rtol=0.02)
 
 
 def test_lights_to_show_stand_before_the_camera_and_apart():
@@ -211,7 +232,7 @@ def test_smoothing_keeps_the_mean_and_takes_the_noise(made):
     capture, _, scene = made
     camera, lights = capture.rig.cameras[0], [capture.rig.light("l4")]
     mask = coverage(scene, camera)["hair"] > 0.5
-    reference = capture.olat("cam_0", ["l4"])[0]
+    reference = capture.olat("cam_0", ["l4"])[0][0]
     plain = render_olat(scene, camera, lights, spp=9, thrift=0, seed=3)[0]
     smooth = olat_smoothed(scene, camera, lights, Sampling(9, 16, 3))[0]
     # light is handed on by share of the pixels, so that a little crosses the mask's edge

@@ -222,7 +222,7 @@ def test_observations_are_responses_at_full_level(made):
     mask = model.mask("cam_0", "hair", capture)
     pixels = chosen(mask, 10, np.random.default_rng(0))
     o = observe(capture, "cam_0", ["l3", "l0"], pixels)
-    full = capture.olat("cam_0", ["l3", "l0"]).reshape(2, -1, 3)
+    full = capture.olat("cam_0", ["l3", "l0"])[0].reshape(2, -1, 3)
     np.testing.assert_array_equal(o.radiance, full[:, pixels])
     assert [x.name for x in o.lights] == ["l3", "l0"]
     assert o.valid.all()

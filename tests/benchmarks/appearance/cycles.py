@@ -191,7 +191,7 @@ def _view(
     """Pixels that are almost wholly hair, or head."""
     pixels = np.flatnonzero(coverage(scene, camera)[kind].ravel() > 0.95)
     names = [x.name for x in capture.rig.lights]
-    radiance = capture.olat(camera.name, names)
+    radiance, _ = capture.olat(camera.name, names)
     values = radiance.reshape(len(names), -1, 3)[:, pixels]
     whole = Observed(
         camera, tuple(capture.rig.lights), pixels, values, np.ones(values.shape[:2], bool)

@@ -123,7 +123,7 @@ def _view(
     if mask is None or not mask.any():
         raise ValueError(f"{capture.path}: no hair mask of {camera.name}: nothing to compare")
     pixels = np.flatnonzero(mask)
-    truth = capture.olat(camera.name, [x.name for x in lights])
+    truth, _ = capture.olat(camera.name, [x.name for x in lights])
     path = PathReference(scene.with_hair(scene.hair, bsdf="hair"), depth)
     seeds, spp = samples
 

@@ -45,10 +45,11 @@ def capture(tmp_path: Path) -> Capture:
 
 def test_responses_come_in_rig_order_and_at_full_level(capture):
     assert capture.olat_lights() == ["light_0", "light_2", "light_3"]
-    olat = capture.olat("cam_0")
+    olat, known = capture.olat("cam_0")
+    assert known.all()
     assert olat.shape == (3, 6, 8, 3)
     np.testing.assert_array_equal(olat[:, 0, 0, 0], [4, 6, 2])
-    np.testing.assert_array_equal(capture.olat("cam_0", ["light_3"])[0], 2.0)
+    np.testing.assert_array_equal(capture.olat("cam_0", ["light_3"])[0][0], 2.0)
 
 
 def test_steps_by_kind(capture):

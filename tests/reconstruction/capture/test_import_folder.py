@@ -77,7 +77,7 @@ def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
     assert verify(tmp_path / "out") == []
     assert [c.name for c in capture.rig.cameras] == list(CAMERAS)
     assert capture.olat_lights() == list(LIGHTS)
-    assert capture.olat("left")[:, 0, 0, 0].tolist() == [10, 11]
+    assert capture.olat("left")[0][:, 0, 0, 0].tolist() == [10, 11]
     assert [light.beside for light in capture.rig.lights] == ["left", None]
     mask = capture.mask("left")
     assert mask is not None
@@ -200,7 +200,7 @@ def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(ahead.position - point, [0, 1.5, 0], atol=1e-9)
     assert np.linalg.norm(point) < 0.02
     assert above.intensity.tolist() == [1, 1, 1]
-    assert capture.olat("left")[:, 0, 0, 0].tolist() == [10, 11]
+    assert capture.olat("left")[0][:, 0, 0, 0].tolist() == [10, 11]
 
 
 def test_never_writes_over_something(folder: Path, tmp_path: Path) -> None:

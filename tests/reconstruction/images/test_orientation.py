@@ -106,3 +106,19 @@ def test_wrong_shapes_and_banks_are_refused() -> None:
         orientations(np.ones((2, 8, 8)), np.ones((9, 9), bool))
     with pytest.raises(ValueError, match="wavelength"):
         LogGaborBank(wavelength=1.0)
+
+
+def test_a_saturated_streak_does_not_turn_a_line() -> None:
+    """A highlight that runs across the fibres, cut flat, is left out where it is."""
+    picture = 1 + 0.2 * grating(np.radians(30.0))
+    cut = picture.copy()
+    cut[28:36] = 4.0
+    clipped = cut >= 4.0
+    mask, far = np.ones(cut.shape, bool), np.zeros(cut.shape, bool)
+    far[20:44] = True  # the streak's neighbourhood
+    truth = orientations(picture, mask, SMALL).angle
+    left_out = orientations(cut[None], mask, SMALL, known=~clipped[None]).angle
+    taken = orientations(cut, mask, SMALL).angle
+    near = far & ~clipped
+    assert np.median(difference(left_out, truth)[near]) < 3
+    assert np.median(difference(taken, truth)[near]) > 10

@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reconstruction.array_backend import array_types
+from reconstruction.geometry.cameras import Camera
+from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.codes import code_map, match, pack, unpack
+from reconstruction.light_codes.device_views import DeviceViews
 
 
 @given(st.integers(1, 400), st.integers(0, 2**32 - 1))
@@ -83,3 +87,25 @@ def test_saturated_pixels_are_lit_and_dark_views_have_no_bits() -> None:
 def test_shapes_that_disagree_are_refused() -> None:
     with pytest.raises(ValueError, match="expected responses"):
         code_map(np.zeros((2, 3, 3)), np.zeros((3, 4), bool), 0)
+
+
+def test_a_light_without_a_frame_in_one_view_is_not_asked_of_a_pair() -> None:
+    """What one view has of it must not count as a difference; whoever stands beside it may see."""
+    mask = np.ones((2, 2), bool)
+    lit = np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 0.1]]])
+    shot = np.array([False, True, True])
+    whole = code_map(lit, mask, 2)
+    part = code_map(np.where(shot[:, None, None], lit, 0), mask, 2, shot=shot)
+    assert unpack(part.shot, 3).tolist() == [False, True, True]
+    assert unpack(whole.varying, 3)[0]
+    camera = Camera.look_at("a", 2, 2, (0, -1, 0), (0, 0, 0), 10.0)
+    lines = np.full((2, 2, 2), 0.7, np.float32)
+    views = [View(camera, mask, lines, codes, -1) for codes in (whole, part)]
+    types = array_types()
+    device = DeviceViews(types, views)
+    asked = device.asked(types.UInt32([0, 1, 0]), types.UInt32([1, 0, 0]))
+    words = np.stack([np.asarray(w) for w in asked], axis=1).astype(np.uint32)
+    bits = unpack(words, 3)
+    assert not bits[:2, 0].any()
+    assert bits[:2, 1].all()
+    assert bits[2, 0]

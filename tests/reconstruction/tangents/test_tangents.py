@@ -19,6 +19,7 @@ from reconstruction.tangents.line_evidence import (
     seen_by,
 )
 from reconstruction.tangents.reflection import (
+    Answers,
     Reflection,
     observe,
     reflection_scores,
@@ -131,8 +132,12 @@ def test_pooling_averages_over_near_points_only() -> None:
     assert table[2, 2] == 1
 
 
-def test_reflection_finds_directions_that_texture_does_not_know() -> None:
-    """A patch whose direction turns from point to point; a third of the points are known."""
+@pytest.mark.parametrize(("full", "missing"), [(np.inf, 0), (0.5, 0), (np.inf, 10)])
+def test_reflection_finds_directions_that_texture_does_not_know(full, missing) -> None:
+    """A patch whose direction turns from point to point; a third of the points are known.
+
+    As well where highlights are cut off at half of their height, and where frames are missing.
+    """
     rng = np.random.default_rng(3)
     lights = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(200, 1.2))]
     cameras = [
@@ -158,7 +163,12 @@ def test_reflection_finds_directions_that_texture_does_not_know() -> None:
         x_, y_ = np.rint(c.project(points)[0]).astype(int).T
         image = np.zeros((len(lights), 48, 48))
         image[:, y_, x_] = answer.T
-        pictures.append((c, image))
+        clipped = image >= full * image.max()
+        image = np.where(clipped, 0.3 * image.max(), image)  # as if there had never been more
+        image[:missing] = 0
+        known = ~clipped
+        known[:missing] = False
+        pictures.append(Answers(c, image, known))
     first = truth.copy()
     wrong = rng.random(len(points)) > 0.45
     first[wrong] = rng.normal(size=(int(wrong.sum()), 3))
@@ -199,7 +209,13 @@ def test_observations_undo_distance_and_intensity() -> None:
     far2 = np.array([1.04, 4.16])
     olat = (np.array([2.0, 5.0]) * cosines / far2)[:, None, None] * np.ones((2, 64, 64))
     seen = np.array([True])
-    o = observe(c, olat, lights, np.zeros((1, 3)), np.array([[1.0, 0, 0]]), seen)
+    o = observe(
+        Answers(c, olat, np.ones(olat.shape, bool)),
+        lights,
+        np.zeros((1, 3)),
+        np.array([[1.0, 0, 0]]),
+        seen,
+    )
     np.testing.assert_allclose(o.response, 1, rtol=1e-5)
     np.testing.assert_allclose(o.facing[0], cosines, rtol=1e-6)
 

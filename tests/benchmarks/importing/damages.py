@@ -1,0 +1,129 @@
+"""What is lost where a capture comes as a user's photographs: each damage alone, and all of them.
+
+One capture of the demo's rig goes through the wires once and is kept. It is written out as pictures
+with COLMAP's text and lights in millimetres, read by `hairstage import`, reconstructed by
+`hairstage reconstruct`, and scored beside the capture itself. Leaves `importing.json` and
+`importing.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.captures import SimulatedCapture
+from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, within
+from benchmarks.importing.folders import Written, write_folder
+from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
+from benchmarks.results import markdown, save
+from benchmarks.strand_truth import StrandTruth
+from reconstruction import Capture, Model, Progress, ReconstructOptions, parse_options, reconstruct
+from stage_service.cli.support.children import own_command
+from stage_service.cli.support.commands import CommandError, rig_path
+
+ALL = "all of them, in 8-bit PNG"
+DAMAGES = {
+    "COLMAP text, millimetres": Written("exr"),
+    "16-bit PNG": Written("png16"),
+    "8-bit PNG, three exposures": Written("png8"),
+    "Bayer mosaic, 14-bit TIFF": Written("bayer"),
+    "a wall at 3 %, clean plates": Written("exr", wall=0.03),
+    "5 % of the frames missing": Written("exr", missing=0.05),
+    "2 % of the hair saturated": Written("exr", blown=True),
+    ALL: Written("png8", wall=0.03, missing=0.05, blown=True),
+}
+"""All have COLMAP's text and millimetres."""
+
+LEVELS = ("1mm_10deg", "2mm_20deg")
+
+
+def _command(*words: object) -> None:
+    """Run one of the product's commands; raises `CommandError` with what it said."""
+    command = own_command(*map(str, words))
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise CommandError(f"{' '.join(map(str, words))}: {done.stderr[-600:]}", done.returncode)
+
+
+def _scored(model: Model, truth: StrandTruth) -> dict[str, Any]:
+    """F in percent over visible and all points, and what the report warns of."""
+    scores, report = truth.score(model.strands()), model.report()
+    return {
+        **{part: {k: 100 * scores[part][k]["f"] for k in LEVELS} for part in ("visible", "all")},
+        "seconds": sum(stage.seconds for stage in report.stages),
+        "warnings": [w for stage in report.stages for w in stage.warnings],
+    }
+
+
+def _imported(work: Path, seen: Capture, written: Written, args: argparse.Namespace) -> Model:
+    """The capture written out, imported and reconstructed by the commands."""
+    folder = write_folder(seen, work / "folder", written, args.seed)
+    _command("import", folder, "--out", work / "capture", "--json")
+    model, options = work / "model", json.dumps(_options(args))
+    _command("reconstruct", work / "capture", "--out", model, "--options", options, "--json")
+    return Model(model)
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    return {"grid": 4e-3, "roots": 300} if args.quick else {"grid": 3e-3, "roots": 3000}
+
+
+def _shot(args: argparse.Namespace, progress: Progress) -> tuple[Capture, Path]:
+    """What every row sees, and the truth's folder."""
+    if args.quick:
+        framing = replace(FRAMINGS["curly"], rows=21, coarser=6)
+        made, cameras, every = subject_capture("curly", framing, args.cache, 0.0), 4, 1
+    else:
+        text = rig_path("demo").read_text()
+        made = SimulatedCapture("importing", text, "wavy", spp=16, seed=args.seed)
+        cameras, every = 6, 5
+    path, truth = made.make(args.cache, progress)
+    whole = Capture(path)
+    names = [c.name for c in whole.rig.cameras][:cameras]
+    return whole.view(cameras=names, lights=whole.olat_lights()[::every]), truth
+
+
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """The capture itself, then each damage; see the module's docstring."""
+    damages = {k: w for k, w in DAMAGES.items() if args.only in (None, k)}
+    if not damages:
+        raise LeftOut(f"no damage {args.only!r}; there are {', '.join(DAMAGES)}")
+    if args.quick:
+        damages = {ALL: DAMAGES[ALL]}
+    seen, folder = _shot(args, within(progress, "capture", 0.0, 0.3))
+    truth = StrandTruth(seen, folder)
+    results: dict[str, Any] = {
+        "cameras": len(seen.rig.cameras),
+        "lights": len(seen.olat_lights()),
+        "rows": {},
+    }
+    for k, (name, written) in enumerate({"direct": None, **damages}.items()):
+        progress(name, 0.3 + 0.7 * k / (len(damages) + 1))
+        with tempfile.TemporaryDirectory(dir=args.out) as work:
+            if written is None:
+                model = Model(Path(work) / "model")
+                options = parse_options(ReconstructOptions, _options(args))
+                reconstruct(seen, model, method="auto", options=options)
+            else:
+                model = _imported(Path(work), seen, written, args)
+            results["rows"][name] = _scored(model, truth)
+        save(args.out / "importing.json", results)
+        (args.out / "importing.md").write_text(table(results))
+    return results
+
+
+def table(results: dict[str, Any]) -> str:
+    """F at both levels over visible points, and what is lost at the finer one, in Markdown."""
+    rows, first = [], results["rows"]["direct"]["visible"][LEVELS[0]]
+    for name, row in results["rows"].items():
+        fine, coarse = (row["visible"][k] for k in LEVELS)
+        rows.append((name, f"{fine:.1f}", f"{coarse:.1f}", f"{fine - first:+.1f}"))
+    return markdown(("written as", "F at 1 mm/10°, %", "F at 2 mm/20°, %", "points at 1 mm"), rows)
+
+
+BENCHMARK = Benchmark(run, (CACHE, ONLY))
