@@ -60,15 +60,13 @@ class Picture:
     """`light (H, W, 3)`, linear, 1 where a channel is full; `saturated (H, W)`.
 
     `full` is the light from which on a channel is saturated (inf: never), `quantum (H, W, 3) or ()`
-    the light of one step of the file's numbers, `clipped` whether what is darker than black became
-    0, so that its noise is lost.
+    the light of one step of the file's numbers.
     """
 
     light: Floats
     saturated: Bools
     full: float
     quantum: Any
-    clipped: bool
 
 
 def picture_size(path: Path) -> Size:
@@ -149,7 +147,7 @@ def _exr(path: Path, sensor: Sensor) -> Picture:
     gamma = 1.0 if sensor.response is None else sensor.response
     light = _decoded((image - black) / (white - black), gamma)
     quantum = float(attributes.get("countScale", 0.0)) / (white - black)
-    return Picture(light, saturated, (full - black) / (white - black), quantum, False)
+    return Picture(light, saturated, (full - black) / (white - black), quantum)
 
 
 def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
@@ -175,8 +173,7 @@ def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
     light = _decoded(share, gamma)
     step = np.float32(1 / (white - black)) if whole else np.float32(0)
     quantum = _decoded(share + step, gamma) - light if gamma != "linear" else step
-    clipped = bool(whole and black == 0)
-    return Picture(light, saturated, float(_decoded(np.float32(FULL), gamma)), quantum, clipped)
+    return Picture(light, saturated, float(_decoded(np.float32(FULL), gamma)), quantum)
 
 
 def _raw(path: Path, sensor: Sensor) -> Picture:
@@ -209,7 +206,7 @@ def _mosaic(values: NDArray[Any], bayer: str, black: float, white: float) -> Pic
     shift = max(0, 15 - int(deep.max(initial=1)).bit_length())  # finer than one count between them
     image = cv2.demosaicing(deep << shift, codes[bayer]).astype(np.float32) / (1 << shift)
     light = (image - np.float32(black)) / np.float32(white - black)
-    return Picture(light, saturated, FULL, 1 / (white - black), black == 0)
+    return Picture(light, saturated, FULL, 1 / (white - black))
 
 
 def _decoded(share: Any, response: Literal["linear", "srgb"] | float) -> Any:

@@ -52,8 +52,13 @@ def visual_hull(
         raise ValueError(f"bounds must be (2, 3), lowest corner first, got {box.tolist()}")
     shape = np.maximum(np.ceil((box[1] - box[0]) / spacing), 1).astype(np.int64)
     if np.prod(shape.astype(float)) > MOST_VOXELS:
+        whole = [v.camera.name for v in views if v.mask.mean() > 0.95]
+        hint = f"; the masks of {', '.join(whole)} fill their pictures: " if whole else ""
+        hint += "is the background dark? else give clean plates or masks of the subject" * bool(
+            whole
+        )
         raise ValueError(
-            f"a grid of {shape.tolist()} voxels is too large: take a spacing above {spacing} m"
+            f"a grid of {shape.tolist()} voxels is too large: take a spacing above {spacing} m{hint}"
         )
     return VoxelGrid(box[0] + spacing / 2, spacing, _carve(views, box[0], spacing, shape, least))
 

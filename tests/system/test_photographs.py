@@ -127,14 +127,15 @@ def test_three_commands_lead_from_photographs_to_strands_in_blender(photographs,
     assert said.returncode != 0
     assert "give --unit mm" in said.stderr  # nothing in COLMAP's files says it
     typed(first, "--unit", "mm", cwd=tmp_path)
-    options = json.dumps({"grid": 5e-3, "roots": 300})
+    options = json.dumps({"grid": 5e-3, "within": 4e-3})
     said = typed(second, "--options", options, cwd=tmp_path)
     assert "no sweep, 64 single lights, no head: method hull" in said
     strands = read_strands(tmp_path / "model" / "strands.npz")
     distance = np.linalg.norm(strands.points, axis=1)
     assert len(strands) > 100
-    assert np.median(np.abs(distance - RADIUS)) < 0.012
-    assert polar_error(strands) < 15
+    # the surface, and what is filled under it
+    assert np.percentile(distance, 99) == pytest.approx(RADIUS, abs=8e-3)
+    assert polar_error(strands) < 10
     said = typed(third, cwd=tmp_path)
     assert "has no fit" in said
     assert "open_in_blender.py" in said
