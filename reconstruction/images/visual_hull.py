@@ -57,9 +57,8 @@ def visual_hull(
         hint += "is the background dark? else give clean plates or masks of the subject" * bool(
             whole
         )
-        raise ValueError(
-            f"a grid of {shape.tolist()} voxels is too large: take a spacing above {spacing} m{hint}"
-        )
+        size = f"a grid of {shape.tolist()} voxels is too large"
+        raise ValueError(f"{size}: take a spacing above {spacing} m{hint}")
     return VoxelGrid(box[0] + spacing / 2, spacing, _carve(views, box[0], spacing, shape, least))
 
 
