@@ -14,7 +14,7 @@ import numpy as np
 
 from appearance import Exposure, FittedModel
 from appearance.bsdf.far_field import azimuthal_table
-from appearance.bsdf.lobes import variances
+from appearance.bsdf.lobes import logistic_scale, variances
 from appearance.model.light_sums import LightSums, few_lights, weights_of_environment
 from appearance.model.relight import PROCEDURAL
 from appearance.render.environment_maps import load_environment
@@ -79,6 +79,9 @@ class Lighting:
                 "turns": TURNS,
                 "variances": [float(v) for v in variances(hair.beta_m)],
                 "tilt": float(np.radians(hair.tilt_deg)),
+                "eta": float(hair.eta),
+                "logistic_scale": float(logistic_scale(hair.beta_n)),
+                "absorption": [float(x) for x in hair.sigma_a],
                 "skin": list(fitted.appearance.skin),
                 "colour": list(fitted.appearance.colour),
                 "one_material": fitted.maps.uniform,

@@ -195,11 +195,13 @@ export class Controls {
         viewer.status("");
       } catch (error) { return viewer.status(error.message); }
     }
+    if (mode === "lit" && !picture.lighting) {
+      try { await this.relight.material(); } catch (error) { return viewer.status(error.message); }
+    }
     picture.state.mode = mode;
     this.explain();
     if (mode === "lit") {
       try {
-        await this.relight.material();
         if (!Object.keys(this.relight.weights).length) this.relight.towards([-0.6, -0.7, 0.4]);
         else await this.relight.set(this.relight.weights);
       } catch (error) { viewer.status(error.message); }

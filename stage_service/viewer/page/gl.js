@@ -77,10 +77,10 @@ export function buffer(gl, target, data) {
   return made;
 }
 
-// A picture to draw into, linear: colour in `format`, with depth if asked.
+// A picture to draw into: colour in `format`; `depth` is "none", "drawn" or "read" by shaders.
 export class Film {
-  constructor(gl, format, withDepth) {
-    Object.assign(this, { gl, format, withDepth, width: 0, height: 0 });
+  constructor(gl, format, depthIs) {
+    Object.assign(this, { gl, format, depthIs, width: 0, height: 0 });
     this.frame = gl.createFramebuffer();
   }
 
@@ -89,18 +89,24 @@ export class Film {
     if (width === this.width && height === this.height) return this;
     Object.assign(this, { width, height });
     if (this.colour) gl.deleteTexture(this.colour.texture);
-    if (this.depth) gl.deleteRenderbuffer(this.depth);
+    if (this.buffer) gl.deleteRenderbuffer(this.buffer);
+    if (this.depth) gl.deleteTexture(this.depth.texture);
     this.colour = texture(gl, gl.TEXTURE_2D, gl.NEAREST,
       () => gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height));
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.framebufferTexture2D(
       gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.colour.texture, 0);
-    if (this.withDepth) {
-      this.depth = gl.createRenderbuffer();
-      gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
+    if (this.depthIs === "read") {
+      this.depth = texture(gl, gl.TEXTURE_2D, gl.NEAREST,
+        () => gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT24, width, height));
+      gl.framebufferTexture2D(
+        gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, this.depth.texture, 0);
+    } else if (this.depthIs === "drawn") {
+      this.buffer = gl.createRenderbuffer();
+      gl.bindRenderbuffer(gl.RENDERBUFFER, this.buffer);
       gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
       gl.framebufferRenderbuffer(
-        gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
+        gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.buffer);
     }
     return this;
   }

@@ -2,9 +2,11 @@
 
 import { Film, Program, buffer } from "./gl.js";
 import * as shaders from "./shaders.js";
+import { ofLight } from "./space.js";
 
 export const MODES = { direction: 0, confidence: 1, root: 2, length: 3, lit: 4 };
-const SAMPLES = 48;
+const SAMPLES = 48, TURN = 3, LEAST_TURNS = 4;  // a light has TURN samples at a time
+
 const BATCH_MS = 40;  // what a batch of strands is to take
 const NO_SLICE = [0, 0, 0, 1];
 
@@ -22,20 +24,26 @@ export class Picture {
     this.wire = new Program(gl, shaders.WIRE_VERTEX, shaders.WIRE_FRAGMENT);
     this.copy = new Program(gl, shaders.SCREEN_VERTEX, shaders.COPY_FRAGMENT);
     this.show = new Program(gl, shaders.SCREEN_VERTEX, shaders.SHOW_FRAGMENT);
-    this.film = new Film(gl, gl.RGBA16F, true);
-    this.mean = new Film(gl, gl.RGBA32F, false);
+    this.film = new Film(gl, gl.RGBA16F, "drawn");
+    this.mean = new Film(gl, gl.RGBA32F, "none");
+    this.shadow = new Film(gl, gl.R32UI, "read");
     this.empty = gl.createVertexArray();
     this.samples = 0;
     this.frames = 0;
     this.batch = 1000;
+    this.texels = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));  // a side of what a light sees
   }
 
   // What gives the uniforms of light; the programs for it are compiled when it is first wanted.
   setLighting(lighting) {
     this.litStrands ??= new Program(
       this.gl, shaders.STRAND_VERTEX(shaders.LIT), shaders.STRAND_FRAGMENT);
-    this.litSkin ??= new Program(
-      this.gl, shaders.HEAD_VERTEX, shaders.HEAD_FRAGMENT(shaders.LIT_HEAD));
+    const skin = (lit) => new Program(this.gl, shaders.HEAD_VERTEX, shaders.HEAD_FRAGMENT(lit));
+    this.litSkin ??= skin(shaders.LIT_HEAD);
+    this.shadowedSkin ??= skin(shaders.SHADOWED_HEAD);
+    this.fibres ??= new Program(this.gl, shaders.FIBRE_VERTEX, shaders.FIBRE_FRAGMENT);
+    this.hidingFibres ??= new Program(this.gl, shaders.FIBRE_VERTEX, shaders.FIBRE_SHADOW);
+    this.hidingHead ??= new Program(this.gl, shaders.HEAD_VERTEX, shaders.HEAD_SHADOW);
     this.lighting = lighting;
   }
 
@@ -62,18 +70,32 @@ export class Picture {
 
   // A part of one sample more of the picture at rest; false when there are enough.
   resting(view) {
-    if (this.samples >= SAMPLES) return false;
+    if (this.samples >= this.enough()) return false;
     this.sample ??= this.oneSample(view);
     if (this.sample.next().done) this.sample = null;
     this.mark();
     return true;
   }
 
+  // Samples until every light has had its turn.
+  cycle() { return TURN * ((this.lit() && this.lighting.lights.length) || 1); }
+
+  enough() {
+    const cycle = this.cycle();
+    return cycle * Math.max(Math.ceil(SAMPLES / cycle), LEAST_TURNS);
+  }
+
   *oneSample(view) {
     const gl = this.gl, { width, height } = this.canvas, number = this.samples + 1;
-    const shift = [radical(number, 2) - 0.5, radical(number, 3) - 0.5];
+    const cycle = this.cycle(), turn = Math.floor(this.samples / cycle), within = this.samples % TURN;
+    const round = TURN * turn + within + 1;
+    const shift = [radical(round, 2) - 0.5, radical(round, 3) - 0.5];
+    const lit = this.lit() && this.lighting.lights.length > 0;
+    if (lit && within === 0)
+      this.cast = yield* this.castShadow(Math.floor(this.samples % cycle / TURN), turn + 1);
+    const light = lit ? this.cast : null;
     const film = this.film.sized(width, height).frame;
-    yield* this.scene(view, { linear: 1, ribbon: this.state.width, shift, film });
+    yield* this.scene(view, { linear: 1, ribbon: this.state.width, shift, film, light });
     this.samples = number;
     gl.disable(gl.DEPTH_TEST);
     gl.bindVertexArray(this.empty);
@@ -85,7 +107,42 @@ export class Picture {
     this.copy.use({ uPicture: this.film.colour });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.disable(gl.BLEND);
-    if (number >= 4 || number === SAMPLES) this.showMean();
+    if (number >= 4 && (cycle === TURN || number % cycle === 0)) this.showMean();
+  }
+
+  // What one light sees first, drawn; the uniforms to shade by it, as bright as all together.
+  *castShadow(number, round) {
+    const gl = this.gl, hair = this.sets.model, { low, high } = hair, { lighting } = this;
+    const { camera, range, texel } = ofLight(
+      lighting.lights[number].position, low, high, this.texels);
+    const shift = [radical(round, 2) - 0.5, radical(round, 3) - 0.5];
+    const seen = { uMatrix: camera.matrix(...range, shift), uEye: camera.eye };
+    const begin = () => {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
+      gl.viewport(0, 0, this.texels, this.texels);
+      gl.enable(gl.DEPTH_TEST);
+    };
+    this.shadow.sized(this.texels, this.texels);
+    begin();
+    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    if (this.head) {
+      this.hidingHead.use(seen);
+      this.head.draw();
+    }
+    const shade = lighting.uniforms(number);
+    for (let first = 0; first < hair.here;) {
+      const count = Math.min(this.batch, hair.here - first);  // which may change at every yield
+      begin();
+      gl.bindVertexArray(this.empty);
+      this.hidingFibres.use(
+        { ...seen, ...hair.uniforms(), uRibbon: this.state.width, uSkip: 1, uFirst: first });
+      hair.draw(1, 1, count);
+      first += count;
+      yield;
+    }
+    return { ...shade, uShadow: seen.uMatrix, uShadowRange: range,
+      uTexel: texel, uShadowDepth: this.shadow.depth, uShadowOf: this.shadow.colour };
   }
 
   showMean() {
@@ -151,12 +208,12 @@ export class Picture {
       const camera = view(wide, height), common = this.common(camera, how);
       begin();
       if (this.head && state.head && state.opacity === 1) {
-        const lit = this.lit();
-        (lit ? this.litSkin : this.skin).use({ ...common, ...(lit ? this.lighting.uniforms() : {}) });
+        const skin = how.light ? this.shadowedSkin : this.lit() ? this.litSkin : this.skin;
+        skin.use({ ...common, ...this.light(how) });
         this.head.draw();
       }
       for (const name of what === "over" ? ["model", "truth"] : [what])
-        yield* this.strands(name, what === "over", { ...common, uFocal: camera.K[0][0] }, how, begin);
+        yield* this.strands(name, what === "over", common, how, begin);
       if (this.wires && state.wires) {
         begin();
         this.wire.use(common);
@@ -178,6 +235,9 @@ export class Picture {
     };
   }
 
+  // The uniforms of all light, or of the one whose turn it is.
+  light(how) { return how.light ?? (this.lit() ? this.lighting.uniforms() : {}); }
+
   lit() { return this.state.mode === "lit" && this.lighting; }
 
   // At rest all strands, a batch at a time; in motion as many as go quickly, at once.
@@ -195,9 +255,9 @@ export class Picture {
         gl.enable(gl.BLEND);
         gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       }
-      (lit ? this.litStrands : this.plain).use({
-        ...common, ...hair.uniforms(), uRibbon: how.ribbon, uSkip: skip, uFirst: first, uLeast: 0,
-        uOpacity: state.opacity, ...(lit ? this.lighting.uniforms() : {}),
+      (!lit ? this.plain : how.light ? this.fibres : this.litStrands).use({
+        ...common, ...hair.uniforms(), uRibbon: how.ribbon, uSkip: skip, uFirst: first,
+        uOpacity: state.opacity, ...(lit ? this.light(how) : {}),
         ...(flat ? { uMode: 5, uFlat: name === "truth" ? [0.25, 0.75, 1] : [1, 0.55, 0.15] } : {}),
         ...(this.lit() && !lit && !flat ? { uMode: 0 } : {}),
       });

@@ -33,14 +33,21 @@ export class Relight {
     picture.setLighting(this);
   }
 
-  uniforms() {
+  // All lights, or number `only` alone, as bright as if it stood for all turns of `lights`.
+  uniforms(only) {
     const { material } = this.told, { model } = this.viewer.picture.sets;
+    const used = only === undefined ? this.lights : [this.lights[only]];
+    const times = this.lights.length / Math.max(used.length, 1);
     const at = new Float32Array(24), power = new Float32Array(24);
-    this.lights.forEach((l, i) => { at.set(l.position, 3 * i); power.set(l.intensity, 3 * i); });
+    used.forEach((l, i) => {
+      at.set(l.position, 3 * i);
+      power.set(l.intensity.map((x) => times * x), 3 * i);
+    });
     return {
-      uLights: this.seen ? this.lights.length : 0, uLightAt: at, uLightPower: power,
+      uLights: this.seen ? used.length : 0, uLightAt: at, uLightPower: power,
       uSeen0: this.seen?.[0] ?? model.none, uSeen1: this.seen?.[1] ?? model.none,
       uTable: this.table, uVariance: material.variances, uTilt: material.tilt,
+      uEta: material.eta, uLogistic: material.logistic_scale, uAbsorption: material.absorption,
       uGrid: [material.cosines, material.turns], uSkin: material.skin,
       uAmbient: material.colour.map((c) => this.ambient * c / (4 * Math.PI)),
     };
@@ -124,6 +131,7 @@ export class Relight {
     this.seen = groups.map((g) => g.used ? hair.perPoint(g.strands, 4) : hair.none);
     picture.head?.seen(groups.map((g) => g.head));
     this.lights = lights;
+    viewer.draw();
     viewer.status("");
   }
 

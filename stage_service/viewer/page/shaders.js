@@ -5,20 +5,39 @@ precision highp float; precision highp int;
 precision highp sampler2D; precision highp sampler3D; precision highp usampler2D;
 `;
 
-export const STRAND_VERTEX = (lighting) => HEAD + `
+const STRAND = HEAD + `
 uniform usampler2D uPoints;
 uniform sampler2D uStrand;
-uniform sampler2D uLevel;
-uniform vec3 uLow, uEye, uFlat;
-uniform float uStep, uLongest, uFocal, uLeast, uRibbon;
-uniform int uCount, uPerRow, uSkip, uFirst, uMode;
+uniform vec3 uLow, uEye;
+uniform float uStep, uRibbon;
+uniform int uCount, uPerRow, uSkip, uFirst;
 uniform mat4 uMatrix;
-out vec3 vColour, vPlace;
-${lighting}
 ivec2 texel(int strand, int k) {
   return ivec2((strand % uPerRow) * uCount + k, strand / uPerRow);
 }
 vec3 place(int strand, int k) { return uLow + uStep * vec3(texelFetch(uPoints, texel(strand, k), 0).xyz); }
+vec2 own(int strand) { return texelFetch(uStrand, ivec2(strand % uPerRow, strand / uPerRow), 0).xy; }
+int number() {
+  return min((uRibbon > 0.0 ? gl_VertexID / 2 : gl_VertexID) * uSkip, uCount - 1);
+}
+vec3 tangent(int strand, int k) {
+  vec3 t = place(strand, min(k + 1, uCount - 1)) - place(strand, max(k - 1, 0));
+  return t / max(length(t), 1e-9);
+}
+vec3 across(vec3 t, vec3 view) {  // to the right of the strand, seen from the eye
+  vec3 side = cross(t, view);
+  float wide = length(side);
+  return wide > 1e-4 ? side / wide : vec3(0.0);
+}
+`;
+
+export const STRAND_VERTEX = (lighting) => STRAND + `
+uniform sampler2D uLevel;
+uniform vec3 uFlat;
+uniform float uLongest;
+uniform int uMode;
+out vec3 vColour, vPlace;
+${lighting}
 vec3 ramp(float x) {  // dark blue, teal, yellow: lightness grows with x
   x = clamp(x, 0.0, 1.0);
   vec3 c = mix(vec3(0.27, 0.0, 0.33), vec3(0.13, 0.57, 0.55), min(2.0 * x, 1.0));
@@ -30,28 +49,15 @@ vec3 hue(vec3 d) {
   return mix(c, vec3(1.0), 0.35 * clamp(d.z, 0.0, 1.0)) * (0.75 + 0.25 * d.z);
 }
 void main() {
-  int strand = uFirst + gl_InstanceID;
-  int k = min((uRibbon > 0.0 ? gl_VertexID / 2 : gl_VertexID) * uSkip, uCount - 1);
-  vec3 p = place(strand, k);
-  vec3 t = place(strand, min(k + 1, uCount - 1)) - place(strand, max(k - 1, 0));
-  t /= max(length(t), 1e-9);
-  vec2 own = texelFetch(uStrand, ivec2(strand % uPerRow, strand / uPerRow), 0).xy;
-  vec3 view = uEye - p;
-  float depth = length(view);
-  view /= depth;
-  vec3 q = p;
-  if (uRibbon > 0.0) {
-    vec3 side = cross(t, view);
-    float wide = length(side);
-    side = wide > 1e-4 ? side / wide : vec3(0.0);
-    float r = max(own.y * uRibbon, 0.5 * uLeast * depth / uFocal);
-    q += side * (gl_VertexID % 2 == 0 ? r : -r);
-  }
+  int strand = uFirst + gl_InstanceID, k = number();
+  vec3 p = place(strand, k), t = tangent(strand, k), view = normalize(uEye - p), q = p;
+  if (uRibbon > 0.0)
+    q += across(t, view) * own(strand).y * uRibbon * (gl_VertexID % 2 == 0 ? 1.0 : -1.0);
   vec3 c = vec3(1.0);
   if (uMode == 0) c = 0.5 + 0.5 * t;
   else if (uMode == 1) c = ramp(texelFetch(uLevel, texel(strand, k), 0).x);
   else if (uMode == 2) c = hue(normalize(place(strand, 0) - uLow - 32767.0 * uStep));
-  else if (uMode == 3) c = ramp(own.x / uLongest);
+  else if (uMode == 3) c = ramp(own(strand).x / uLongest);
   else if (uMode == 5) c = uFlat;
   if (uMode == 4) c = lit(p, t, view, strand, texel(strand, k));
   else c = pow(c, vec3(2.2)) * (0.35 + 0.65 * length(cross(t, view)));
@@ -59,6 +65,45 @@ void main() {
   vPlace = p;
   gl_Position = uMatrix * vec4(q, 1.0);
 }`;
+
+// A round fibre: a ribbon across the eye, of which each fragment knows where on the fibre it lies.
+export const FIBRE_VERTEX = STRAND + `
+out vec3 vPlace, vTangent, vFacing;
+out float vAcross, vRadius;
+flat out uint vStrand;
+void main() {
+  int strand = uFirst + gl_InstanceID, k = number();
+  vec3 p = place(strand, k), view = normalize(uEye - p);
+  vTangent = tangent(strand, k);
+  vAcross = gl_VertexID % 2 == 0 ? 1.0 : -1.0;
+  vRadius = own(strand).y * uRibbon;
+  vec3 side = across(vTangent, view);
+  vFacing = cross(side, vTangent);
+  vPlace = p + vAcross * vRadius * side;
+  vStrand = uint(strand);
+  gl_Position = uMatrix * vec4(vPlace, 1.0);
+}`;
+
+const FIBRE = HEAD + `
+in vec3 vPlace, vTangent, vFacing;
+in float vAcross, vRadius;
+flat in uint vStrand;
+uniform mat4 uMatrix;
+vec3 surface() {  // and the depth of the round fibre, not of the ribbon
+  vec3 p = vPlace + vFacing * vRadius * sqrt(max(1.0 - vAcross * vAcross, 0.0));
+  vec4 clip = uMatrix * vec4(p, 1.0);
+  gl_FragDepth = 0.5 + 0.5 * clip.z / clip.w;
+  return p;
+}
+`;
+
+export const FIBRE_SHADOW = FIBRE + `
+out uint oStrand;
+void main() { surface(); oStrand = vStrand; }`;
+
+export const HEAD_SHADOW = HEAD + `
+out uint oStrand;
+void main() { oStrand = 0xffffffffu; }`;
 
 export const UNLIT = `
 vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) { return vec3(0.0); }`;
@@ -150,6 +195,30 @@ void main() {
   oColour = vec4(shown(c.rgb), c.a);
 }`;
 
+const LONGITUDINAL = `
+float scaledI0(float x) {  // I0(x) exp(-x): Abramowitz and Stegun 9.8.1, 9.8.2
+  if (x < 3.75) {
+    float y = x * x / 14.0625;
+    return exp(-x) * (1.0 + y * (3.5156229 + y * (3.0899424 + y * (1.2067492 + y * (0.2659732
+      + y * (0.0360768 + y * 0.0045813))))));
+  }
+  float z = 3.75 / x;
+  return (0.39894228 + z * (0.01328592 + z * (0.00225319 + z * (-0.00157565 + z * (0.00916281
+    + z * (-0.02057706 + z * (0.02635537 + z * (-0.01647633 + z * 0.00392377)))))))) * inversesqrt(x);
+}
+float longitudinal(float si, float ci, float so, float co, float v) {
+  float chord = (ci - co) * (ci - co) + (si + so) * (si + so), r = 1.0 / v;
+  return scaledI0(ci * co * r) * exp(-0.5 * chord * r) * r / (1.0 - exp(-2.0 * r));
+}
+struct Tilted { vec4 sines, cosines; };
+Tilted tilted(float si, float ci, float tilt) {  // the inclination that R, TT, TRT and the rest see
+  float s1 = sin(tilt), c1 = cos(tilt), s2 = 2.0 * s1 * c1, c2 = c1 * c1 - s1 * s1;
+  float s4 = 2.0 * s2 * c2, c4 = c2 * c2 - s2 * s2;
+  return Tilted(vec4(si * c2 + ci * s2, si * c1 - ci * s1, si * c4 - ci * s4, si),
+    vec4(abs(ci * c2 - si * s2), abs(ci * c1 + si * s1), abs(ci * c4 + si * s4), ci));
+}
+`;
+
 // Direct light of the hair's BSDF seen from afar: M_p of each lobe, times a table of the mean of
 // A_p N_p over the fibre's width (appearance/bsdf/far_field.py), times what the shadow lets through.
 const LIGHTS = `
@@ -169,31 +238,14 @@ uniform sampler2D uSeen0, uSeen1, uTable;
 uniform vec4 uVariance;
 uniform float uTilt;
 uniform vec2 uGrid;  // cosines, turns
-float scaledI0(float x) {  // I0(x) exp(-x): Abramowitz and Stegun 9.8.1, 9.8.2
-  if (x < 3.75) {
-    float y = x * x / 14.0625;
-    return exp(-x) * (1.0 + y * (3.5156229 + y * (3.0899424 + y * (1.2067492 + y * (0.2659732
-      + y * (0.0360768 + y * 0.0045813))))));
-  }
-  float z = 3.75 / x;
-  return (0.39894228 + z * (0.01328592 + z * (0.00225319 + z * (-0.00157565 + z * (0.00916281
-    + z * (-0.02057706 + z * (0.02635537 + z * (-0.01647633 + z * 0.00392377)))))))) * inversesqrt(x);
-}
-float longitudinal(float si, float ci, float so, float co, float v) {
-  float chord = (ci - co) * (ci - co) + (si + so) * (si + so), r = 1.0 / v;
-  return scaledI0(ci * co * r) * exp(-0.5 * chord * r) * r / (1.0 - exp(-2.0 * r));
-}
-vec3 azimuthal(int lobe, float cosine, float turn) {
+${LONGITUDINAL}vec3 azimuthal(int lobe, float cosine, float turn) {
   float row = clamp(cosine * uGrid.x, 0.5, uGrid.x - 0.5) + float(lobe) * uGrid.x;
   float column = clamp(turn / 3.14159265 * uGrid.y, 0.5, uGrid.y - 0.5);
   return texture(uTable, vec2(column / uGrid.y, row / (4.0 * uGrid.x))).rgb;
 }
 vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) {
   float si = clamp(dot(t, view), -1.0, 1.0), ci = sqrt(max(1.0 - si * si, 1e-8));
-  float s1 = sin(uTilt), c1 = cos(uTilt), s2 = 2.0 * s1 * c1, c2 = c1 * c1 - s1 * s1;
-  float s4 = 2.0 * s2 * c2, c4 = c2 * c2 - s2 * s2;
-  vec4 sines = vec4(si * c2 + ci * s2, si * c1 - ci * s1, si * c4 - ci * s4, si);
-  vec4 cosines = vec4(abs(ci * c2 - si * s2), abs(ci * c1 + si * s1), abs(ci * c4 + si * s4), ci);
+  Tilted leans = tilted(si, ci, uTilt);
   vec4 seen0 = texelFetch(uSeen0, at, 0), seen1 = texelFetch(uSeen1, at, 0);
   vec3 across = (view - si * t) / ci, sum = vec3(0.0);
   for (int i = 0; i < uLights; i++) {
@@ -206,11 +258,73 @@ vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) {
     float turn = acos(clamp(dot(across, l - so * t) / co, -1.0, 1.0));
     vec3 f = vec3(0.0);
     for (int lobe = 0; lobe < 4; lobe++)
-      f += longitudinal(sines[lobe], cosines[lobe], so, co, uVariance[lobe])
+      f += longitudinal(leans.sines[lobe], leans.cosines[lobe], so, co, uVariance[lobe])
         * azimuthal(lobe, ci, turn);
     sum += seen * power * f;
   }
   return sum;
+}`;
+
+// What a light sees first in each texel: how deep it lies, and whose strand it is, for a strand does
+// not hide itself. Texels are shifted from one picture to the next, so their mean has none.
+const SHADOW = `
+uniform sampler2D uShadowDepth;
+uniform usampler2D uShadowOf;
+uniform mat4 uShadow;
+uniform vec2 uShadowRange;  // near, far
+bool hidden(vec3 p, uint mine, float slack) {
+  vec4 clip = uShadow * vec4(p, 1.0);
+  vec3 at = 0.5 + 0.5 * clip.xyz / clip.w;
+  if (any(lessThan(at, vec3(0.0))) || any(greaterThan(at, vec3(1.0)))) return false;
+  ivec2 size = textureSize(uShadowDepth, 0), texel = min(ivec2(at.xy * vec2(size)), size - 1);
+  if (texelFetch(uShadowOf, texel, 0).x == mine) return false;
+  float n = uShadowRange.x, f = uShadowRange.y;
+  float first = n * f / (f - texelFetch(uShadowDepth, texel, 0).x * (f - n));
+  return first < n * f / (f - at.z * (f - n)) - slack;
+}
+`;
+
+// Direct light of the hair's BSDF where a fragment lies on its fibre: appearance/bsdf/lobes.py.
+export const FIBRE_FRAGMENT = FIBRE + LIGHTS + LONGITUDINAL + SHADOW + `
+uniform vec4 uSlice, uVariance;
+uniform float uOpacity, uTilt, uEta, uLogistic;
+uniform vec3 uEye, uAbsorption;
+out vec4 oColour;
+const float PI = 3.14159265;
+float turned(float x) {  // N_p: a logistic, trimmed to one turn
+  x -= 2.0 * PI * round(x / (2.0 * PI));
+  float z = exp(-abs(x) / uLogistic);
+  return z / (uLogistic * (1.0 + z) * (1.0 + z) * tanh(min(0.5 * PI / uLogistic, 20.0)));
+}
+vec3 fibre(vec3 t, vec3 view, vec3 l) {
+  float si = clamp(dot(t, view), -1.0, 1.0), ci = sqrt(max(1.0 - si * si, 1e-8));
+  float so = clamp(dot(t, l), -1.0, 1.0), co = sqrt(max(1.0 - so * so, 1e-8));
+  vec3 facing = (view - si * t) / ci;
+  float turn = atan(-dot(l, cross(t, facing)), dot(l, facing));
+  float h = clamp(vAcross, -1.0, 1.0), up = sqrt(max(1.0 - h * h, 0.0)), gamma = asin(h);
+  float q = (uEta - 1.0) * (uEta + 1.0), mu = ci * up, n = uEta * uEta;
+  float w = sqrt(q + mu * mu), s = mu + w, p = n * mu + w;
+  float rs = q / (s * s), rp = q * ((n + 1.0) * mu * mu - 1.0) / (p * p);
+  float F = 0.5 * (rs * rs + rp * rp), through = 2.0 * mu * w * (1.0 / (s * s) + n / (p * p));
+  float inside = atan(h * ci, w);
+  vec3 T = exp(-uAbsorption * (2.0 * uEta * w / (q + ci * ci)));
+  vec3 tt = through * through * T, trt = tt * F * T;
+  vec3 rest = trt * F * T / max(1.0 - F * T, 1e-6);
+  Tilted leans = tilted(si, ci, uTilt);
+  float first = turn + 2.0 * gamma;
+  return longitudinal(leans.sines.x, leans.cosines.x, so, co, uVariance.x) * F * turned(first)
+    + longitudinal(leans.sines.y, leans.cosines.y, so, co, uVariance.y) * tt
+      * turned(first - 2.0 * inside - PI)
+    + longitudinal(leans.sines.z, leans.cosines.z, so, co, uVariance.z) * trt
+      * turned(first - 4.0 * inside)
+    + longitudinal(leans.sines.w, leans.cosines.w, so, co, uVariance.w) * rest * (0.5 / PI);
+}
+void main() {
+  vec3 p = surface(), l;
+  if (dot(uSlice.xyz, p) > uSlice.w) discard;
+  vec3 power = incoming(0, p, l), c = uAmbient * power;
+  if (!hidden(p, vStrand, 2e-5)) c += power * fibre(normalize(vTangent), normalize(uEye - p), l);
+  oColour = vec4(c * uOpacity, uOpacity);
 }`;
 
 export const LIT_HEAD = LIGHTS + `
@@ -224,4 +338,15 @@ vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
     sum += power * (seen * max(dot(n, l), 0.0) / 3.14159265 * uSkin + uAmbient);
   }
   return sum;
+}`;
+
+// The same with the shadow of one light looked up, not taken from the vertices.
+export const SHADOWED_HEAD = LIGHTS + SHADOW + `
+uniform vec3 uSkin;
+uniform float uTexel;  // metres
+vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
+  vec3 l, power = incoming(0, p, l);
+  float cosine = max(dot(n, l), 0.0);
+  bool dark = cosine == 0.0 || hidden(p + 2.0 * uTexel * n, 0xfffffffeu, 2.0 * uTexel);
+  return power * ((dark ? 0.0 : cosine / 3.14159265) * uSkin + uAmbient);
 }`;

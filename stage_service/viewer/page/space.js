@@ -59,6 +59,25 @@ export class Pinhole {
   }
 }
 
+// What a light at `eye` sees of a box, `size` pixels a side; with the range of depths to draw.
+export function ofLight(eye, low, high, size) {
+  const forward = unit(sub(scale(add(low, high), 0.5), eye));
+  const right = unit(cross(forward, Math.abs(forward[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));
+  const R = [right, cross(forward, right), forward], x = [], y = [], z = [];
+  for (let i = 0; i < 8; i++) {
+    const corner = sub([0, 1, 2].map((k) => (i >> k & 1 ? high : low)[k]), eye);
+    const depth = Math.max(dot(corner, forward), 0.05);
+    x.push(dot(corner, right) / depth);
+    y.push(dot(corner, R[1]) / depth);
+    z.push(depth);
+  }
+  const [fx, fy] = [x, y].map((v) => (size - 4) / (Math.max(...v) - Math.min(...v)));
+  const K = [[fx, 0, 1.5 - fx * Math.min(...x)], [0, fy, 1.5 - fy * Math.min(...y)], [0, 0, 1]];
+  const camera = new Pinhole({ R, t: R.map((row) => -dot(row, eye)), K, width: size, height: size });
+  const range = [Math.max(0.02, Math.min(...z) - 0.3), Math.max(...z) + 0.01];
+  return { camera, range, texel: range[1] / Math.min(fx, fy) };
+}
+
 // Turns about `target`; azimuth from +x towards +y, the face looks along -y, z is up.
 export class Orbit {
   constructor(low, high) {

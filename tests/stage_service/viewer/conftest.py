@@ -42,7 +42,12 @@ def sphere(radius: float = 0.079, rows: int = 12) -> Mesh:
 
 
 @pytest.fixture
-def model(tmp_path: Path) -> Model:
+def model(bristly: Model) -> Model:
+    return bristly
+
+
+@pytest.fixture
+def bristly(tmp_path: Path) -> Model:
     made = Model(tmp_path / "bristles").create()
     made.write_strands(bristles())
     made.write_head(sphere())

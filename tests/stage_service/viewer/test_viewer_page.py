@@ -12,6 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
+from appearance import Exposure, HairAppearance, render_olat
+from appearance.model.fitted_model import FittedModel
+from appearance.observations import HeldOut
+from appearance.sun_fit.fitted_appearance import FittedAppearance
+from reconstruction import Camera, Model, Strands
+
 api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
@@ -19,6 +25,27 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here"),
 ]
 PATIENCE_MS = 300_000
+HAIR = HairAppearance((0.1, 0.3, 0.9), 0.3, 0.25, tilt_deg=2)
+
+
+def fibre() -> Strands:
+    """One bent fibre of 5 cm, 2 mm wide: a few pixels."""
+    s = np.linspace(-0.025, 0.025, 40)
+    return Strands.from_list([np.stack([s, 4 * s**2, 0.3 * s], 1)], radius=1e-3)
+
+
+def bundle() -> Strands:
+    """200 fibres that hide each other, 1 mm wide; some run through others."""
+    rng = np.random.default_rng(3)
+    s = np.linspace(-0.02, 0.02, 24)[:, None]
+    lines = []
+    for _ in range(200):
+        turned = rng.normal(size=3) * 0.3
+        lines.append(rng.uniform(-0.015, 0.015, 3) * [0.3, 1, 1] + s * ([1, 0, 0] + turned))
+    return Strands.from_list(lines, radius=5e-4)
+
+
+GROOMS = {"fibre": fibre, "bundle": bundle}
 
 
 @dataclass
@@ -42,6 +69,19 @@ class Seen:
             f"viewer.picture.frames > 0 && {what}",
             timeout=PATIENCE_MS,
         )
+
+
+@pytest.fixture
+def model(tmp_path, request):
+    """Strands that a test names, with a material; else bristles on a sphere."""
+    which = getattr(request, "param", None)
+    if which is None:
+        return request.getfixturevalue("bristly")
+    made = Model(tmp_path / "bristles").create()
+    made.write_strands(GROOMS[which]())
+    grey = (0.2,) * 3
+    FittedAppearance(HAIR, grey, grey, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()).save(made)
+    return made
 
 
 @pytest.fixture
@@ -80,3 +120,47 @@ def test_strands_are_drawn_turn_and_take_another_colour(seen, url):
     assert seen.complaints == []
     assert seen.hosts == {url.partition("://")[2]}
     assert "token" not in seen.page.evaluate("location.href")
+
+
+@pytest.mark.parametrize(
+    ("model", "allowed"), [("fibre", 0.01), ("bundle", 0.08)], indirect=["model"]
+)
+def test_direct_light_is_that_of_the_path_tracer(seen, model, viewing, allowed):
+    """From in front, from the side, from behind; the picture's sum beside paths of one vertex."""
+    seen.drawn("viewer.relight")
+    seen.page.evaluate("() => { viewer.frame = () => {}; }")
+    seen.page.select_option("select >> nth=0", "lit")
+    seen.page.wait_for_function("viewer.relight.seen", timeout=PATIENCE_MS)
+    lighting = viewing.get("bristles").lighting
+    eye = np.array(seen.page.evaluate("viewer.orbit.pinhole(96, 96).eye"))
+    ways = np.array([x.position / np.linalg.norm(x.position) for x in lighting.lights])
+    across = np.cross(eye, [0, 0, 1.0])
+    numbers = [int((ways @ w).argmax()) for w in (eye, across, -eye)]
+    told = seen.page.evaluate(
+        "(() => { const { K, R, t } = viewer.orbit.pinhole(96, 96); return { K, R, t }; })()"
+    )
+    camera = Camera("orbit", 96, 96, *(np.array(told[k]) for k in "KRt"))
+    scene = FittedModel.load(model).scene()
+    expected = render_olat(
+        scene, camera, [lighting.lights[n] for n in numbers], spp=256, max_depth=1, thrift=0
+    )
+    for number, picture in zip(numbers, expected, strict=True):
+        seen.page.evaluate(f"viewer.relight.set({{{number}: [1, 1, 1]}})")
+        seen.page.wait_for_function(
+            f"!viewer.relight.under && viewer.relight.lights[0]?.number === {number}",
+            timeout=PATIENCE_MS,
+        )
+        found = np.array(seen.page.evaluate(AT_REST), np.float32).reshape(96, 96, 4)[::-1, :, :3]
+        np.testing.assert_allclose(found.sum(axis=(0, 1)), picture.sum(axis=(0, 1)), rtol=allowed)
+    assert seen.complaints == []
+
+
+AT_REST = """() => {
+    const { picture, canvas, relight } = viewer;
+    canvas.width = canvas.height = 96;
+    relight.ambient = 0;
+    picture.samples = 0;
+    picture.sample = null;
+    while (picture.samples < picture.enough()) for (const _ of picture.oneSample(viewer.view));
+    return Array.from(picture.radiance());
+}"""
