@@ -41,7 +41,9 @@ def bundle() -> Strands:
     lines = []
     for _ in range(200):
         turned = rng.normal(size=3) * 0.3
-        lines.append(rng.uniform(-0.015, 0.015, 3) * [0.3, 1, 1] + s * ([1, 0, 0] + turned))
+        lines.append(
+            rng.uniform(-0.015, 0.015, 3) * [0.3, 1, 1] + s * (np.array([1, 0, 0]) + turned)
+        )
     return Strands.from_list(lines, radius=5e-4)
 
 
