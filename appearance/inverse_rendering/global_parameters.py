@@ -34,12 +34,16 @@ WIDE = {"sigma_a": 0.4, "beta_m": 0.4, "beta_n": 0.6, "eta": 0.6, "gain": PRIOR}
 _FARTHEST = 1.5
 _TURNS, _ESTIMATES = 16, 4
 """Most draws of paths; the result is the mean of so many estimates within a width of each other."""
+_DARKENS, _CLEARLY = 32, 0.25
+"""Most steps of absorption alone, and the width from which they count."""
 _FEWEST = 32
 """Paths a pixel of a draw."""
 _BEGINS = (-1.8, 0.4)
 """Roughness begins between 0.15 and 0.6: a much narrower lobe is met by too few paths."""
 _ALIKE = 3 * 32
 """Values in a row that may be off together."""
+FOUND = {"beta_m": (0.05, 0.8), "beta_n": (0.2, 0.7)}
+"""Roughness that was found again from pictures, wherever it began; what ends beyond is doubtful."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +67,10 @@ def solve_global_parameters(
 
     "sigma_a" moves all cells' logits alike in each channel; "gain" is the lights' intensities,
     their mean kept at 1. What no pixel of the pairs depends on stays where it is: every estimate
-    has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Found are beta_m of
-    0.05 to 0.8 and beta_n of 0.2 to 0.7, wherever they begin; a narrower beta_n ends at up to 0.3.
-    Black hair has to begin dark: from an absorption of 0.2 for 6 to 15 its beta_m ended at 0.93
-    for 0.25, with no sign of it here.
+    has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Roughness is found
+    within `FOUND`; a narrower beta_n ends at up to 0.3. Hair that begins too bright in all channels
+    is darkened before anything else moves: a wide lobe would explain its picture as well. (Black
+    hair: beta_m within 10 %, its index off by up to 0.15 from a grey start.)
     Takes the time of five to sixteen pictures of twice `effort.spp` paths a pixel. Where a picture
     is not finite, it gives back what it got.
     """
@@ -80,6 +84,8 @@ def solve_global_parameters(
     given = raw, gain
     for name in {"beta_m", "beta_n"} & set(names):
         raw = raw | {name: np.clip(raw[name], *_BEGINS)}
+    if len(names) > 1 and "sigma_a" in names:
+        raw = _darkened(problem, raw, gain, evidence)
     estimates: list[tuple[Raw, Array]] = []
     away = np.zeros(len(numbers))
     system = _System(problem, numbers, evidence)
@@ -103,6 +109,19 @@ def solve_global_parameters(
         raw | {n: np.mean([r[n] for r, _ in last], axis=0) for n in names if n in raw},
         np.exp(np.mean([np.log(g) for _, g in last], axis=0)),
     )
+
+
+def _darkened(problem: FitProblem, raw: Raw, gain: Array, evidence: Evidence) -> Raw:
+    """`raw` with its absorption moved, alone, while each channel is clearly too bright."""
+    numbers = [("sigma_a", i) for i in range(3)]
+    system = _System(problem, numbers, replace(evidence, seed=evidence.seed + 1))
+    for turn in range(_DARKENS):
+        step = system.step(raw, gain, turn)
+        if not step.max() < -_CLEARLY:  # or not a number
+            break
+        for number, d in zip(numbers, step * system.wide, strict=True):
+            raw, gain = _moved(raw, gain, number, d)
+    return raw
 
 
 def _moved(raw: Raw, gain: Array, number: Number, d: float) -> tuple[Raw, Array]:

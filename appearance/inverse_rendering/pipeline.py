@@ -9,6 +9,7 @@ import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import lights_as_found, save_lights
+from appearance.inverse_rendering.global_parameters import FOUND
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import Monitor, Outcome, run
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
@@ -71,6 +72,9 @@ def fit_maps(
         outcome = one_colour
         if options.variant != "original":
             outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
+        for name, (least, most) in FOUND.items():
+            if not least <= (value := float(getattr(outcome.maps, name))) <= most:
+                stage.warn(f"{name} {value:.2f} is beyond {least} to {most}: too far to be sure of")
         outcome.maps.save(model, mapped.root_uv)
         save_lights(model, outcome.lights, problem.lights)
         progress("judging held-out images", 0.92)
