@@ -6,7 +6,7 @@ says in the report.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field, with_descent
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
 from reconstruction.growth.hair_envelope import build_envelope, build_hull, pixel_size
+from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.head.capture_head import (
@@ -96,7 +97,9 @@ def reconstruct(
             measured = merge(measured, segments)
         scalp = find_scalp(head.mesh, envelope)
         field = stages.field(envelope, measured, scalp)
-        stages.strands(field, scalp, seen, head.scalp_map)
+        grown = stages.grown(field, scalp, seen)
+        grown = stages.refined(grown, measured, cloud)
+        stages.rooted(grown, measured, scalp, head.scalp_map)
     if not any(stage.name == "head" for stage in stages.report.stages):
         model.remove("head.obj")  # an earlier reconstruction's: this one has the capture's, or none
     model.write_report(stages.report)
@@ -236,20 +239,20 @@ class _Stages:
         self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
     ) -> None:
         """Strands from line stereo alone: only what is seen, none of them rooted."""
-        polylines, _ = self.lines(masked, head, method)
+        polylines, segments = self.lines(masked, head, method)
         why = "line stereo measures what is seen; the method 'fused' leads it to the scalp"
         with self.report.stage("strands") as stage:
             stage.leave_out("roots", why, "the field and the growth")
-            self._unrooted([*polylines], stage)
+            lines = Measured(segments.points, segments.directions, segments.confidence)
+            self._unrooted([*polylines], lines, stage)
 
-    def _unrooted(self, polylines: list[AnyFloats], stage: Stage) -> None:
+    def _unrooted(self, polylines: list[AnyFloats], measured: Measured, stage: Stage) -> None:
         """Write strands that have no roots; raises `CaptureError` where there is none."""
         if not polylines:
             raise CaptureError("no strand was found: the method 'hull' fills the masks' hull")
         radius = self._radius(len(polylines))
         strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
-        stage.figures.update(strands=len(strands), metres=float(strands.lengths().sum()))
-        self.model.write_strands(strands)
+        self._write(strands, measured, stage)
 
     def hull(self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None) -> None:
         """Strands along the smooth field of the hull's surface, pulled by all that is measured.
@@ -279,7 +282,8 @@ class _Stages:
         scalp = None if mesh is None else find_scalp(mesh, envelope)
         field = self.field(envelope, with_descent(envelope, measured, mesh), scalp)
         if head is not None and scalp is not None:
-            self.strands(field, scalp, seen, head.scalp_map)
+            grown = self.refined(self.grown(field, scalp, seen), measured, cloud)
+            self.rooted(grown, measured, scalp, head.scalp_map)
             return
         with self.report.stage("strands") as stage:
             coverage, tracing = Coverage(field), Tracing(max_length=o.max_length)
@@ -287,7 +291,7 @@ class _Stages:
                 coverage.add(path)
             within = UNROOTED_DEPTH if o.within is None else o.within
             gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
-            self._unrooted(roots_first([*seen, *gaps], None), stage)
+            self._unrooted(roots_first([*seen, *gaps], None), measured, stage)
 
     def envelope(
         self, masked: MaskedCapture, cloud: PointCloud, head: Mesh | None
@@ -353,13 +357,10 @@ class _Stages:
                 )
         return field
 
-    def strands(
-        self, field: OrientationField, scalp: Scalp, seen: list[AnyFloats], flat: ScalpMap | None
-    ) -> None:
+    def grown(self, field: OrientationField, scalp: Scalp, seen: list[AnyFloats]) -> Strands:
         """Strands from the scalp, then through the gaps that those leave, all of them rooted.
 
         `seen` polylines `(N, 3)` were measured as they are; they get roots like those through gaps.
-        Where the roots lie on the scalp's map (`flat` where the head has it) is written, too.
         """
         o = self.options
         with self.report.stage("strands") as stage:
@@ -381,8 +382,7 @@ class _Stages:
                 raise CaptureError(
                     "no strand could be grown: the envelope does not reach the scalp"
                 )
-            radius = self._radius(len(result.strands))
-            strands = Strands.from_list(result.strands, radius).resampled(SPACING)
+            strands = Strands.from_list(result.strands).resampled(SPACING)
             stage.figures.update(
                 strands=len(strands),
                 from_roots=len(rooted),
@@ -394,15 +394,55 @@ class _Stages:
                 covered_by_roots=share,
                 covered=filled,
                 metres=float(strands.lengths().sum()),
-                radius=radius,
                 options=asdict(o),
             )
             if result.dropped:
                 stage.warn(
                     f"{result.dropped} strands through gaps reached no root and were dropped"
                 )
-            self.model.write_strands(strands)
+        return strands
+
+    def refined(self, strands: Strands, measured: Measured, cloud: PointCloud) -> Strands:
+        """All strands refined together by the `measured` lines, where a sweep has placed these."""
+        o = self.options.refine
+        with self.report.stage("refinement") as stage:
+            lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+            why = None
+            if not len(cloud) or not len(lines.points):
+                why = "without a sweep lines lie on the visual hull, millimetres off"
+            elif not (o.steps or o.worth):
+                why = "the options ask for none"
+            if why is not None:
+                stage.leave_out("refinement", why, "this stage; strands stay as they were grown")
+                return strands
+            self.progress("refining strands", 0.8)
+            strands, figures = refine(strands, lines, o)
+            stage.figures.update(figures)
+        return strands
+
+    def rooted(
+        self, strands: Strands, measured: Measured, scalp: Scalp, flat: ScalpMap | None
+    ) -> None:
+        """Write strands that have roots, and where these lie on the scalp's map.
+
+        `flat` is the head's own map where it has one.
+        """
+        with self.report.stage("roots") as stage:
+            strands = replace(strands, radius=self._radius(len(strands)))
+            self._write(strands, measured, stage)
             write_root_map(self.model, strands, scalp, flat, stage)
+
+    def _write(self, strands: Strands, measured: Measured, stage: Stage) -> None:
+        """Write strands, each point with its confidence by the `measured` lines."""
+        lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+        confidence = supported(strands, lines)
+        stage.figures.update(
+            strands=len(strands),
+            metres=float(strands.lengths().sum()),
+            radius=strands.radius,
+            measured_share=float((confidence > 0).mean()),
+        )
+        self.model.write_strands(replace(strands, confidence=confidence))
 
     def _radius(self, count: int) -> float:
         """Metres: the user's, or what keeps a head of hair's coverage with so many strands."""

@@ -29,9 +29,9 @@ class Groom:
     """Strands as they go out.
 
     `root_uv (S, 2)` are the roots' places on the scalp's map; `ids (S,)` the strands' places in the
-    model's `strands.npz`. `confidence (N,)` in [0, 1] says how near a point is to a triangulated
-    one (Gaussian of `MEASURED`), None where the model has no points. `guides (G,)` are the
-    strands that stand for clumps, `clump (S,)` which of them each strand follows; both empty
+    model's `strands.npz`. `confidence (N,)` in [0, 1] is the strands' own, or else says how near
+    a point is to a triangulated one (Gaussian of `MEASURED`), None without both. `guides (G,)` are
+    the strands that stand for clumps, `clump (S,)` which of them each strand follows; both empty
     without guides. `head_uv (V, 2)` is the map at the head's vertices, NaN off the scalp, or None.
     """
 
@@ -72,8 +72,8 @@ class Groom:
     ) -> Groom:
         """The groom of a fit; `measured (M, 3)` are triangulated points."""
         strands, ids = thinned(fitted.strands, options.strands, options.seed)
-        confidence = None
-        if measured is not None and len(measured):
+        confidence = strands.confidence
+        if confidence is None and measured is not None and len(measured):
             far = 5 * MEASURED
             distance, _ = cKDTree(measured).query(strands.points, distance_upper_bound=far)
             confidence = np.exp(-0.5 * (distance / MEASURED) ** 2).astype(np.float32)

@@ -16,15 +16,17 @@ class Strands:
     """Strands as polylines, root first.
 
     `points (N, 3) float32` in metres; strand `i` is `points[offsets[i]:offsets[i + 1]]` with
-    `offsets (S + 1,) int64`; `radius` in metres, a scalar or `(N,)`.
+    `offsets (S + 1,) int64`; `radius` in metres, a scalar or `(N,)`. `confidence (N,)`, where it is
+    known, says how well measurements agree with each point: 0 where it is guessed, at most 1.
 
     Raises `ValueError` where offsets do not partition the points, a strand has under two points,
-    or a coordinate is not finite.
+    a coordinate is not finite or a confidence not in [0, 1].
     """
 
     points: Floats
     offsets: Ints
     radius: float | Floats = 4e-5
+    confidence: Floats | None = None
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points, dtype=np.float32).reshape(-1, 3)
@@ -45,6 +47,13 @@ class Strands:
             object.__setattr__(self, "radius", radius)
         if not (np.all(np.asarray(self.radius) > 0) and np.all(np.isfinite(self.radius))):
             raise ValueError("radius must be positive and finite")
+        if self.confidence is not None:
+            confidence = np.ascontiguousarray(self.confidence, dtype=np.float32)
+            if confidence.shape != (len(points),):
+                raise ValueError(f"confidence must be ({len(points)},), got {confidence.shape}")
+            if not ((confidence >= 0) & (confidence <= 1)).all():
+                raise ValueError("confidence must be in [0, 1]")
+            object.__setattr__(self, "confidence", confidence)
 
     @classmethod
     def from_list(cls, strands: list[AnyFloats], radius: float = 4e-5) -> Strands:
@@ -101,7 +110,8 @@ class Strands:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[index] - offsets[:-1], counts)
         radius = self.radius[take] if isinstance(self.radius, np.ndarray) else self.radius
-        return Strands(self.points[take], offsets, radius)
+        confidence = None if self.confidence is None else self.confidence[take]
+        return Strands(self.points[take], offsets, radius, confidence)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Strands:
         """The strands moved by `x -> rotation (3, 3) @ x + translation (3,)`."""
@@ -111,11 +121,14 @@ class Strands:
     def resampled(self, step: float) -> Strands:
         """Every strand resampled at equal arc lengths of about `step` metres, ends kept.
 
-        Strands of no length keep their two end points. A per-point radius is interpolated.
+        Strands of no length keep their two end points. A per-point radius is interpolated, and so
+        is the confidence.
         """
         every = Resampling(self, step)
-        points, radius = every(np.arange(every.offsets[-1]))
-        return Strands(points, every.offsets, radius)
+        index = np.arange(every.offsets[-1])
+        points, radius = every(index)
+        confidence = None if self.confidence is None else every.confidence(index)
+        return Strands(points, every.offsets, radius, confidence)
 
 
 class Resampling:
@@ -138,7 +151,25 @@ class Resampling:
 
     def __call__(self, index: Ints) -> tuple[Floats, float | Floats]:
         """Points `(N, 3)` at `index (N,)` among all the resampled ones, and their radius."""
-        p, offsets, arc = self.strands.points, self.strands.offsets, self._arc
+        p = self.strands.points
+        left, w = self._place(index)
+        points = (p[left] * (1 - w)[:, None] + p[left + 1] * w[:, None]).astype(np.float32)
+        radius = self.strands.radius
+        if isinstance(radius, np.ndarray):
+            radius = (radius[left] * (1 - w) + radius[left + 1] * w).astype(np.float32)
+        return points, radius
+
+    def confidence(self, index: Ints) -> Floats:
+        """Confidence `(N,)` at `index (N,)`, 0 where it is not known."""
+        given = self.strands.confidence
+        if given is None:
+            return np.zeros(len(index), np.float32)
+        left, w = self._place(index)
+        return (given[left] * (1 - w) + given[left + 1] * w).clip(0, 1).astype(np.float32)
+
+    def _place(self, index: Ints) -> tuple[Ints, Array]:
+        """The given point before each of `index (N,)`, and the share of the way to the next."""
+        offsets, arc = self.strands.offsets, self._arc
         strand = np.searchsorted(self.offsets, index, side="right") - 1
         last = np.diff(self.offsets)[strand] - 1
         k = index - self.offsets[strand]
@@ -147,12 +178,7 @@ class Resampling:
         left = np.clip(np.searchsorted(arc, s, side="right") - 1, low, high)
         span = arc[left + 1] - arc[left]
         w = np.clip(np.divide(s - arc[left], span, out=np.zeros_like(s), where=span > 0), 0, 1)
-        left, w = np.where(k == last, high, left), np.where(k == last, 1.0, w)
-        points = (p[left] * (1 - w)[:, None] + p[left + 1] * w[:, None]).astype(np.float32)
-        radius = self.strands.radius
-        if isinstance(radius, np.ndarray):
-            radius = (radius[left] * (1 - w) + radius[left + 1] * w).astype(np.float32)
-        return points, radius
+        return np.where(k == last, high, left), np.where(k == last, 1.0, w)
 
 
 def unit_or_zero(vectors: Array) -> Array:

@@ -1,4 +1,5 @@
-"""NumPy archives: `points (N, 3)`, `offsets (S + 1,)` and, optionally, `radius` () or (N,).
+"""NumPy archives: `points (N, 3)`, `offsets (S + 1,)` and, optionally, `radius` () or (N,) and
+`confidence` (N,).
 
 Poses of moving strands are `points (T, N, 3)`.
 """
@@ -24,24 +25,26 @@ DEFLATE_AT_BEST = 1032
 
 
 def read_npz(path: Path) -> Strands:
-    """Read an archive; other members than `points`, `offsets`, `radius` are not looked at."""
-    points, offsets, radius = _members(path)
+    """Read an archive; other members than those of the module's text are not looked at."""
+    points, offsets, radius, confidence = _members(path)
     if points.ndim != 2 or points.shape[1] != 3:
         raise StrandFileError(f"points must be (N, 3), got {points.shape}")
-    return Strands(points, offsets, radius)
+    return Strands(points, offsets, radius, confidence)
 
 
 def read_npz_poses(path: Path) -> list[Strands]:
     """Read the poses of an archive, one where its points are `(N, 3)`."""
-    points, offsets, radius = _members(path)
+    points, offsets, radius, confidence = _members(path)
     if points.ndim == 2:
         points = points[None]
     if points.ndim != 3 or points.shape[2] != 3 or not len(points):
         raise StrandFileError(f"points must be (N, 3) or (T, N, 3), got {points.shape}")
-    return [Strands(pose, offsets, radius) for pose in points]
+    return [Strands(pose, offsets, radius, confidence) for pose in points]
 
 
-def _members(path: Path) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | float]:
+def _members(
+    path: Path,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | float, NDArray[Any] | None]:
     try:
         with zipfile.ZipFile(path) as archive:
             points = _member(archive, "points", "f")
@@ -49,20 +52,29 @@ def _members(path: Path) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | flo
             radius: NDArray[Any] | float = 4e-5
             if "radius.npy" in archive.namelist():
                 radius = _member(archive, "radius", "f")
+            confidence = None
+            if "confidence.npy" in archive.namelist():
+                confidence = _member(archive, "confidence", "f")
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as e:
         raise StrandFileError(f"not a whole .npz archive ({e})") from e
     except RuntimeError as e:  # encrypted, or packed in a way that is not known
         raise StrandFileError(f"not a whole .npz archive ({e})") from e
     if isinstance(radius, np.ndarray) and radius.ndim == 0:
         radius = float(radius)
-    return points, offsets, radius
+    return points, offsets, radius, confidence
 
 
 def write_npz(path: Path, strands: Strands) -> None:
-    """Write `points`, `offsets` and `radius`, uncompressed."""
-    radius = np.asarray(strands.radius, np.float32)
+    """Write `points`, `offsets`, `radius` and, where it is known, `confidence`, uncompressed."""
+    arrays = {
+        "points": strands.points,
+        "offsets": strands.offsets,
+        "radius": np.asarray(strands.radius, np.float32),
+    }
+    if strands.confidence is not None:
+        arrays["confidence"] = strands.confidence
     with writing(path) as temporary:
-        np.savez(temporary, points=strands.points, offsets=strands.offsets, radius=radius)
+        np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def _member(archive: zipfile.ZipFile, name: str, kinds: str) -> NDArray[Any]:

@@ -1,8 +1,9 @@
 """USD `BasisCurves` through `usd-core`.
 
-Linear curves are written: `curveVertexCounts`, `points`, `widths` (twice the radius), z up, one
-unit a metre. Every linear `BasisCurves` of a stage is read, but for those whose purpose is "guide",
-in the world's frame, turned to z up and scaled to metres by what the stage says of itself. Cubic
+Linear curves are written: `curveVertexCounts`, `points`, `widths` (twice the radius) and, where it
+is known, the primvar `confidence` of every point, z up, one unit a metre. Every linear
+`BasisCurves` of a stage is read, but for those whose purpose is "guide", in the world's frame,
+turned to z up and scaled to metres by what the stage says of itself; `confidence` is not. Cubic
 curves are refused: taking their control points for points on the hair would be wrong by up to a
 control segment.
 """
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.files.durable import writing
@@ -109,6 +110,12 @@ def define_curves(stage: Any, where: str, strands: Strands) -> Any:
     curves.CreateWidthsAttr(Vt.FloatArray.FromNumpy(width))
     vary = isinstance(strands.radius, np.ndarray)
     curves.SetWidthsInterpolation(UsdGeom.Tokens.vertex if vary else UsdGeom.Tokens.constant)
+    if strands.confidence is not None:
+        primvars = UsdGeom.PrimvarsAPI(curves)
+        confidence = primvars.CreatePrimvar(
+            "confidence", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex
+        )
+        confidence.Set(Vt.FloatArray.FromNumpy(strands.confidence))
     if len(strands):
         reach = width.max() / 2
         low, high = strands.points.min(axis=0) - reach, strands.points.max(axis=0) + reach

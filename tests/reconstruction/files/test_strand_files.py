@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from pxr import Usd, UsdGeom
 
 from reconstruction import StrandFileError, Strands, read_strands, write_strands
 from reconstruction.files.strands import READABLE, WRITABLE
@@ -59,6 +60,26 @@ def test_a_scalar_radius_stays_a_scalar(suffix: str, two: Strands, tmp_path: Pat
     radius = read_strands(tmp_path / f"hair{suffix}").radius
     assert isinstance(radius, float)
     assert radius == pytest.approx(2e-4, rel=1e-6)
+
+
+def test_confidence_goes_to_npz_and_usd(two: Strands, tmp_path: Path) -> None:
+    confidence = np.linspace(0, 1, len(two.points), dtype=np.float32)
+    strands = Strands(two.points, two.offsets, two.radius, confidence)
+    write_strands(tmp_path / "s.npz", strands)
+    np.testing.assert_array_equal(read_strands(tmp_path / "s.npz").confidence, confidence)
+    write_strands(tmp_path / "s.usdc", strands)
+    stage = Usd.Stage.Open(str(tmp_path / "s.usdc"))
+    primvar = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim()).GetPrimvar("confidence")
+    assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
+    np.testing.assert_array_equal(primvar.Get(), confidence)
+
+
+def test_a_confidence_that_is_none_is_an_error(two: Strands, tmp_path: Path) -> None:
+    for bad in (np.zeros(3, np.float32), np.full(len(two.points), np.nan, np.float32)):
+        arrays = {"points": two.points, "offsets": two.offsets, "confidence": bad}
+        np.savez(tmp_path / "bad.npz", allow_pickle=False, **arrays)
+        with pytest.raises(StrandFileError, match=r"bad\.npz: confidence"):
+            read_strands(tmp_path / "bad.npz")
 
 
 @pytest.mark.parametrize("suffix", BOTH_WAYS)

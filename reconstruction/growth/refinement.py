@@ -1,0 +1,274 @@
+"""All strands together after growth: those that explain nothing new go, the rest are refined.
+
+Growth traces strands one by one: many run into one ridge of the measured lines, and none knows of
+the others. Here strands are taken by what they add to what the others explain, and those that stay
+are moved onto the measured lines by Gauss-Newton, each line drawing only the strand nearest to it.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.spatial import cKDTree
+
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+from reconstruction.geometry.strands import Strands, unit_or_zero
+from reconstruction.reconstruct_options import RefineOptions
+from reconstruction.tangents.estimate import Measured
+from reconstruction.tangents.line_evidence import half_sphere
+
+REACH = 4e-3  # metres from a point up to which measured lines say anything of it
+NEAR, ALIKE_DEG = 1e-3, 10.0  # deviations at which a line says exp(-1/2) of what it says at best
+GUESS = 0.05  # what a millimetre that nothing was measured at counts; the best measured one 1
+CELL, HEADINGS = 1e-3, 24  # metres and directions: what lies in one cell explains the same
+
+POINT_DEVIATION = 0.5e-3  # metres of a measured line across itself
+ANGLE_DEVIATION = np.radians(15.0)  # of a measured line of confidence 1
+BEND_DEVIATION = 0.1  # per point: how the turn from one point to the next may change
+GUESS_DEVIATION = 3e-3  # metres that a point moves where nothing holds it
+COMPATIBLE = np.cos(np.radians(35.0))
+
+_NEIGHBOURS = 6
+_SAMPLE = 1e-3  # metres between the points at which strands are compared
+_LARGEST_STEP = 2e-3  # metres a step, so that no strand jumps beyond what it was matched with
+
+
+class Lines:
+    """Measured lines, looked up by place and direction."""
+
+    def __init__(self, lines: Measured) -> None:
+        self.lines = lines
+        self._tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
+
+    def near(self, points: AnyFloats) -> tuple[Array, Ints, Bools]:
+        """Distances, numbers and whether there is one, each `(N, K)`, of lines within `REACH`."""
+        k = np.arange(1, min(_NEIGHBOURS, len(self.lines.points)) + 1)
+        distance, index = self._tree.query(points, k=k, distance_upper_bound=REACH, workers=-1)
+        found = np.isfinite(distance)
+        return np.where(found, distance, 0.0), np.where(found, index, 0), found
+
+    def support(self, points: AnyFloats, tangents: AnyFloats) -> Array:
+        """How well a measured line agrees with each point `(N, 3)` and its tangent `(N, 3)`.
+
+        `(N,)` in [0, 1]: the confidence of the line that agrees best, less the further away it is
+        and runs; 0 where no line is within `REACH`, where all is guessed.
+        """
+        distance, index, found = self.near(points)
+        cosine = np.abs(np.einsum("nki,ni->nk", self.lines.directions[index], tangents))
+        turn = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
+        alike = np.exp(-0.5 * (distance / NEAR) ** 2 - 0.5 * (turn / ALIKE_DEG) ** 2)
+        return np.asarray(np.where(found, self.lines.confidence[index] * alike, 0.0).max(axis=1))
+
+
+def refine(
+    strands: Strands, measured: Measured, options: RefineOptions
+) -> tuple[Strands, dict[str, Any]]:
+    """Drop the strands that explain nothing new and move the others onto the measured lines.
+
+    Also returns JSON-ready figures on what became of them. At least one line must be measured.
+    """
+    lines = Lines(measured)
+    kept = worthwhile(strands, lines, options.worth)
+    out = strands.subset(kept)
+    before = residuals(out, lines)
+    start = out.points.astype(float)
+    for _ in range(options.steps):
+        out = gauss_newton_step(out, lines)
+    moved = np.linalg.norm(out.points - start, axis=1)
+    figures = {
+        "removed": int((~kept).sum()),
+        "strands": len(out),
+        "metres_before": float(strands.lengths().sum()),
+        "metres": float(out.lengths().sum()),
+        "moved_mm": {f"p{q}": float(1e3 * np.percentile(moved, q)) for q in (50, 90, 99)},
+        "residuals_before": before,
+        "residuals": residuals(out, lines),
+    }
+    return out, figures
+
+
+def supported(strands: Strands, measured: Measured) -> Floats:
+    """Each point's `Strands.confidence (N,)`: `Lines.support`, 0 without any line."""
+    if not len(measured.points):
+        return np.zeros(len(strands.points), np.float32)
+    support = Lines(measured).support(strands.points, strands.tangents())
+    return support.clip(0, 1).astype(np.float32)
+
+
+def worthwhile(strands: Strands, lines: Lines, worth: float) -> Bools:
+    """Which strands `(S,)` add at least `worth` a millimetre to what the others explain.
+
+    Cells of a millimetre and some 15 degrees are worth the support of the best strand in them,
+    `GUESS` at least. The strand that adds most a millimetre is taken first, then what the others
+    add is looked at again (lazily: it only falls).
+    """
+    dense = strands.resampled(_SAMPLE)
+    tangents = dense.tangents()
+    value = GUESS + lines.support(dense.points, tangents)
+    cells = _cells(dense.points, tangents)
+    best = np.zeros(int(cells.max(initial=-1)) + 1)
+    ends = dense.offsets
+    own = [_mean_by(cells[a:b], value[a:b]) for a, b in pairwise(ends)]
+    count = np.diff(ends)
+
+    def gain(i: int) -> float:
+        cell, there = own[i]
+        return float(np.maximum(there - best[cell], 0).sum()) / float(count[i])
+
+    heap = [(-gain(i), i) for i in range(len(own))]
+    heapq.heapify(heap)
+    kept = np.zeros(len(own), bool)
+    while heap:
+        _, i = heapq.heappop(heap)
+        now = gain(i)
+        if now < worth:
+            continue
+        if heap and now < -heap[0][0]:
+            heapq.heappush(heap, (-now, i))
+            continue
+        kept[i] = True
+        cell, there = own[i]
+        best[cell] = np.maximum(best[cell], there)
+    return kept
+
+
+def _cells(points: AnyFloats, tangents: AnyFloats) -> Ints:
+    """Numbers `(N,)`, from 0 on, of the cells of place and direction that points lie in."""
+    heading = np.abs(tangents @ half_sphere(HEADINGS).T.astype(np.float32)).argmax(axis=1)
+    place = np.floor(points / CELL).astype(np.int64)
+    place -= place.min(axis=0, initial=0)
+    size = place.max(axis=0, initial=0) + 1
+    flat = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * HEADINGS + heading
+    return np.unique(flat, return_inverse=True)[1].ravel().astype(np.int64)
+
+
+def _mean_by(cells: Ints, value: Array) -> tuple[Ints, Array]:
+    """The different ones of `cells (N,)` and the mean of `value (N,)` in each."""
+    cell, member, count = np.unique(cells, return_inverse=True, return_counts=True)
+    return cell, np.bincount(member.ravel(), value, len(cell)) / count
+
+
+def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
+    """How far measured lines are from the strands: medians across (mm) and of the angle (degrees).
+
+    Of the lines that a strand passes within `REACH`; `explained` is their share of all.
+    """
+    tree = cKDTree(strands.points, balanced_tree=False, compact_nodes=False)
+    distance, index = tree.query(lines.lines.points, distance_upper_bound=REACH, workers=-1)
+    found = np.isfinite(distance)
+    if not found.any():
+        return {"explained": 0.0}
+    tangents = strands.tangents()[index[found]]
+    off = strands.points[index[found]] - lines.lines.points[found]
+    across = off - np.einsum("ni,ni->n", off, tangents)[:, None] * tangents
+    cosine = np.abs(np.einsum("ni,ni->n", tangents, lines.lines.directions[found]))
+    return {
+        "explained": float(found.mean()),
+        "across_mm": float(1e3 * np.median(np.linalg.norm(across, axis=1))),
+        "angle_deg": float(np.degrees(np.median(np.arccos(np.minimum(cosine, 1.0))))),
+    }
+
+
+def gauss_newton_step(strands: Strands, lines: Lines) -> Strands:
+    """All points moved at once: onto the lines, along their directions, bending little, roots kept.
+
+    Residuals are linear in the points `x (N, 3)` once lines have their points, so a step is one
+    banded solve. Each line holds the strand point that is nearest to it (across the line alone);
+    each segment turns to the mean of the lines around it; the displacement bends little from point
+    to point, and is held to 0 where nothing was measured.
+    """
+    x = strands.points.astype(float)
+    tangents = strands.tangents().astype(float)
+    n = len(x)
+    last = np.zeros(n, bool)
+    last[strands.offsets[1:] - 1] = True
+    root = strands.offsets[:-1]
+    diagonal = np.zeros((3, n, 3, 3))  # blocks between a point and itself, the next, the one after
+    right = np.zeros((n, 3))
+    eye = np.eye(3)
+    diagonal[0] += eye / GUESS_DEVIATION**2
+    diagonal[0][root] += eye / 1e-12
+    _hold_to_lines(x, tangents, lines, diagonal[0], right)
+    _turn_to_lines(x, tangents, lines, ~last, diagonal, right)
+    _bend_little(x, last, diagonal)
+    return replace(strands, points=(x + _limited(_solve(diagonal, right))).astype(np.float32))
+
+
+def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: Array) -> None:
+    """Each line against its nearest point that runs as it does, across the line."""
+    p, d, c = lines.lines.points, lines.lines.directions, lines.lines.confidence
+    tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
+    distance, index = tree.query(p, k=np.arange(1, 9), distance_upper_bound=REACH, workers=-1)
+    found = np.isfinite(distance)
+    index = np.where(found, index, 0)
+    alike = found & (np.abs(np.einsum("nki,ni->nk", tangents[index], d)) >= COMPATIBLE)
+    which = np.flatnonzero(alike.any(axis=1))
+    i = index[which, alike[which].argmax(axis=1)]
+    across = np.eye(3) - d[which, :, None] * d[which, None, :]
+    offset = np.einsum("nij,nj->ni", across, p[which] - x[i])
+    # Geman-McClure: a line that is millimetres off is another strand's
+    far = (offset**2).sum(axis=1) / (3 * POINT_DEVIATION) ** 2
+    weight = c[which] / POINT_DEVIATION**2 / (1 + far) ** 2
+    np.add.at(own, i, weight[:, None, None] * across)
+    np.add.at(right, i, weight[:, None] * offset)
+
+
+def _turn_to_lines(
+    x: Array, tangents: Array, lines: Lines, starts: Bools, diagonal: Array, right: Array
+) -> None:
+    """Each segment against the mean direction of the lines around it that run as it does."""
+    i = np.flatnonzero(starts)
+    step = x[i + 1] - x[i]
+    length = np.linalg.norm(step, axis=1)
+    along = unit_or_zero(step)
+    distance, index, found = lines.near(0.5 * (x[i] + x[i + 1]))
+    d = lines.lines.directions[index]
+    cosine = np.einsum("nki,ni->nk", d, along)
+    near = np.exp(-0.5 * (distance / NEAR) ** 2) * lines.lines.confidence[index] ** 2
+    weight = np.where(found & (np.abs(cosine) >= COMPATIBLE), near, 0.0)
+    mean = unit_or_zero(np.einsum("nk,nki->ni", weight * np.sign(cosine), d))
+    total = weight.sum(axis=1) / np.maximum(length * ANGLE_DEVIATION, 1e-9) ** 2
+    wanted = total[:, None] * (length[:, None] * mean - step)
+    block = total[:, None, None] * np.eye(3)
+    diagonal[0][i] += block
+    diagonal[0][i + 1] += block
+    diagonal[1][i] -= block
+    right[i] -= wanted
+    right[i + 1] += wanted
+
+
+def _bend_little(x: Array, last: Bools, diagonal: Array) -> None:
+    """Second differences of the displacement: `u[i] - 2 u[i+1] + u[i+2]` within one strand."""
+    i = np.flatnonzero(~last[:-2] & ~last[1:-1])
+    length = np.linalg.norm(x[i + 2] - x[i], axis=1) / 2
+    weight = (1 / np.maximum(length * BEND_DEVIATION, 1e-9) ** 2)[:, None, None] * np.eye(3)
+    for k, own in enumerate((1, 4, 1)):
+        diagonal[0][i + k] += own * weight
+    diagonal[1][i] -= 2 * weight
+    diagonal[1][i + 1] -= 2 * weight
+    diagonal[2][i] += weight
+
+
+def _solve(diagonal: Array, right: Array) -> Array:
+    """Displacements `(N, 3)` of the block-pentadiagonal system, symmetric positive definite."""
+    n = len(right)
+    banded = np.zeros((9, 3 * n))
+    for block in range(3):
+        for a in range(3):
+            for b in range(3):
+                below = 3 * block + b - a
+                if below < 0:
+                    continue  # of the diagonal block only the lower half is needed
+                banded[below, a::3][: n - block] = diagonal[block, : n - block, b, a]
+    return np.asarray(solveh_banded(banded, right.ravel(), lower=True)).reshape(n, 3)
+
+
+def _limited(step: Array) -> Array:
+    """No point moves further than `_LARGEST_STEP`."""
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return step * np.minimum(1.0, _LARGEST_STEP / np.maximum(length, 1e-12))

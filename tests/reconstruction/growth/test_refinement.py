@@ -1,0 +1,130 @@
+"""Strands refined together, against lines that were measured on waves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from reconstruction.geometry.strands import Strands
+from reconstruction.growth.refinement import _solve, refine, supported
+from reconstruction.reconstruct_options import RefineOptions
+from reconstruction.tangents.estimate import Measured
+
+LENGTH, WAVE = 60e-3, 40e-3
+
+
+def wave(s: np.ndarray, aside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit tangents at `s (N,)` metres along z of waves that are moved by `aside`."""
+    k = 2 * np.pi / WAVE
+    p = np.stack([3e-3 * np.sin(k * s), np.zeros_like(s), s], axis=1) + aside
+    d = np.stack([3e-3 * k * np.cos(k * s), np.zeros_like(s), np.ones_like(s)], axis=1)
+    return p, d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+ASIDE = np.array([[x, y, 0.0] for x in (0, 4e-3, 8e-3) for y in (0, 4e-3)])
+"""Six strands, 4 mm apart."""
+
+
+def lines(noise: float, angle_deg: float, below: float = 0.0) -> Measured:
+    """Lines measured on all six from `below` metres on, with errors across and of angle."""
+    rng = np.random.default_rng(2)
+    s = rng.uniform(below, LENGTH, 600)
+    p, d = wave(s, ASIDE[rng.integers(0, len(ASIDE), len(s))])
+    p += noise * rng.normal(size=p.shape)
+    d += np.radians(angle_deg) * rng.normal(size=d.shape)
+    d *= rng.choice([-1, 1], (len(d), 1)) / np.linalg.norm(d, axis=1, keepdims=True)
+    return Measured(p, d, rng.uniform(0.5, 1.0, len(p)))
+
+
+def strands(copies: int, off: float) -> Strands:
+    """Each of the six `copies` times, shifted and bent by about `off` metres but at its root."""
+    rng = np.random.default_rng(3)
+    s = np.arange(0, LENGTH, 2e-3)
+    rise = (1 - np.exp(-s / 10e-3))[:, None]
+    out = []
+    for aside in np.repeat(ASIDE, copies, axis=0):
+        bend = rng.normal(size=3) + np.sin(s / 4e-3 + rng.uniform(0, 6))[:, None] * rng.normal(
+            size=3
+        )
+        out.append(wave(s, aside)[0] + off * rise * bend * [1, 1, 0])
+    return Strands.from_list(out)
+
+
+def errors(made: Strands) -> tuple[float, float]:
+    """Median distance (metres) to the true waves and angle (degrees) to them."""
+    s = np.arange(0, LENGTH, 1e-4)
+    p, d = (np.concatenate(part) for part in zip(*[wave(s, a) for a in ASIDE], strict=True))
+    distance, i = cKDTree(p).query(made.points)
+    cosine = np.abs((d[i] * made.tangents()).sum(axis=1)).clip(0, 1)
+    return float(np.median(distance)), float(np.degrees(np.median(np.arccos(cosine))))
+
+
+@pytest.mark.parametrize(("noise", "angle_deg"), [(0.0, 0.0), (3e-4, 10.0)])
+def test_strands_come_nearer_to_the_waves_that_lines_were_measured_on(
+    noise: float, angle_deg: float
+) -> None:
+    start = strands(1, 5e-4)
+    made, figures = refine(start, lines(noise, angle_deg), RefineOptions(steps=4, worth=0))
+    before, after = errors(start), errors(made)
+    assert after[0] < 0.6 * before[0]
+    assert after[1] < 0.8 * before[1]
+    assert figures["removed"] == 0
+    np.testing.assert_allclose(made.roots, start.roots, atol=1e-7)
+
+
+def test_better_lines_give_better_strands() -> None:
+    start, asked = strands(1, 5e-4), RefineOptions(steps=4, worth=0)
+    exact, fair, bad = (
+        errors(refine(start, lines(noise, angle), asked)[0])
+        for noise, angle in ((0.0, 0.0), (3e-4, 8.0), (8e-4, 20.0))
+    )
+    assert exact[0] < fair[0] < bad[0]
+    assert exact[1] < fair[1] < bad[1]
+
+
+def test_copies_and_strands_across_the_measured_ones_go() -> None:
+    many = strands(6, 1e-4)
+    across = [np.linspace([-5e-3, 2e-3, z], [13e-3, 2e-3, z], 10) for z in (0.01, 0.03)]
+    given = Strands.from_list([many[i] for i in range(len(many))] + across)
+    made, figures = refine(given, lines(2e-4, 5.0), RefineOptions(steps=0, worth=0.2))
+    assert len(ASIDE) <= len(made) <= 3 * len(ASIDE)  # of six copies each
+    truth = np.concatenate([wave(np.arange(0, LENGTH, 1e-3), a)[0] for a in ASIDE])
+    assert cKDTree(made.points).query(truth)[0].max() < 2e-3  # none of the six is lost
+    assert np.abs(made.tangents()[:, 0]).max() < 0.8  # none that runs across is left
+    assert figures["removed"] == len(given) - len(made)
+
+
+def test_what_lies_far_from_every_line_hardly_moves() -> None:
+    start = strands(1, 5e-4)
+    made, _ = refine(start, lines(0.0, 0.0, below=40e-3), RefineOptions(steps=3, worth=0))
+    low = start.points[:, 2] < 15e-3
+    moved = np.linalg.norm(made.points - start.points, axis=1)
+    assert moved[low].max() < 0.2 * np.median(moved[start.points[:, 2] > 45e-3])
+
+
+def test_the_banded_solution_is_the_dense_one() -> None:
+    rng, n = np.random.default_rng(4), 7
+    blocks = rng.normal(size=(3, n, 3, 3))
+    blocks[0] = blocks[0] @ blocks[0].transpose(0, 2, 1) + 30 * np.eye(3)
+    dense = np.zeros((3 * n, 3 * n))
+    for block in range(3):
+        for i in range(n - block):
+            part = np.s_[3 * i : 3 * i + 3], np.s_[3 * (i + block) : 3 * (i + block) + 3]
+            dense[part] = blocks[block, i].T
+            dense[part[::-1]] = blocks[block, i]
+    right = rng.normal(size=(n, 3))
+    wanted = np.linalg.solve(dense, right.ravel()).reshape(n, 3)
+    np.testing.assert_allclose(_solve(blocks, right), wanted, rtol=1e-9)
+
+
+def test_confidence_is_that_of_the_line_that_agrees_best_and_0_far_from_all() -> None:
+    along = np.array([0.0, 0, 1])
+    straight = Strands.from_list([np.linspace([0, 0, 0], [0, 0, 50e-3], 51)])
+    at = np.array([[0, 0, 10e-3], [1e-3, 0, 20e-3], [0, 0, 30e-3]])
+    leant = np.array([0, np.sin(np.radians(10)), np.cos(np.radians(10))])
+    measured = Measured(at, np.stack([along, along, leant]), np.array([0.8, 0.8, 0.8]))
+    confidence = supported(straight, measured)
+    np.testing.assert_allclose(confidence[[10, 20, 30]], 0.8 * np.exp([0, -0.5, -0.5]), rtol=1e-4)
+    assert not confidence[35:].any()
+    assert not supported(straight, Measured.none()).any()
