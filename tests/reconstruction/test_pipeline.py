@@ -158,6 +158,8 @@ def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
         "surface",
         "field",
         "strands",
+        "refinement",
+        "roots",
     ]
     assert [x.why for x in report["triangulation"].left_out] == ["the rig has no projector"]
     assert any("12 lights" in x.why for x in report["orientation"].left_out)

@@ -66,7 +66,7 @@ def _members(
 
 def write_npz(path: Path, strands: Strands) -> None:
     """Write `points`, `offsets`, `radius` and, where it is known, `confidence`, uncompressed."""
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "points": strands.points,
         "offsets": strands.offsets,
         "radius": np.asarray(strands.radius, np.float32),
