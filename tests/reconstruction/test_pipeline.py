@@ -29,7 +29,7 @@ from reconstruction import (
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_planes import PointCloud
 from reconstruction.reconstruct_options import MeasureOptions
-from reconstruction.tangents.estimate import light_groups, thinned
+from reconstruction.tangents.estimate import Measured, light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(12, 1.2, 0.0))]
@@ -287,7 +287,8 @@ def test_what_cannot_be_done_without_is_named(
 def test_no_strand_is_an_error_that_says_what_to_do(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reconstruction.pipeline.line_strands", lambda *_, **__: ([], None))
+    nothing = Measured(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    monkeypatch.setattr("reconstruction.pipeline.line_strands", lambda *_, **__: ([], nothing))
     with pytest.raises(CaptureError, match="no strand was found: the method 'hull'"):
         reconstruct(unswept, Model(tmp_path), method="photometric")
     assert not (tmp_path / "strands.npz").exists()

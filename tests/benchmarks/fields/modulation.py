@@ -268,6 +268,8 @@ def in_brightest(frames: Frames, field: Field, k: int, weights: Array) -> Pair:
     if not at.additive:
         return one * np.maximum(1 + answer, 0), other * np.maximum(1 + answer, 0)
     given = sum(w * at.irradiance(x) for w, x in zip(weights, view.lights, strict=True))
+    if at.alone:
+        return np.maximum(answer * given, 0), np.maximum(answer * given, 0)
     return np.maximum(one + answer * given, 0), np.maximum(other + answer * given, 0)
 
 
