@@ -139,6 +139,23 @@ def test_held_out_cameras_are_judged_under_the_lights_as_found(made, tufted, tmp
     assert judged["start"]["relative_error"] < 0.8
 
 
+def test_a_roughness_beyond_what_is_found_again_is_warned_of(made, tufted, tmp_path, monkeypatch):
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    far = replace(HairMaps.of(tufted.truth), beta_m=0.93)
+
+    def found(problem, *args, **more):
+        return Outcome(
+            far, LightDeviations.calibrated(len(problem.lights)), "converged", 0.0, 0.0, 1, []
+        )
+
+    monkeypatch.setattr(pipeline, "run", found)
+    fit_maps(capture, other, request=REQUEST)
+    (warning,) = other.report()["inverse_rendering"].warnings
+    assert warning.startswith("beta_m 0.93 is beyond 0.05 to 0.8")
+
+
 def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
     capture, model = made
     other = Model(tmp_path / "model")
