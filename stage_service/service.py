@@ -215,9 +215,11 @@ class Service:
                     f"pipeline: {request.pipeline.name!r} works on strands that are there already; "
                     "a new capture has none"
                 )
-            if given is None:
+            method = request.pipeline.options.method
+            if given is None and method in ("light_planes", "fused"):
                 raise BadInput(
-                    f"pipeline: {request.pipeline.name!r} roots strands on a scalp: give the head"
+                    f"pipeline: {method!r} roots strands on a scalp: give the head, or the method "
+                    "'auto', which takes what there is"
                 )
         head = None
         if given is not None:

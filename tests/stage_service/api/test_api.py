@@ -363,6 +363,8 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
     ):
         refused = http.post("/captures", json={"pipeline": {"name": pipeline}, **given})
         assert why in problem(refused, "bad-input")["detail"]
+    headless = {"name": "reconstruct", "options": {"method": "auto"}}
+    assert capture_done(http, {"plan": SHORT, "pipeline": headless})["job"]
     done = capture_done(http, {"plan": SHORT})
     for options, why in (
         ({"truth": "/nowhere/truth.npz"}, "options.truth: [Errno 2]"),
