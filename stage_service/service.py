@@ -6,17 +6,13 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
-
-from appearance.model.relight import PROCEDURAL
-from reconstruction import Capture, CaptureError, Model, Rig, read_obj
+from reconstruction import Capture, CaptureError
 from reconstruction.calibration.boards import CalibrationError
-from reconstruction.containment import inside, is_file_name, plain_file
+from reconstruction.containment import inside, is_file_name
 from reconstruction.geometry.rig import RigError
 from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.catalogue import UnknownCapture
@@ -25,38 +21,33 @@ from stage_service.acquisition.snapshots import SNAPSHOT, one_step
 from stage_service.acquisition.states import CaptureStatus, Outcome
 from stage_service.calibrating import BoardView, Calibrating, CalibrationView
 from stage_service.config import RigFile
+from stage_service.frames import UnknownFrame, read_frame, steps_of
+from stage_service.inputs import BadInput, check_new, read_head, read_masks
 from stage_service.jobs.follower import JobFollower
-from stage_service.jobs.pipelines import PIPELINES
-from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
-from stage_service.jobs.records import Job, PipelineRequest
+from stage_service.jobs.queue import JobQueue, NoSuchJob
 from stage_service.jobs.slots import worker_is_alive
+from stage_service.leasing import Leasing
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
 from stage_service.plan.resolved import resolve
 from stage_service.queueing import Queueing, then
 from stage_service.records.audit import Action
 from stage_service.records.events import EventLog
-from stage_service.records.lease import Lease
 from stage_service.service_models import (
     AcknowledgeRequest,
-    Artifact,
     BoardQuery,
     CalibrationRequest,
     CaptureRequest,
     CaptureView,
     Health,
-    JobRequest,
     LatchView,
-    LeaseGrant,
-    LeaseRequest,
-    LeaseView,
     QueueRequest,
-    RenewRequest,
     RigView,
     SnapshotRequest,
     StepView,
 )
 from stage_service.storage import NotThere, Removed, Storage
+from stage_service.submitting import NotFinished, Submitting
 from stage_service.verification import Verification, Verifier
 from stage_service.viewer import Viewed, Viewing
 from stage_service.watching import NotReady, Watching
@@ -64,26 +55,6 @@ from stage_service.watching import NotReady, Watching
 T = TypeVar("T")
 READ_S = 1.0
 """A start waits for so long for the captures on the disk; the others are read beside it."""
-
-
-class BadInput(ValueError):
-    """A file that a request names cannot be used; the message names it and says why."""
-
-
-class UnknownArtifact(LookupError):
-    """The model folder has no such file."""
-
-
-class UnknownFrame(LookupError):
-    """The capture's plan has no such step or its rig no such camera."""
-
-
-class NotFinished(RuntimeError):
-    """What was asked for needs a capture that completed."""
-
-
-class ModelInUse(RuntimeError):
-    """Another job, queued or running, makes the same model."""
 
 
 class Service:
@@ -113,6 +84,10 @@ class Service:
         self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
         self._queue = JobQueue(root, gpu_workers=gpu_workers)
         self._follower = JobFollower(root, self._queue, self._captures.events, self._captures.audit)
+        self.jobs = Submitting(
+            root / "models", self._control, self._queue, self._follower, self.capture_path
+        )
+        self.leasing = Leasing(self._control, self.events)
         self.watching = Watching(root, self._captures, self._queue, self._follower)
         self.storage = Storage(root, self._captures, self._control, self._queue)
         self.viewing = Viewing(lambda: [m.name for m in self.storage.models()], self._viewed)
@@ -124,7 +99,6 @@ class Service:
             verify_days,
         )
         self.calibrating = Calibrating(root / "calibration", rig_file, self.events)
-        self._submitting = threading.Lock()
         self._closing = threading.Lock()
         self._closed = threading.Event()
 
@@ -209,25 +183,11 @@ class Service:
                 raise BadInput("upload: give this, or head and masks; not both")
             given, folder = self.storage.uploaded(request.upload)
         if request.pipeline is not None:
-            _check_named(request.pipeline, self.rig_file.rig)
-            if "reconstruct" not in PIPELINES[request.pipeline.name]:
-                raise BadInput(
-                    f"pipeline: {request.pipeline.name!r} works on strands that are there already; "
-                    "a new capture has none"
-                )
-            method = request.pipeline.options.method
-            if given is None and method in ("light_planes", "fused"):
-                raise BadInput(
-                    f"pipeline: {method!r} roots strands on a scalp: give the head, or the method "
-                    "'auto', which takes what there is"
-                )
+            check_new(request.pipeline, self.rig_file.rig, given is not None)
         head = None
         if given is not None:
-            try:
-                head = read_obj(given)
-            except (OSError, ValueError) as error:
-                raise BadInput(f"head: {error}") from error
-        masks = self._masks(folder) if folder is not None else None
+            head = read_head(given)
+        masks = read_masks(folder, self.rig_file.rig) if folder is not None else None
         asked = {"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {}
 
         def start(unless_dark_since: int | None = None, **more: str) -> str:
@@ -298,32 +258,12 @@ class Service:
         Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`; `CaptureError` where the file is
         gone or cannot be read.
         """
-        capture = Capture(self.capture_path(capture_id))
-        by_index = {s.index: s for s in capture.steps}
-        cameras = [c.name for c in capture.rig.cameras]
-        if step not in by_index or camera not in cameras:
-            raise UnknownFrame(
-                f"{capture_id} has the steps {min(by_index, default=None)} to "
-                f"{max(by_index, default=None)} and the cameras "
-                f"{cameras}; got step {step}, camera {camera!r}"
-            )
-        try:
-            return capture.read_file(by_index[step], camera, read)
-        except CaptureError:
-            raise
-        except (OSError, ValueError) as error:
-            raise CaptureError(str(error)) from error
+        return read_frame(Capture(self.capture_path(capture_id)), step, camera, read)
 
     def steps(self, capture_id: str) -> list[StepView]:
         """What a capture shoots, in order, and which frames it has. Raises `UnknownCapture`,
         `CaptureError`."""
-        capture = Capture(self.capture_path(capture_id))
-        names = [camera.name for camera in capture.rig.cameras]
-        there = {key for key, r in capture.records.items() if r.file is not None}
-        return [
-            StepView(**step.to_dict(), lacks=[n for n in names if (step.index, n) not in there])
-            for step in capture.steps
-        ]
+        return steps_of(Capture(self.capture_path(capture_id)))
 
     def board(self, capture_id: str, camera: str, board: BoardQuery) -> BoardView:
         """What a camera saw of a calibration's board. Raises as `frame`, and `BadInput`."""
@@ -359,7 +299,7 @@ class Service:
 
     def remove_capture(self, capture_id: str, by: Caller, *, dry_run: bool) -> Removed:
         """Put a capture into the trash. Raises as `Storage.remove_capture`."""
-        with self._submitting:
+        with self.jobs.lock:
             return self.storage.remove_capture(capture_id, self._follower.owes, by, dry_run=dry_run)
 
     def verify(self, capture_id: str, by: Caller) -> Verification:
@@ -393,74 +333,6 @@ class Service:
             return Viewed(model, Capture(self._queue.get(name).capture))
         return Viewed(model)
 
-    def submit(self, request: JobRequest, by: Caller, key: str | None = None) -> Job:
-        """Enqueue a pipeline on a capture; where that was done under this `key`, it is that job.
-        Raises `UnknownCapture`, `NotFinished`, `BadInput`, `ModelInUse`, `JobsUnavailable`."""
-        job = new_job_id()
-        if key is not None:
-            job = f"job-{sha256(key.encode()).hexdigest()[:16]}"
-            with suppress(NoSuchJob):
-                return self._queue.get(job)
-        work = partial(self._submit, job, request)
-        what = f"{request.pipeline.name} on {request.capture}"
-        return self._control.do(by, "job.submit", work, job, detail=what, steers=False)
-
-    def _submit(self, job: str, request: JobRequest) -> Job:
-        if request.capture == SNAPSHOT:
-            raise BadInput("capture: a snapshot is kept until the next one only: shoot a capture")
-        path = self.capture_path(request.capture)
-        capture = Capture(path)
-        if capture.manifest is None:
-            raise NotFinished(f"capture {request.capture} has no manifest yet: it is not finished")
-        if (outcome := capture.manifest.get("outcome")) != "completed":
-            raise NotFinished(
-                f"capture {request.capture} is {outcome}, not completed: resume it, or shoot anew"
-            )
-        _check_named(request.pipeline, capture.rig)
-        model = Model(self.root / "models" / (request.model or job))
-        rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
-        if not rebuilds and not model.has("strands.npz"):
-            raise BadInput(
-                f"model: {request.pipeline.name!r} needs a model with strands: name one that "
-                "'reconstruct' made"
-            )
-        with self._submitting:
-            other = self._queue.at_work_on(model)
-            if other is not None:
-                raise ModelInUse(
-                    f"model {model.path.name}: job {other} makes it; wait, or cancel it"
-                )
-            return self._queue.submit(request.pipeline, path, model, job=job)
-
-    def jobs(self, limit: int, offset: int = 0) -> list[Job]:
-        """The latest `limit` jobs after the `offset` newest, newest first."""
-        return self._queue.all(limit=limit, offset=offset)
-
-    def job(self, job_id: str) -> Job:
-        """A job's present state. Raises `NoSuchJob`, as all about jobs `JobsUnavailable`."""
-        try:
-            return self._queue.get(job_id)
-        except NoSuchJob:  # that of a capture which has just completed may not be there yet
-            # Not owed (any more): it was enqueued meanwhile, or there is none.
-            return self._follower.enqueue_now(job_id) or self._queue.get(job_id)
-
-    def cancel_job(self, job_id: str, by: Caller) -> Job:
-        """Cancel a job: a queued one at once, a running one at its next progress call."""
-        work = partial(self._queue.cancel, job_id)
-        return self._control.do(by, "job.cancel", work, job_id, steers=False)
-
-    def artifacts(self, job_id: str) -> list[Artifact]:
-        """The files in the job's model folder. Raises `NoSuchJob`."""
-        files = Model(self.job(job_id).model).artifacts()
-        return [Artifact(path=name, bytes=p.stat().st_size) for name, p in files.items()]
-
-    def artifact(self, job_id: str, path: str) -> Path:
-        """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
-        file = Model(self.job(job_id).model).artifacts().get(path)
-        if file is None:
-            raise UnknownArtifact(f"job {job_id} has no file {path!r}")
-        return file
-
     def devices(self) -> dict[str, Any]:
         """Each device and whether it answers; "safety": whether the lamps are known to be off."""
         return self._captures.devices()
@@ -475,50 +347,6 @@ class Service:
         work, detail = self._captures.latch.acknowledge, f"{request.name}: {request.note}"
         self._control.do(by, "acknowledge", work, detail=detail)
         return self._captures.darkness()
-
-    def lease(self) -> LeaseView:
-        """Who steers, if anybody in particular."""
-        held = self._control.leases.current
-        if held is None:
-            return LeaseView(holder=None, expires=None)
-        return LeaseView(holder=held.holder, expires=held.expires)
-
-    def take_lease(self, request: LeaseRequest, by: Caller) -> LeaseGrant:
-        """Steer alone for some time. Raises `Leased`."""
-        work = partial(self._control.leases.take, request.holder, request.seconds)
-        detail = f"{request.holder}, {request.seconds:g} s"
-        return self._granted(self._control.do(by, "lease.take", work, detail=detail, steers=False))
-
-    def renew_lease(self, request: RenewRequest, by: Caller) -> LeaseGrant:
-        """Let the caller's lease end so many seconds from now. Raises `NoLease`."""
-        work = partial(self._control.leases.renew, by.token or "", request.seconds)
-        detail = f"{request.seconds:g} s"
-        return self._granted(self._control.do(by, "lease.renew", work, detail=detail, steers=False))
-
-    def release_lease(self, by: Caller) -> LeaseView:
-        """End the caller's lease. Raises `Forbidden`, `NoLease`."""
-        by.require("steer")
-        work = partial(self._control.leases.release, by.token or "")
-        self._control.do(by, "lease.release", work, steers=False)
-        return self._tell_lease()
-
-    def end_lease(self, by: Caller) -> LeaseView:
-        """End the lease whoever holds it. Raises `Forbidden`, `NoLease`."""
-        by.require("admin")
-        held = self._control.leases.current
-        detail = "" if held is None else f"held by {held.holder}"
-        work = self._control.leases.end
-        self._control.do(by, "lease.end", work, detail=detail, steers=False)
-        return self._tell_lease()
-
-    def _granted(self, lease: Lease) -> LeaseGrant:
-        self._tell_lease()
-        return LeaseGrant(token=lease.token, holder=lease.holder, expires=lease.expires)
-
-    def _tell_lease(self) -> LeaseView:
-        view = self.lease()
-        self.events.publish("stage.lease", view.model_dump())
-        return view
 
     def record_login(self, name: str, address: tuple[str, int] | None) -> None:
         """Note in the audit log who logged in, and from where."""
@@ -563,48 +391,3 @@ class Service:
             problems.insert(0, "the service has not started")
         if problems:
             raise NotReady(problems)
-
-    def _masks(self, folder: Path) -> dict[str, Any]:
-        masks = {}
-        for camera in self.rig_file.rig.cameras:
-            path = folder / f"{camera.name}.png"
-            try:
-                image = cv2.imread(str(plain_file(path)), cv2.IMREAD_GRAYSCALE)
-            except FileNotFoundError:
-                continue
-            except (OSError, ValueError) as error:
-                raise BadInput(f"masks: {error}") from error
-            if image is None or image.shape != (camera.height, camera.width):
-                found = "not an image" if image is None else f"{image.shape[1]}x{image.shape[0]}"
-                raise BadInput(
-                    f"masks: {path}: expected {camera.width}x{camera.height}, got {found}"
-                )
-            masks[camera.name] = image >= 128
-        if not masks:
-            raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
-        return masks
-
-
-def _check_named(pipeline: PipelineRequest, rig: Rig) -> None:
-    """Raises `BadInput` where options name what the rig has not, or a file that is not there."""
-    options = pipeline.options
-    for kind, wanted, known in (
-        ("held_out_cameras", options.held_out_cameras, rig.cameras),
-        ("held_out_lights", options.held_out_lights, rig.lights),
-    ):
-        unknown = set(wanted) - {x.name for x in known}
-        if unknown:
-            raise BadInput(f"pipeline.options.{kind}: the rig has no {sorted(unknown)}")
-    asked = options.reconstruct
-    for field, file in (
-        ("truth", options.truth),
-        ("environment", None if options.environment in PROCEDURAL else options.environment),
-        ("reconstruct.head_mesh", asked.head_mesh),
-        ("reconstruct.scalp_points", asked.scalp_points),
-        ("reconstruct.network.file", asked.network.file if asked.network else None),
-    ):
-        try:
-            if file is not None and not (field == "truth" and Path(file).is_dir()):
-                plain_file(file)
-        except (OSError, ValueError) as error:
-            raise BadInput(f"pipeline.options.{field}: {error}") from error

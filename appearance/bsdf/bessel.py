@@ -37,8 +37,3 @@ def scaled_i0(x: Any) -> Any:
     for c in reversed(others):
         b1, b2 = 2 * t * b1 - b2 + c, b1
     return (t * b1 - b2 + first) * dr.rsqrt(1 + x)
-
-
-def i0(x: Any) -> Any:
-    """I0(x) for x >= 0, until exp(x) overflows."""
-    return dr.exp(x) * scaled_i0(x)

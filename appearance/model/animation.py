@@ -101,11 +101,6 @@ def turntable(
     return np.stack(out)
 
 
-def flicker(frames: Floats) -> float:
-    """The mean absolute difference of successive displayed frames `(T, H, W, 3)` in [0, 1]."""
-    return float(np.abs(np.diff(frames.astype(np.float64), axis=0)).mean())
-
-
 def write_animation(path: Path, frames: Floats, seconds: float = SECONDS) -> None:
     """Write radiance `(T, H, W, 3)` as an endless WebP of `seconds`, all frames exposed alike.
 

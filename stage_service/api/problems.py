@@ -30,13 +30,15 @@ from stage_service.acquisition.control import Forbidden
 from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
 from stage_service.devices.ownership import StageInUse
+from stage_service.frames import UnknownFrame
+from stage_service.inputs import BadInput
 from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
-from stage_service.service import BadInput, ModelInUse, NotFinished, UnknownArtifact, UnknownFrame
 from stage_service.storage import BadUpload, InUse, NotThere
+from stage_service.submitting import ModelInUse, NotFinished, UnknownArtifact
 from stage_service.viewer import BadLight, NothingToView
 from stage_service.watching import NotReady
 

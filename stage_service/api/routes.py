@@ -159,7 +159,7 @@ async def submit_job(
 ) -> Job:
     """Enqueue a pipeline on a finished capture. Sent again with the same `Idempotency-Key`, it is
     the same job."""
-    job = await lanes.jobs(service.submit, body, by, idempotency_key)
+    job = await lanes.jobs(service.jobs.submit, body, by, idempotency_key)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job
 
@@ -172,32 +172,32 @@ async def list_jobs(
     offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones left out")] = 0,
 ) -> list[Job]:
     """The latest jobs, newest first."""
-    return await lanes.jobs(service.jobs, limit, offset)
+    return await lanes.jobs(service.jobs.latest, limit, offset)
 
 
 @reading.get("/jobs/{job}", tags=["jobs"])
 async def get_job(job: str, service: OnService, lanes: OnLanes) -> Job:
     """A job's state, progress, and outcome."""
-    return await lanes.jobs(service.job, job)
+    return await lanes.jobs(service.jobs.get, job)
 
 
 @router.delete("/jobs/{job}", tags=["jobs"])
 async def cancel_job(job: str, service: OnService, lanes: OnLanes, by: Processes) -> Job:
     """Cancel a job: a queued one at once, a running one at its next progress call."""
-    return await lanes.jobs(service.cancel_job, job, by)
+    return await lanes.jobs(service.jobs.cancel, job, by)
 
 
 @reading.get("/jobs/{job}/report", response_class=FileResponse, responses=RANGES, tags=["jobs"])
 async def get_report(job: str, service: OnService, lanes: OnLanes) -> Response:
     """The report that the job's stages filled: seconds, error against time, left out, warnings."""
-    file = await lanes.jobs(service.artifact, job, "report.json")
+    file = await lanes.jobs(service.jobs.artifact, job, "report.json")
     return file_response(file, "application/json")
 
 
 @reading.get("/jobs/{job}/artifacts", tags=["jobs"])
 async def list_artifacts(job: str, service: OnService, lanes: OnLanes) -> list[Artifact]:
     """The files in the job's model folder."""
-    return await lanes.jobs(service.artifacts, job)
+    return await lanes.jobs(service.jobs.artifacts, job)
 
 
 @reading.get(
@@ -208,7 +208,7 @@ async def list_artifacts(job: str, service: OnService, lanes: OnLanes) -> list[A
 )
 async def get_artifact(job: str, path: str, service: OnService, lanes: OnLanes) -> Response:
     """One file of the model folder."""
-    file = await lanes.jobs(service.artifact, job, path)
+    file = await lanes.jobs(service.jobs.artifact, job, path)
     kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
     return file_response(file, kind)
 

@@ -60,19 +60,19 @@ reading = APIRouter(dependencies=READS)
 @router.post("/lease", status_code=status.HTTP_201_CREATED, tags=["steering"])
 def take_lease(body: LeaseRequest, service: OnService, by: Steers) -> LeaseGrant:
     """Steer alone for some time. Others are answered 409, but may abort and black out."""
-    return service.take_lease(body, by)
+    return service.leasing.take(body, by)
 
 
 @reading.get("/lease", tags=["steering"])
 def get_lease(service: OnService) -> LeaseView:
     """Who steers, if anybody in particular."""
-    return service.lease()
+    return service.leasing.view()
 
 
 @router.patch("/lease", tags=["steering"])
 def renew_lease(body: RenewRequest, service: OnService, by: Steers) -> LeaseGrant:
     """Let the lease of the token end so many seconds from now."""
-    return service.renew_lease(body, by)
+    return service.leasing.renew(body, by)
 
 
 @router.delete("/lease", tags=["steering"])
@@ -82,7 +82,7 @@ def release_lease(
     force: Annotated[bool, Query(description="whoever holds it; needs the scope admin")] = False,
 ) -> LeaseView:
     """End the lease of the token."""
-    return service.end_lease(by) if force else service.release_lease(by)
+    return service.leasing.end(by) if force else service.leasing.release(by)
 
 
 @reading.get("/audit", tags=["steering"])

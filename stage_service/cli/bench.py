@@ -38,7 +38,7 @@ def add(commands: Commands) -> None:
         "bench",
         help="measure error against run time (in a checkout)",
         description="Run a benchmark of the checkout; what follows NAME is its own.",
-        epilog="\n".join(f"  {name:<13}{text}" for name, text in BENCHMARKS.items()),
+        epilog="\n".join(f"  {name:<14}{text}" for name, text in BENCHMARKS.items()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     bench.add_argument("name", choices=tuple(BENCHMARKS), metavar="NAME")

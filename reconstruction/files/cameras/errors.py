@@ -13,7 +13,7 @@ import numpy as np
 from reconstruction.arrays import Array
 from reconstruction.containment import is_file_name
 from reconstruction.geometry.cameras import Camera
-from reconstruction.geometry.lens_models import Kind, LensModel, LensModelCamera
+from reconstruction.geometry.lens_models import LensModel, LensModelCamera
 
 CameraAxes = Literal["opencv", "opengl"]
 """x right, y down, z forward; or x right, y up, z backwards."""
@@ -85,8 +85,3 @@ def _plain(lens: LensModel) -> Array | None:
     if lens.kind == "metashape" and not (k[3] or k[6] or k[7]):
         return np.array([k[0], k[1], k[5], k[4], k[2]])
     return None
-
-
-def no_lens(kind: Kind = "opencv") -> LensModel:
-    """A lens that bends nothing, or as a fisheye bends."""
-    return LensModel(kind, np.zeros(0))

@@ -228,7 +228,7 @@ def test_a_job_submitted_twice_under_one_key_is_one_job(ask, tokens, service, mo
         asked, model = PipelineRequest(name="fit"), Model(service.root / "models" / job)
         return service._queue.submit(asked, service.root / "captures" / "x", model, job=job)
 
-    monkeypatch.setattr(service, "_submit", submit)
+    monkeypatch.setattr(service.jobs, "_submit", submit)
     app = create_app(service)
     body = {"capture": "x", "pipeline": {"name": "fit"}}
     sent = [

@@ -1,0 +1,45 @@
+"""A capture's steps and frames, for those who look at them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from reconstruction import Capture, CaptureError
+from stage_service.service_models import StepView
+
+T = TypeVar("T")
+
+
+class UnknownFrame(LookupError):
+    """The capture's plan has no such step or its rig no such camera."""
+
+
+def read_frame(capture: Capture, step: int, camera: str, read: Callable[[Path], T]) -> T:
+    """What `read` makes of a frame's EXR file. Raises `UnknownFrame`, `MissingFrame`;
+    `CaptureError` where the file is gone or cannot be read."""
+    by_index = {s.index: s for s in capture.steps}
+    cameras = [c.name for c in capture.rig.cameras]
+    if step not in by_index or camera not in cameras:
+        raise UnknownFrame(
+            f"{capture.path.name} has the steps {min(by_index, default=None)} to "
+            f"{max(by_index, default=None)} and the cameras "
+            f"{cameras}; got step {step}, camera {camera!r}"
+        )
+    try:
+        return capture.read_file(by_index[step], camera, read)
+    except CaptureError:
+        raise
+    except (OSError, ValueError) as error:
+        raise CaptureError(str(error)) from error
+
+
+def steps_of(capture: Capture) -> list[StepView]:
+    """What a capture shoots, in order, and which frames it has."""
+    names = [camera.name for camera in capture.rig.cameras]
+    there = {key for key, r in capture.records.items() if r.file is not None}
+    return [
+        StepView(**step.to_dict(), lacks=[n for n in names if (step.index, n) not in there])
+        for step in capture.steps
+    ]

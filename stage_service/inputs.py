@@ -1,0 +1,87 @@
+"""Files and names that requests give: read, and refused with where they stand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+
+from appearance.model.relight import PROCEDURAL
+from reconstruction import Mesh, Rig, read_obj
+from reconstruction.arrays import Bools
+from reconstruction.containment import plain_file
+from stage_service.jobs.pipelines import PIPELINES
+from stage_service.jobs.records import PipelineRequest
+
+
+class BadInput(ValueError):
+    """A file that a request names cannot be used; the message names it and says why."""
+
+
+def read_head(path: Path) -> Mesh:
+    """The head of an OBJ file. Raises `BadInput`."""
+    try:
+        return read_obj(path)
+    except (OSError, ValueError) as error:
+        raise BadInput(f"head: {error}") from error
+
+
+def read_masks(folder: Path, rig: Rig) -> dict[str, Bools]:
+    """The masks `<camera>.png` of the rig's cameras, `(height, width)` each. Raises `BadInput`."""
+    masks = {}
+    for camera in rig.cameras:
+        path = folder / f"{camera.name}.png"
+        try:
+            image = cv2.imread(str(plain_file(path)), cv2.IMREAD_GRAYSCALE)
+        except FileNotFoundError:
+            continue
+        except (OSError, ValueError) as error:
+            raise BadInput(f"masks: {error}") from error
+        if image is None or image.shape != (camera.height, camera.width):
+            found = "not an image" if image is None else f"{image.shape[1]}x{image.shape[0]}"
+            raise BadInput(f"masks: {path}: expected {camera.width}x{camera.height}, got {found}")
+        masks[camera.name] = image >= 128
+    if not masks:
+        raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
+    return masks
+
+
+def check_new(pipeline: PipelineRequest, rig: Rig, head: bool) -> None:
+    """Raises `BadInput` where the pipeline cannot follow a new capture, with a head or without."""
+    check_named(pipeline, rig)
+    if "reconstruct" not in PIPELINES[pipeline.name]:
+        raise BadInput(
+            f"pipeline: {pipeline.name!r} works on strands that are there already; "
+            "a new capture has none"
+        )
+    method = pipeline.options.method
+    if not head and method in ("light_planes", "fused"):
+        raise BadInput(
+            f"pipeline: {method!r} roots strands on a scalp: give the head, or the method "
+            "'auto', which takes what there is"
+        )
+
+
+def check_named(pipeline: PipelineRequest, rig: Rig) -> None:
+    """Raises `BadInput` where options name what the rig has not, or a file that is not there."""
+    options = pipeline.options
+    for kind, wanted, known in (
+        ("held_out_cameras", options.held_out_cameras, rig.cameras),
+        ("held_out_lights", options.held_out_lights, rig.lights),
+    ):
+        unknown = set(wanted) - {x.name for x in known}
+        if unknown:
+            raise BadInput(f"pipeline.options.{kind}: the rig has no {sorted(unknown)}")
+    asked = options.reconstruct
+    for field, file in (
+        ("truth", options.truth),
+        ("environment", None if options.environment in PROCEDURAL else options.environment),
+        ("reconstruct.head_mesh", asked.head_mesh),
+        ("reconstruct.scalp_points", asked.scalp_points),
+        ("reconstruct.network.file", asked.network.file if asked.network else None),
+    ):
+        try:
+            if file is not None and not (field == "truth" and Path(file).is_dir()):
+                plain_file(file)
+        except (OSError, ValueError) as error:
+            raise BadInput(f"pipeline.options.{field}: {error}") from error

@@ -1,0 +1,119 @@
+"""Jobs as the seam has them: what is asked of the queue, in callers' names, and what it leaves."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+
+from reconstruction import Capture, Model
+from stage_service.acquisition.control import Caller, Control
+from stage_service.acquisition.snapshots import SNAPSHOT
+from stage_service.inputs import BadInput, check_named
+from stage_service.jobs.follower import JobFollower
+from stage_service.jobs.pipelines import PIPELINES
+from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
+from stage_service.jobs.records import Job
+from stage_service.service_models import Artifact, JobRequest
+
+
+class UnknownArtifact(LookupError):
+    """The model folder has no such file."""
+
+
+class NotFinished(RuntimeError):
+    """What was asked for needs a capture that completed."""
+
+
+class ModelInUse(RuntimeError):
+    """Another job, queued or running, makes the same model."""
+
+
+class Submitting:
+    """Takes jobs for the models under `models`; `capture_path` finds a capture's folder.
+
+    Whoever holds `lock` keeps new jobs from being submitted.
+    """
+
+    def __init__(
+        self,
+        models: Path,
+        control: Control,
+        queue: JobQueue,
+        follower: JobFollower,
+        capture_path: Callable[[str], Path],
+    ) -> None:
+        self._models, self._capture_path = models, capture_path
+        self._control, self._queue, self._follower = control, queue, follower
+        self.lock = threading.Lock()
+
+    def submit(self, request: JobRequest, by: Caller, key: str | None = None) -> Job:
+        """Enqueue a pipeline on a capture; where that was done under this `key`, it is that job.
+        Raises `UnknownCapture`, `NotFinished`, `BadInput`, `ModelInUse`, `JobsUnavailable`."""
+        job = new_job_id()
+        if key is not None:
+            job = f"job-{sha256(key.encode()).hexdigest()[:16]}"
+            with suppress(NoSuchJob):
+                return self._queue.get(job)
+        work = partial(self._submit, job, request)
+        what = f"{request.pipeline.name} on {request.capture}"
+        return self._control.do(by, "job.submit", work, job, detail=what, steers=False)
+
+    def _submit(self, job: str, request: JobRequest) -> Job:
+        if request.capture == SNAPSHOT:
+            raise BadInput("capture: a snapshot is kept until the next one only: shoot a capture")
+        path = self._capture_path(request.capture)
+        capture = Capture(path)
+        if capture.manifest is None:
+            raise NotFinished(f"capture {request.capture} has no manifest yet: it is not finished")
+        if (outcome := capture.manifest.get("outcome")) != "completed":
+            raise NotFinished(
+                f"capture {request.capture} is {outcome}, not completed: resume it, or shoot anew"
+            )
+        check_named(request.pipeline, capture.rig)
+        model = Model(self._models / (request.model or job))
+        rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
+        if not rebuilds and not model.has("strands.npz"):
+            raise BadInput(
+                f"model: {request.pipeline.name!r} needs a model with strands: name one that "
+                "'reconstruct' made"
+            )
+        with self.lock:
+            other = self._queue.at_work_on(model)
+            if other is not None:
+                raise ModelInUse(
+                    f"model {model.path.name}: job {other} makes it; wait, or cancel it"
+                )
+            return self._queue.submit(request.pipeline, path, model, job=job)
+
+    def latest(self, limit: int, offset: int = 0) -> list[Job]:
+        """The latest `limit` jobs after the `offset` newest, newest first."""
+        return self._queue.all(limit=limit, offset=offset)
+
+    def get(self, job_id: str) -> Job:
+        """A job's present state. Raises `NoSuchJob`, as all about jobs `JobsUnavailable`."""
+        try:
+            return self._queue.get(job_id)
+        except NoSuchJob:  # that of a capture which has just completed may not be there yet
+            # Not owed (any more): it was enqueued meanwhile, or there is none.
+            return self._follower.enqueue_now(job_id) or self._queue.get(job_id)
+
+    def cancel(self, job_id: str, by: Caller) -> Job:
+        """Cancel a job: a queued one at once, a running one at its next progress call."""
+        work = partial(self._queue.cancel, job_id)
+        return self._control.do(by, "job.cancel", work, job_id, steers=False)
+
+    def artifacts(self, job_id: str) -> list[Artifact]:
+        """The files in the job's model folder. Raises `NoSuchJob`."""
+        files = Model(self.get(job_id).model).artifacts()
+        return [Artifact(path=name, bytes=p.stat().st_size) for name, p in files.items()]
+
+    def artifact(self, job_id: str, path: str) -> Path:
+        """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
+        file = Model(self.get(job_id).model).artifacts().get(path)
+        if file is None:
+            raise UnknownArtifact(f"job {job_id} has no file {path!r}")
+        return file
