@@ -10,6 +10,8 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats
 
+GROUND, INK = "#08090a", "#c3c8cd"
+"""The console's: the pictures are looked at beside the stage, in the dark."""
 Row = tuple[str, Mapping[str, AnyFloats], Mapping[str, str]]
 
 
@@ -26,7 +28,7 @@ def comparison_picture(
     figure = Figure(
         figsize=(height * len(columns) + 1.2, (height + 0.25) * len(rows) + 0.3),
         layout="constrained",
-        facecolor="white",
+        facecolor=GROUND,
     )
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(rows), len(columns), squeeze=False)
@@ -39,11 +41,11 @@ def comparison_picture(
             for spine in axis.spines.values():
                 spine.set_visible(False)
             if i == 0:
-                axis.set_title(column.replace("_", " "), fontsize=11)
+                axis.set_title(column.replace("_", " "), fontsize=11, color=INK)
             if j == 0:
-                axis.set_ylabel(label, fontsize=9)
+                axis.set_ylabel(label, fontsize=9, color=INK)
             if column in captions:
-                axis.set_xlabel(captions[column], fontsize=8, labelpad=2)
+                axis.set_xlabel(captions[column], fontsize=8, color=INK, labelpad=2)
     figure.savefig(path, dpi=110)
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from stage_service.cli.support.children import tied
 from stage_service.cli.support.commands import FAILED, CommandError, Commands, Output
 
 BENCHMARKS = {
@@ -57,4 +58,4 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
         )
     path = os.pathsep.join([str(tests), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "benchmarks", args.name, *args.arguments]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode
+    return subprocess.run(tied(command), env={**os.environ, "PYTHONPATH": path}).returncode

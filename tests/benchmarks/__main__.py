@@ -8,6 +8,7 @@ from importlib import import_module
 
 from benchmarks.command import Benchmark, LeftOut
 from stage_service.cli.bench import BENCHMARKS
+from stage_service.cli.stage.processes import exit_on_sigterm
 from stage_service.cli.support.commands import (
     FAILED,
     CommandError,
@@ -75,4 +76,5 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
 
 
 if __name__ == "__main__":
+    exit_on_sigterm()
     sys.exit(main())

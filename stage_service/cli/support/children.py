@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +22,8 @@ GRACE_S = 40.0
 class Children:
     """Starts processes and ends them on every exit of its with-block, the latest first.
 
-    Each child's output goes to `logs/<name>.log`, unless it is asked for.
+    Each child's output goes to `logs/<name>.log`, unless it is asked for. They are `tied`: to be
+    started by a thread that lives as long as they shall.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -51,7 +53,7 @@ class Children:
         with contextlib.ExitStack() as stack:
             log = stack.enter_context(self.log(name).open("a")) if to_log else None
             child = subprocess.Popen(
-                command,
+                tied(command),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE if answers else log,
                 stderr=log,
@@ -126,6 +128,15 @@ def end(child: subprocess.Popen[str]) -> None:
             child.wait()
     if child.stdout is not None:
         child.stdout.close()
+
+
+def tied(command: list[str], how: str = "TERM") -> list[str]:
+    """`command`, to get the signal `how` when the thread that starts it is gone, even by SIGKILL.
+
+    By util-linux's `setpriv`, which becomes the command; where that is missing, as it is.
+    """
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", how, "--", *command] if setpriv else command
 
 
 def own_command(*arguments: str | Path) -> list[str]:

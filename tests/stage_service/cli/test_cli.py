@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -393,6 +394,24 @@ def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path)
     with pytest.raises(CommandError, match=r"bad: ended with exit code 1; .*no such camera"):
         command()
     assert not alive(pids[0])
+
+
+def test_children_end_where_their_command_is_killed(tmp_path):
+    if shutil.which("setpriv") is None:
+        pytest.skip("there is no setpriv here: children outlive a command that is killed")
+    sleeper = "import time; print('here', flush=True); time.sleep(60); print('survived')"
+    program = (
+        "import sys, time; from pathlib import Path\n"
+        "from stage_service.cli.support.children import Children\n"
+        "with Children(Path(sys.argv[1])) as children:\n"
+        "    children.start('x', [sys.executable, '-c', sys.argv[2]], to_log=False)\n"
+        "    time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path), sleeper]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout.readline() == "here\n"
+        parent.kill()
+        assert parent.stdout.read() == ""  # ends when nobody holds it any more
 
 
 def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
