@@ -12,7 +12,14 @@ from typing import Any, Literal, get_args
 
 from reconstruction.capture.folder import CaptureError, Step, StepKind
 from reconstruction.capture.import_geometry import GeometryFiles
-from reconstruction.files.pictures import FORMATS, LOSSY, Positive, Sensor
+from reconstruction.files.pictures import (
+    FORMATS,
+    LOSSY,
+    PictureError,
+    Positive,
+    Sensor,
+    exposure_of,
+)
 from reconstruction.geometry.rig import Rig
 from reconstruction.options import BadOptions, options, parse_options
 
@@ -49,16 +56,16 @@ class Patterns:
 class ImportSettings:
     """`import.toml`, field by field.
 
-    `exposure` in seconds is that of pictures whose pattern has no `{exposure}`; `exposures` names
-    others. `first_light`: the number in a picture's name that stands for the first light of the
-    list, those after it following; None: the number that the light's own name ends in. `units`:
-    whether a full channel at 1 s is `scale` W/(sr m²), or unknown. `geometry`: the files of cameras
-    and lights, relative to the folder.
+    `exposure` in seconds is that of pictures whose pattern has no `{exposure}`, "file" what each
+    says itself (EXIF); `exposures` names others. `first_light`: the number in a picture's name that
+    stands for the first light of the list, those after it following; None: the number that the
+    light's own name ends in. `units`: whether a full channel at 1 s is `scale` W/(sr m²), or
+    unknown. `geometry`: the files of cameras and lights, relative to the folder.
     """
 
     pictures: Patterns = Patterns()
     sensor: Sensor = Sensor()
-    exposure: Positive = 1.0
+    exposure: Positive | Literal["file"] = 1.0
     exposures: dict[str, Positive] = field(default_factory=dict)
     first_light: int | None = None
     units: Literal["radiance", "relative"] | None = None
@@ -165,7 +172,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     shot = {s.light for s in steps}
     return Found(
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
-        tuple(left), tuple(_notes(rig, shot, used, settings, left)),
+        tuple(left), (*_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
 
 
@@ -215,6 +222,7 @@ class _Names:
         self.lights = [x.name for x in rig.lights]
         self.projectors = [p.name for p in rig.projectors]
         self._settings = settings
+        self.sensitivities: set[str] = set()
 
     def matching(self, role: str, pattern: str, names: Mapping[str, Path]) -> list[_Match]:
         """Files whose names follow `pattern`. Raises `ImportProblem` where it says too little."""
@@ -229,7 +237,8 @@ class _Names:
             raise ImportProblem(f"{where}: must say which {' and '.join(sorted(missing))}")
         expression = re.compile(self._expression(pattern))
         found = ((path, expression.fullmatch(name)) for name, path in names.items())
-        read = [self._read(path, match.groupdict()) for path, match in found if match]
+        timed = role not in ("flat", "hair", "subject")
+        read = [self._read(path, match.groupdict(), timed) for path, match in found if match]
         return [m for m in read if m is not None]
 
     def _expression(self, pattern: str) -> str:
@@ -256,8 +265,8 @@ class _Names:
                 out += re.escape(part)
         return out
 
-    def _read(self, path: Path, said: Mapping[str, str]) -> _Match | None:
-        """None where a number stands for nothing that the rig has."""
+    def _read(self, path: Path, said: Mapping[str, str], timed: bool) -> _Match | None:
+        """None where a number stands for nothing that the rig has; `timed`: seconds matter."""
         camera = (
             self._name(said.get("camera"), self.cameras) if "camera" in said else self.cameras[0]
         )
@@ -270,9 +279,11 @@ class _Names:
         if projector is None and "projector" in said:
             return None
         row, number = (int(said[f]) if f in said else None for f in ("row", "number"))
-        exposure = (
-            self._seconds(said["exposure"]) if "exposure" in said else self._settings.exposure
-        )
+        exposure = self._settings.exposure
+        if "exposure" in said:
+            exposure = self._seconds(said["exposure"])
+        elif exposure == "file":
+            exposure = self._seconds_in(path) if timed else 1.0
         return _Match(path, camera, light, projector, row, number, exposure)
 
     def _light(self, text: str) -> str | None:
@@ -304,6 +315,21 @@ class _Names:
                 f"{{exposure}} = {text!r}: seconds above 0, or a name of `exposures`"
             )
         return value
+
+    def _seconds_in(self, path: Path) -> float:
+        try:
+            seconds, sensitivity = exposure_of(path)
+        except PictureError as error:
+            raise ImportProblem(str(error)) from error
+        self.sensitivities.add(sensitivity)
+        return seconds
+
+    def notes(self) -> list[str]:
+        """What differs between the shots, and is not accounted for."""
+        if len(self.sensitivities) < 2:
+            return []
+        several = _few(sorted(self.sensitivities))
+        return [f"pictures differ in more than seconds ({several}): only seconds are accounted for"]
 
     def why_none(self, folder: Path, pattern: str, names: Mapping[str, Path]) -> str:
         """Why no file is a picture of one light."""

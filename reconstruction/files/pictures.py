@@ -88,6 +88,35 @@ def picture_size(path: Path) -> Size:
     return int(spec.width), int(spec.height)
 
 
+def exposure_of(path: Path) -> tuple[float, str]:
+    """Seconds, and ISO and f-number in words, that a file says of its shot (EXIF, a RAW file's own,
+    or EXR's `exposureTime` and `expTime`). Raises `PictureError` where it says no seconds."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix in RAW:
+            with rawpy.imread(str(path)) as raw:
+                shot = raw.other
+                said = (shot.shutter_speed, shot.iso_speed, shot.aperture)
+        elif suffix == ".exr":
+            header = OpenEXR.File(str(path), header_only=True).header()
+            said = (header.get("exposureTime", header.get("expTime")), 0, 0)
+        else:
+            spec = _opened(path).spec()
+            names = ("ExposureTime", "Exif:PhotographicSensitivity", "FNumber")
+            said = tuple(spec.getattribute(name) for name in names)
+    except PictureError:
+        raise
+    except Exception as error:  # both bindings raise what they please
+        raise PictureError(_broken(path, error)) from error
+    seconds, iso, stop = (float(x or 0) for x in said)
+    if not 0 < seconds < np.inf:
+        raise PictureError(
+            f"{path}: does not say how long it was exposed: give `exposure` in seconds, or "
+            "{exposure} in its name"
+        )
+    return seconds, f"ISO {iso:g} f/{stop:.3g}"
+
+
 def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
     """Read a picture of `size`. Raises `PictureError`: another size, broken, no such format."""
     suffix = path.suffix.lower()

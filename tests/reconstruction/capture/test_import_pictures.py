@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from reconstruction import Capture, import_folder, verify
@@ -42,6 +43,20 @@ def save(path: Path, value: Floats, kind: type) -> None:
     white = np.iinfo(kind).max
     counts = np.round(np.clip(value, 0, 1) * white).astype(kind)
     assert cv2.imwrite(str(path), counts[..., ::-1] if counts.ndim == 3 else counts)
+
+
+def save_as_shot(path: Path, value: Floats, seconds: float, iso: int = 100) -> None:
+    """`value (H, W, 3)`, 1 at white, with the seconds of its exposure written into the file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exr = path.suffix == ".exr"
+    spec = oiio.ImageSpec(SIZE, SIZE, 3, oiio.FLOAT if exr else oiio.UINT8)
+    spec.attribute("ExposureTime", seconds)
+    spec.attribute("Exif:PhotographicSensitivity", iso)
+    spec.attribute("CompressionQuality", 100)
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec)
+    assert out.write_image(value if exr else np.round(255 * np.clip(value, 0, 1)).astype(np.uint8))
+    out.close()
 
 
 @pytest.fixture
@@ -124,6 +139,48 @@ def test_brackets_are_merged_and_saturation_is_kept(folder, tmp_path):
     assert error < 0.95 * np.sqrt(np.mean((longest - bright[held]) ** 2))
     rest = ~held & ~expected  # that only the shorter ones hold
     assert np.abs(image - bright)[rest].max() < 0.1 * bright[rest].max()
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "tif", "png", "exr"])
+def test_seconds_that_the_files_say(folder, tmp_path, suffix):
+    """Two exposures of a frame, told apart by what is written in the files alone."""
+
+    def write(camera: str, n: int, x: Floats) -> None:
+        for name, seconds in ("DSC_1", 1 / 125), ("DSC_2", 1 / 30):
+            path = folder / camera / f"{n}_{name}.{suffix}"
+            path.parent.mkdir(exist_ok=True)
+            save_as_shot(path, x * seconds * 8, seconds)
+
+    everywhere(write)
+    settings(
+        folder,
+        f'exposure = "file"\nsensor.response = "linear"\n'
+        f'pictures.olat = "{{camera}}/{{light}}_*.{suffix}"\n',
+    )
+    understood = Import.of(folder)
+    assert understood.counts()["exposures_per_frame"] == {2: 6}
+    assert not any("ISO" in note for note in understood.found.notes)
+    capture = import_folder(folder, tmp_path / "out")
+    assert capture.of_kind("olat")[0].exposure == pytest.approx(
+        1 / 30, rel=2e-5
+    )  # EXIF's rationals
+    image, _ = capture.light("light_001", "left")
+    count = 30 / 255  # of the longer exposure
+    assert np.abs(image - 8 * light_of(0, 1)).max() < (3 if suffix == "jpg" else 1) * count
+
+
+def test_shots_of_another_sensitivity_are_told(folder):
+    everywhere(lambda c, n, x: save_as_shot(folder / f"images/{c}/{n}.png", x, 0.1, 100 * (n + 1)))
+    settings(folder, 'exposure = "file"\n')
+    (note,) = [n for n in Import.of(folder).found.notes if "ISO" in n]
+    assert "ISO 100 f/0, ISO 200 f/0, ISO 300 f/0" in note
+
+
+def test_a_picture_that_does_not_say_its_seconds(folder):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint8))
+    settings(folder, 'exposure = "file"\n')
+    with pytest.raises(ImportProblem, match=r"0\.png: does not say how long it was exposed: give"):
+        Import.of(folder)
 
 
 def test_a_mosaic_and_its_black_level(folder, tmp_path):
@@ -268,7 +325,7 @@ def test_two_files_for_one_frame(folder, tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("exposure = 0", "exposure: Input should be greater than 0"),
+        ("exposure = 0", "exposure.*Input should be greater than 0"),
         ("expsure = 1", "expsure: Unexpected"),
         ("exposure = ", "not TOML"),
         ('pictures.olat = "{cam}/{light}.png"', "no fields"),
