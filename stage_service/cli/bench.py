@@ -28,6 +28,7 @@ BENCHMARKS = {
     "masks": "automatic hair masks beside true ones, at several path counts",
     "renderers": "our renderers beside Mitsuba's path integrator, light by light and line by line",
     "soak": "a service that shoots for an hour and is killed: memory, frames, blackouts",
+    "viewer": "the viewer's light beside the path tracer's; frames a second, and its shader's cost",
     "all": "every one of them",
 }
 """What each is about, for `python -m benchmarks` and its help too."""

@@ -35,6 +35,7 @@ MODULES = {
     "masks": "benchmarks.light_planes.masks",
     "renderers": "benchmarks.renderers.errors",
     "soak": "benchmarks.service.soak",
+    "viewer": "benchmarks.viewer.shown",
 }
 """Each has its `BENCHMARK`."""
 

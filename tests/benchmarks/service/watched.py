@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import shutil
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.acquisition.rates import simulated
+from benchmarks.browser import browser_cpu_s, chromium, cpu_s
 from benchmarks.command import Benchmark, LeftOut, option
 from benchmarks.results import save
 from benchmarks.service.live import Live, follower
@@ -31,7 +31,6 @@ from stage_service.records.tokens import own_token
 WATCHERS = 3
 SETTLED_S = 3.0
 PLAN = {"projectors": [], "stepping": "software", "brackets": [1, 1.5, 2, 2.5]}
-TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 Watch = Callable[[Live], AbstractContextManager[None]]
 
 
@@ -90,7 +89,7 @@ def _result(shot: dict[str, list[dict[str, float]]], idle: dict[str, float]) -> 
 
 
 def _shoot(live: Live, plan: dict[str, Any]) -> dict[str, float]:
-    service, browser = _cpu_s(live.child.pid), _browser_cpu_s()
+    service, browser = cpu_s(live.child.pid), browser_cpu_s()
     capture = live.ask("POST", "/captures", {"plan": plan})["id"]
     while live.ask("GET", "/health")["capture"] is not None:
         time.sleep(0.5)
@@ -99,16 +98,16 @@ def _shoot(live: Live, plan: dict[str, Any]) -> dict[str, float]:
         raise LeftOut(f"a capture came to {status['outcome']}: {status['error']}")
     return {
         "seconds": status["seconds"],
-        "service_cpu_s": _cpu_s(live.child.pid) - service,
-        "browser_cpu_s": _browser_cpu_s() - browser,
+        "service_cpu_s": cpu_s(live.child.pid) - service,
+        "browser_cpu_s": browser_cpu_s() - browser,
     }
 
 
 def _idle(live: Live, seconds: float) -> float:
     """The share of a core that the service takes while nothing happens."""
-    before, began = _cpu_s(live.child.pid), time.monotonic()
+    before, began = cpu_s(live.child.pid), time.monotonic()
     time.sleep(seconds)
-    return (_cpu_s(live.child.pid) - before) / (time.monotonic() - began)
+    return (cpu_s(live.child.pid) - before) / (time.monotonic() - began)
 
 
 def _nobody(_live: Live) -> AbstractContextManager[None]:
@@ -126,54 +125,24 @@ def _streams(live: Live) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _browser() -> Iterator[Watch]:
-    """A browser, and what opens pages of the console in it. Raises `LeftOut` without one."""
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError as error:
-        raise LeftOut("Playwright is not installed: pip install 'hairstage[test]'") from error
-    if chromium is None:
-        raise LeftOut("there is no Chromium here")
+    """What opens pages of the console in a browser. Raises `LeftOut` without one."""
+    with chromium() as launch:
 
-    @contextlib.contextmanager
-    def pages(live: Live) -> Iterator[None]:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        try:
-            context = browser.new_context(base_url=str(live.http.base_url))
-            context.request.post("/login", data={"token": own_token()})
-            for _ in range(WATCHERS):
-                page = context.new_page()
-                page.goto("/#now")
-                page.wait_for_selector("h1.big")
-            yield
-        finally:
-            browser.close()
+        @contextlib.contextmanager
+        def pages(live: Live) -> Iterator[None]:
+            browser = launch()
+            try:
+                context = browser.new_context(base_url=str(live.http.base_url))
+                context.request.post("/login", data={"token": own_token()})
+                for _ in range(WATCHERS):
+                    page = context.new_page()
+                    page.goto("/#now")
+                    page.wait_for_selector("h1.big")
+                yield
+            finally:
+                browser.close()
 
-    with sync_playwright() as playwright:
         yield pages
-
-
-def _cpu_s(pid: int) -> float:
-    """User and system seconds of a process and of its children that have ended."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return sum(map(int, fields[11:15])) * TICK_S
-
-
-def _browser_cpu_s() -> float:
-    """That of all processes that this one has begun which are a browser's."""
-    found, parents = 0.0, {os.getpid()}
-    known: dict[int, tuple[int, str]] = {}
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            text = (process / "stat").read_text()
-            known[int(process.name)] = (int(text.rpartition(")")[2].split()[1]), text)
-    while more := {pid for pid, (parent, _) in known.items() if parent in parents} - parents:
-        parents |= more
-    for pid in parents - {os.getpid()}:
-        if "chrom" in known[pid][1].partition("(")[2].partition(")")[0]:
-            with contextlib.suppress(OSError):
-                found += _cpu_s(pid)
-    return found
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
