@@ -116,7 +116,7 @@ export class Picture {
     const { camera, range, texel } = ofLight(
       lighting.lights[number].position, low, high, this.texels);
     const shift = [radical(round, 2) - 0.5, radical(round, 3) - 0.5];
-    const seen = { uMatrix: camera.matrix(...range, shift), uEye: camera.eye };
+    const seen = { uMatrix: camera.matrix(...range, shift), uEye: camera.eye, uFocal: camera.K[0][0] };
     const begin = () => {
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
       gl.viewport(0, 0, this.texels, this.texels);
@@ -230,7 +230,7 @@ export class Picture {
     const near = Math.max(0.02 * box.reach, away - 2.2 * box.reach), far = away + 2.2 * box.reach;
     return {
       uMatrix: camera.matrix(near, state.wires ? Math.max(far, 2 * away + 4) : far, how.shift),
-      uEye: camera.eye, uLinear: how.linear, uExposure: this.exposure(),
+      uEye: camera.eye, uFocal: camera.K[0][0], uLinear: how.linear, uExposure: this.exposure(),
       uSlice: state.slice ?? NO_SLICE, uMode: MODES[state.mode],
     };
   }

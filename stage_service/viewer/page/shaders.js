@@ -66,8 +66,11 @@ void main() {
   gl_Position = uMatrix * vec4(q, 1.0);
 }`;
 
-// A round fibre: a ribbon across the eye, of which each fragment knows where on the fibre it lies.
+// A round fibre: a ribbon across the eye, of which each fragment knows where on the fibre it lies. The
+// ribbon is two pixels wide at least, and fragments beside the fibre are discarded: rasterisers put
+// corners on a grid of 1/16 pixel here and there, on which a thinner one is lost.
 export const FIBRE_VERTEX = STRAND + `
+uniform float uFocal;  // pixels
 out vec3 vPlace, vTangent, vFacing;
 out float vAcross, vRadius;
 flat out uint vStrand;
@@ -75,8 +78,9 @@ void main() {
   int strand = uFirst + gl_InstanceID, k = number();
   vec3 p = place(strand, k), view = normalize(uEye - p);
   vTangent = tangent(strand, k);
-  vAcross = gl_VertexID % 2 == 0 ? 1.0 : -1.0;
   vRadius = own(strand).y * uRibbon;
+  float pixel = (uMatrix * vec4(p, 1.0)).w / uFocal;
+  vAcross = max(1.0, pixel / max(vRadius, 1e-9)) * (gl_VertexID % 2 == 0 ? 1.0 : -1.0);
   vec3 side = across(vTangent, view);
   vFacing = cross(side, vTangent);
   vPlace = p + vAcross * vRadius * side;
@@ -90,6 +94,7 @@ in float vAcross, vRadius;
 flat in uint vStrand;
 uniform mat4 uMatrix;
 vec3 surface() {  // and the depth of the round fibre, not of the ribbon
+  if (abs(vAcross) > 1.0) discard;
   vec3 p = vPlace + vFacing * vRadius * sqrt(max(1.0 - vAcross * vAcross, 0.0));
   vec4 clip = uMatrix * vec4(p, 1.0);
   gl_FragDepth = 0.5 + 0.5 * clip.z / clip.w;

@@ -26,10 +26,14 @@ DEPTH = 24
 
 @dataclass(frozen=True)
 class Effort:
-    """Pixels a side, paths a pixel of what the viewer is held against, samples of the viewer's."""
+    """Pixels a side, paths a pixel of what the viewer is held against.
+
+    Each is `over` x `over` pixels of the viewer's, of so many `samples`.
+    """
 
     size: int = 128
     spp: int = 1024
+    over: int = 4
     samples: int = 24
 
 
@@ -60,7 +64,9 @@ def compare(
         progress(name, 0.2 * len(figures))
         exposure = Exposure.of([row.whole[hair]])
         shown.light(row.what)
-        direct, whole = (shown.at_rest(effort.size, effort.samples, a) for a in (0.0, None))
+        direct, whole = (
+            shown.at_rest(effort.size, effort.over, effort.samples, a) for a in (0.0, None)
+        )
         figures[name] = {
             "psnr_db": psnr(exposure(whole), exposure(row.whole), hair),
             "over_path_tracer": _ratio(whole, row.whole, hair),

@@ -47,13 +47,12 @@ class Shown:
         """Light the hair by lights (number: RGB), or by the environment of that name."""
         self.page.evaluate(LIGHT, weights if isinstance(weights, str) else dict(weights))
 
-    def at_rest(self, size: int, samples: int, ambient: float | None = None) -> Floats:
-        """The picture at rest `(size, size, 3)`, radiance, of at least so many `samples`.
-
-        `ambient` as the page's slider sets it.
-        """
-        told = self.page.evaluate(AT_REST, [size, samples, ambient])
-        return np.array(told, np.float32).reshape(size, size, 4)[::-1, :, :3]
+    def at_rest(self, size: int, over: int, samples: int, ambient: float | None = None) -> Floats:
+        """The picture at rest `(size, size, 3)`, radiance: means of `over` x `over` pixels, each of
+        at least so many `samples`. `ambient` as the page's slider sets it."""
+        told = self.page.evaluate(AT_REST, [size * over, samples, ambient])
+        blocks = np.array(told, np.float32).reshape(size, over, size, over, 4)
+        return np.asarray(blocks.mean((1, 3))[::-1, :, :3])
 
 
 @contextlib.contextmanager

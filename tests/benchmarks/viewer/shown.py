@@ -30,9 +30,9 @@ GOALS = {"psnr_db": 24, "direct_over_depth_1": (0.98, 1.02), "frames_a_second_gp
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Agreement of each groom under four lights, then frames a second at each number of strands."""
     grooms, counts = GROOMS, COUNTS
-    effort, seconds = Effort(args.size, args.spp, args.samples), args.seconds
+    effort, seconds = Effort(args.size, args.spp, args.over, args.samples), args.seconds
     if args.quick:
-        grooms, counts, effort, seconds = ("straight",), (2000,), Effort(32, 8, 3), 1.0
+        grooms, counts, effort, seconds = ("straight",), (2000,), Effort(32, 8, 1, 3), 1.0
     rig = rig_path("demo")
     subjects = {name: simulated(rig, name, None, args.seed) for name in grooms}
     if args.quick:  # a browser without a GPU draws a whole groom for minutes
@@ -62,6 +62,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 OPTIONS = (
     option("--size", "pixels a side of the pictures that are compared", type=int, default=128),
     option("--spp", "paths a pixel of the path tracer's", type=int, default=1024),
+    option("--over", "of the viewer's pixels a side are one of those", type=int, default=4),
     option("--samples", "of each of the viewer's pictures; it takes 48", type=int, default=24),
     option("--seconds", "that each way of drawing is measured", type=float, default=15.0),
 )

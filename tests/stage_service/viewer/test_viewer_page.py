@@ -125,7 +125,7 @@ def test_strands_are_drawn_turn_and_take_another_colour(seen, url):
 
 
 @pytest.mark.parametrize(
-    ("model", "allowed"), [("fibre", 0.01), ("bundle", 0.08)], indirect=["model"]
+    ("model", "allowed"), [("fibre", 0.015), ("bundle", 0.035)], indirect=["model"]
 )
 def test_direct_light_is_that_of_the_path_tracer(seen, model, viewing, allowed):
     """From in front, from the side, from behind; the picture's sum beside paths of one vertex."""
