@@ -20,6 +20,7 @@ from appearance.metrics.scores import (
 )
 from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
+from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
 from appearance.model.relight import relight
 from appearance.observations import HeldOut, Observed, observe_hair
@@ -31,7 +32,7 @@ from appearance.sun_fit.roughness_and_colour import fit_diffuse
 from reconstruction import Camera, Capture, Light, Model, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Array, Bools
 
-FITS = ("ours", "sun_fit", "inverse_rendering", "without_field")
+FITS = ("ours", "sun_fit", "inverse_rendering", "without_field", "guided_frames")
 """Names in the results that are no baselines."""
 OWN_FRAMES = "three_nearest_own_frames"
 """What has the held-out camera's own frames, which nothing else has: beaten or not, no warning."""
@@ -74,6 +75,8 @@ def assess(
     ("rendered", beside the groups, names the one that is ours, where a field is, the one below it);
     where a field is on Sun's fit, that "without_field"; and the baselines
 
+    - "guided_frames", of held-out lights, no baseline: frames changed as our model says, see
+      `GuidedFrames`
     - "mean_colour": one colour, the mean over training frames and hair pixels
     - "diffuse": Lambertian fibres on our strands, with the albedo that reproduces that mean
     - "three_nearest", of held-out lights: the camera's own frames under the three nearest training
@@ -221,6 +224,8 @@ class _Comparison:
             mixed = three_nearest(self.capture, camera.name, light, training)
             image.frames["three_nearest" if own else OWN_FRAMES] = mixed
             if own:
+                guided = GuidedFrames(scene, self.fitted, self.training, camera, image.mask)
+                image.frames["guided_frames"] = guided(image.frames["ours"], [light])
                 continue
             if camera.name not in views:
                 mask = self.model.mask(camera.name, "hair", self.capture)

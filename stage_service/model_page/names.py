@@ -26,6 +26,7 @@ PICTURES = {
     "inverse_rendering": "inverse rendering",
     "sun_fit": "Sun's fit",
     "without_field": "without the field",
+    "guided_frames": "nearest frames, changed as the model says",
     "diffuse": "diffuse",
     "mean_colour": "mean colour",
     "three_nearest": "three nearest lights",

@@ -51,9 +51,10 @@ def add(commands: Commands) -> None:
     )
     render.add_argument(
         "--guide",
-        choices=("kajiya_kay", "none"),
+        choices=("kajiya_kay", "none", "model"),
         default="kajiya_kay",
-        help="what guides an interpolation; none is the standard one",
+        help="what guides an interpolation; none is the standard one; model, for a camera of the "
+        "capture, is what our own renders say",
     )
     render.add_argument(
         "--refine", action="store_true", help="turn the guide's tangents to each camera's frames"
@@ -200,7 +201,12 @@ def _still(
 ) -> tuple[Floats, dict[str, Any]]:
     """One picture, and what there is to tell of it."""
     from appearance import render_mixed
-    from appearance.model.interpolated import InterpolationOptions, Pose, all_lights
+    from appearance.model.interpolated import (
+        GuidedFrames,
+        InterpolationOptions,
+        Pose,
+        all_lights,
+    )
 
     fitted, model, capture = whose
     pose = Pose(fitted, strands)
@@ -209,6 +215,12 @@ def _still(
     if capture is None or args.field != "interpolation":
         return image, {}
     camera, lights, maps, _ = lit
+    if args.guide == "model":
+        if args.camera is None or strands is not None or maps:
+            raise ValueError("--guide model: for a --camera of the capture, its pose and --light")
+        mask = model.mask(camera.name, "hair", capture)
+        guided = GuidedFrames(fitted.scene(), fitted, capture, camera, mask)
+        return guided(image, lights), {"field": "interpolation", "guide": "model"}
     options = InterpolationOptions(guide=args.guide, refine=args.refine)
     all_lit = camera, all_lights(lights, maps)
     return _interpolated(image, options, (pose, model, capture), all_lit, progress)

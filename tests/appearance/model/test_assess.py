@@ -1,6 +1,7 @@
 """Held-out images, their baselines and the pictures, on a small capture of known appearance."""
 
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ from appearance import Exposure, HairAppearance, HeldOut, Sampling, assess, buil
 from appearance.metrics.pictures import comparison_picture
 from appearance.model.assess import front_lights, judge
 from appearance.model.baselines import NearestCameras, three_nearest
+from appearance.model.fitted_model import FittedModel
+from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
 from appearance.model.relight import environment_map, three_quarter_view
 from appearance.render.coverage import coverage
@@ -22,6 +25,7 @@ from reconstruction import (
     Light,
     Mesh,
     Model,
+    ModelError,
     Rig,
     Stage,
     Step,
@@ -86,7 +90,7 @@ def test_the_true_model_beats_the_trivial_baselines(result):
     for group in ("held_out_lights", "held_out_camera"):
         rows = result[group]
         made_of_frames = {
-            "held_out_lights": {"three_nearest"},
+            "held_out_lights": {"three_nearest", "guided_frames"},
             "held_out_camera": {"nearest_cameras", "three_nearest_own_frames"},
         }[group]
         assert set(rows) == {"ours", "mean_colour", "diffuse"} | made_of_frames
@@ -154,6 +158,42 @@ def test_three_nearest_lights_are_training_lights(made):
     weights = 1 / np.arccos([positions[n] for n in nearest])
     want = np.tensordot(weights / weights.sum(), frames, 1)
     np.testing.assert_allclose(mixed, want, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def guided(made):
+    capture, model, scene = made
+    mask = model.mask("cam_0", "hair", capture)
+    fitted, camera = FittedModel.load(model, capture), capture.rig.camera("cam_0")
+    return GuidedFrames(scene, fitted, HELD_OUT.training(capture), camera, mask)
+
+
+def test_frames_changed_by_the_true_model_are_nearer_than_unchanged_ones(result):
+    rows = result["held_out_lights"]
+    assert rows["guided_frames"]["psnr"] > rows["three_nearest"]["psnr"] + 1
+
+
+def test_guided_frames_of_a_captured_light_are_its_own(guided):
+    """Also under a light there of another intensity; what is no hair stays the picture's."""
+    light = guided.capture.rig.light("l0")
+    frame, _ = guided.capture.light("l0", "cam_0")
+    base = np.full(frame.shape, 7.0, np.float32)
+    brighter = Light("other", light.position, 3 * light.intensity)
+    for lit, gain in ((light, 1), (brighter, 3)):
+        image = guided(base, [lit])
+        np.testing.assert_allclose(image[guided.mask], gain * frame[guided.mask], rtol=1e-3, atol=1e-9)
+        assert (image[~guided.mask] == 7).all()
+    together = guided(base, [light, brighter])
+    np.testing.assert_allclose(together[guided.mask], 4 * frame[guided.mask], rtol=1e-3, atol=1e-9)
+
+
+def test_guided_frames_say_what_is_missing(guided):
+    base, light = np.zeros((*guided.mask.shape, 3)), guided.capture.rig.light("l0")
+    with pytest.raises(ModelError, match="cam_0: its hair mask is empty"):
+        replace(guided, mask=np.zeros_like(guided.mask))(base, [light])
+    alone = guided.capture.view(lights=[])
+    with pytest.raises(ModelError, match="cam_0: the capture has no frame of it"):
+        replace(guided, capture=alone)(base, [light])
 
 
 def test_a_saturated_pixel_is_mixed_of_the_lights_that_do_not_saturate_it(tmp_path):
