@@ -55,7 +55,7 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
     assert results["images"]["rendered"] in ("sun_fit", "inverse_rendering")
     fits = ("ours", "sun_fit", "inverse_rendering", "mean_colour", "diffuse")
     for group, of_frames in (
-        ("held_out_lights", ("three_nearest",)),
+        ("held_out_lights", ("three_nearest", "guided_frames")),
         ("held_out_camera", ("nearest_cameras", "three_nearest_own_frames")),
     ):
         for method in (*fits, *of_frames):
