@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from stage_service.acquisition.capture_queue import CaptureQueue, Entry
-from stage_service.acquisition.captures import Busy, CaptureManager, check_flashing
+from stage_service.acquisition.captures import Busy, CaptureManager
 from stage_service.acquisition.control import Caller, Control
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.plan.resolved import resolve
@@ -57,7 +57,7 @@ class Queueing:
             by.require("jobs")
         self._prepare(request, None)
         plan = resolve(request.plan, self._captures.rig_file)
-        check_flashing(plan, armed_by="whoever starts it")
+        plan.check_flashing(armed_by="whoever starts it")
         kept = request.model_dump(mode="json", exclude={"place"}, exclude_defaults=True)
         flashes = plan.cost.flash.needs_consent
         work = partial(self._line.add, kept, str(by), needs_arming=flashes, place=request.place)

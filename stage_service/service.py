@@ -116,7 +116,7 @@ class Service:
         """
         if not self._has_stage:
             self.take_stage()
-        self._captures.darken()
+        self._captures.stage.darken()
         self._follower.start()
         self._captures.catalogue.begin(
             self._read, self._all_read, lambda: self._captures.running is not None, READ_S
@@ -139,7 +139,7 @@ class Service:
 
     def take_stage(self) -> None:
         """Have the stage for this service alone. Raises `StageInUse`."""
-        self._captures.take_stage()
+        self._captures.stage.take()
         self._has_stage = True
 
     def close(self) -> None:
@@ -344,9 +344,9 @@ class Service:
 
     def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:
         """Take a person's word that the lamps are off. Raises `CannotAcknowledge`."""
-        work, detail = self._captures.latch.acknowledge, f"{request.name}: {request.note}"
+        work, detail = self._captures.stage.latch.acknowledge, f"{request.name}: {request.note}"
         self._control.do(by, "acknowledge", work, detail=detail)
-        return self._captures.darkness()
+        return self._captures.stage.darkness()
 
     def record_login(self, name: str, address: tuple[str, int] | None) -> None:
         """Note in the audit log who logged in, and from where."""
@@ -375,7 +375,7 @@ class Service:
             unread=self.unread,
             lamps=lamps["state"],
             lamps_detail=lamps["detail"],
-            latch=LatchView.of(self._captures.latch.latched),
+            latch=LatchView.of(self._captures.stage.latch.latched),
             disk_free_bytes=self.watching.free_bytes(),
             problems=problems,
         )

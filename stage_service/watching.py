@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,7 +82,7 @@ class Watching:
             yield _per(f"{name}_total", text, label, counts[name], "counter")
         reachable = {
             name: float(state == "ok")
-            for name, state in captures.devices_seen().items()
+            for name, state in captures.stage.states().items()
             if state in ("ok", "unreachable")
         }
         yield _per("device_reachable", "when it was last asked", "device", reachable)
@@ -138,6 +138,8 @@ def _one(name: str, help: str, value: float) -> Metric:
     return Metric(name, help, [({}, float(value))])
 
 
-def _per(name: str, help: str, label: str, values: dict[str, float], kind: str = "gauge") -> Metric:
+def _per(
+    name: str, help: str, label: str, values: Mapping[str, float], kind: str = "gauge"
+) -> Metric:
     samples = [({label: key}, float(value)) for key, value in values.items()]
     return Metric(name, help, samples, kind)

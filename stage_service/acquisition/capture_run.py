@@ -1,15 +1,15 @@
-"""The capture that is being made: its sequencer, and what is known of it meanwhile."""
+"""The capture that is being made: what is known of it meanwhile, and what is counted of all."""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from typing import Any
 
 from reconstruction import Capture, CaptureWriter
 from stage_service.acquisition.exposing import FlashWatch
 from stage_service.acquisition.sequencer import Sequencer
-from stage_service.acquisition.states import CaptureStatus, read_status
+from stage_service.acquisition.states import OUTCOMES, CaptureStatus, read_status
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
@@ -77,6 +77,44 @@ class CaptureRun:
 
     def _notify(self, kind: str, data: dict[str, Any]) -> None:
         self._events.publish(kind, {"id": self.id, **data})
+
+
+class Tally:
+    """What became of captures, frames and devices since the start. Not locked: the owner is.
+
+    `running`, where given, is the run that is not counted yet.
+    """
+
+    def __init__(self) -> None:
+        self._captures = Counter[str](dict.fromkeys(OUTCOMES.values(), 0))
+        self._frames = Counter(written=0, missing=0, again=0)
+        self._faults = Counter[str]()
+        self._by_device: defaultdict[str, Counter[str]] = defaultdict(Counter)
+
+    def add(self, run: CaptureRun, outcome: str | None) -> None:
+        """Count a run that is over; `outcome` None: one that is in no list, for its faults only."""
+        if outcome is not None:
+            self._captures[outcome] += 1
+            self._frames.update(run.frames())
+        self._faults.update(run.sequencer.faults)
+        for device, counts in run.sequencer.by_device.items():
+            self._by_device[device].update(counts)
+
+    def counts(self, running: CaptureRun | None) -> dict[str, dict[str, int]]:
+        """Captures by how they ended, frames by what became of them, faults by device."""
+        frames = self._frames.copy()
+        if running is not None:
+            frames.update(running.frames())
+        found = {"captures": self._captures, "frames": frames, "device_faults": self._faults}
+        return {k: dict(v) for k, v in found.items()}
+
+    def of_device(self, device: str, running: CaptureRun | None) -> dict[str, int]:
+        """What one device, or camera, did to captures."""
+        counts = Counter(timeouts=0, faults=0)
+        counts.update(self._by_device[device])
+        if running is not None:
+            counts.update(dict(running.sequencer.by_device.get(device, {})))
+        return dict(counts)
 
 
 def plan_of(capture: Capture, rig_file: RigFile) -> ResolvedPlan:

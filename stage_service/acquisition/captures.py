@@ -7,24 +7,21 @@ import secrets
 import shutil
 import threading
 import time
-from collections import Counter, defaultdict
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
 from reconstruction.capture.writer import utc_now
-from reconstruction.files.durable import RESERVE
-from stage_service.acquisition.capture_run import CaptureRun, plan_of
+from stage_service.acquisition.capture_run import CaptureRun, Tally, plan_of
 from stage_service.acquisition.catalogue import Catalogue
-from stage_service.acquisition.latch import Latch, Unsafe
-from stage_service.acquisition.safety import Blackout, blackout, off_on_exit
+from stage_service.acquisition.latch import Unsafe
+from stage_service.acquisition.safety import blackout, off_on_exit
 from stage_service.acquisition.snapshots import APART_S, SNAPSHOT
+from stage_service.acquisition.stage import Stage
 from stage_service.acquisition.states import (
-    OUTCOMES,
     CaptureStatus,
     State,
     WrongState,
@@ -32,11 +29,8 @@ from stage_service.acquisition.states import (
 )
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
-from stage_service.devices.last_seen import LastSeen
-from stage_service.devices.ownership import Ownership
 from stage_service.plan.capture_plan import CapturePlan
-from stage_service.plan.flash import SLOW_HZ, FlashRefusal
-from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
+from stage_service.plan.resolved import ResolvedPlan, resolve
 from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 from stage_service.records.lease import RootLock
@@ -86,20 +80,21 @@ class CaptureManager:
         self.folder = root / "captures"
         self.folder.mkdir(parents=True, exist_ok=True)
         self._root_lock = RootLock(root)
-        self._ownership = None
-        if rig_file.devices is not None:
-            try:
-                self._ownership = Ownership(rig_file.devices.lights, root, take_over)
-            except BaseException:
-                self._root_lock.release()
-                raise
-        self.audit = AuditLog(root / "audit.jsonl")
-        self.latch = Latch(root / "unsafe.json")
-        self._dark: Blackout | None = None
-        self.events = EventLog()
+        self.audit, self.events = AuditLog(root / "audit.jsonl"), EventLog()
+        try:
+            self.stage = Stage(
+                rig_file,
+                root,
+                self.audit,
+                self.events,
+                lambda: self._running is not None,
+                take_over=take_over,
+            )
+        except BaseException:
+            self._root_lock.release()
+            raise
         self._on_complete = on_complete
         self._lock = threading.RLock()  # for moments, never while device or disk is waited for
-        self._talking = threading.Lock()  # held by who has connected to the devices to ask them
         self._running: CaptureRun | None = None
         self._preparing: str | None = None
         self._closed = False
@@ -107,22 +102,9 @@ class CaptureManager:
         self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
         self.catalogue = Catalogue(self.folder, root / "captures.index")
-        self._counts: dict[str, Counter[str]] = {
-            "captures": Counter(dict.fromkeys(OUTCOMES.values(), 0)),
-            "frames": Counter(written=0, missing=0, again=0),
-            "device_faults": Counter(),
-        }
-        self._by_device: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._tally = Tally()
         self._looked = -APART_S
         self._stay_on_exit = off_on_exit(self.close)
-
-    @cached_property
-    def _devices(self) -> DeviceSet:
-        return DeviceSet.of(self.rig_file)
-
-    @cached_property
-    def _seen(self) -> LastSeen:
-        return LastSeen(self._look, self._devices.unseen())
 
     def start(
         self,
@@ -144,12 +126,8 @@ class CaptureManager:
         """
         resolved = resolve(plan, self.rig_file)
         cost = resolved.cost
-        check_flashing(resolved, armed_by)
-        free = shutil.disk_usage(self.folder).free
-        if cost.bytes + RESERVE > free:
-            need, kept, have = (f"{n / 1e9:.2f} GB" for n in (cost.bytes, RESERVE, free))
-            told = f"the plan writes {need} and leaves {kept} free, {self.folder} has {have}"
-            raise PlanError([told])
+        resolved.check_flashing(armed_by)
+        resolved.check_room(self.folder)
         now = datetime.now(UTC)
         capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
         description = {
@@ -161,8 +139,8 @@ class CaptureManager:
             "request": extra or {},
         }
 
-        def make() -> CaptureRun:
-            folder, rig, devices = self.folder / capture_id, self.rig_file.rig, self._devices
+        def make(devices: DeviceSet) -> CaptureRun:
+            folder, rig = self.folder / capture_id, self.rig_file.rig
             writer = CaptureWriter.create(folder, rig, description, masks=masks, head=head)
             return self._run_of(capture_id, resolved, devices, writer, armed_by)
 
@@ -176,13 +154,13 @@ class CaptureManager:
         cost = plan.cost.model_dump(mode="json")
         told = {"steps": list(plan.steps), "cost": cost, "started": utc_now()}
 
-        def make() -> CaptureRun:
+        def make(devices: DeviceSet) -> CaptureRun:
             time.sleep(max(0.0, self._looked + APART_S - time.monotonic()))
             self._looked = time.monotonic()
             self.catalogue.take(SNAPSHOT)
             shutil.rmtree(folder, ignore_errors=True)
             writer = CaptureWriter.create(folder, self.rig_file.rig, told)
-            return self._run_of(SNAPSHOT, plan, self._devices, writer, None)
+            return self._run_of(SNAPSHOT, plan, devices, writer, None)
 
         self._launch(SNAPSHOT, make)
         return self.get(SNAPSHOT)
@@ -193,12 +171,12 @@ class CaptureManager:
         if "continue" not in possible(done.state, done.outcome):
             raise WrongState("resume", done.state, done.outcome)
 
-        def make() -> CaptureRun:
+        def make(devices: DeviceSet) -> CaptureRun:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
-            check_flashing(plan, armed_by)
-            devices = self._devices
-            return self._run_of(capture_id, plan, devices, CaptureWriter.reopen(path), armed_by)
+            plan.check_flashing(armed_by)
+            writer = CaptureWriter.reopen(path)
+            return self._run_of(capture_id, plan, devices, writer, armed_by)
 
         self._launch(capture_id, make)
 
@@ -210,14 +188,13 @@ class CaptureManager:
         writer: CaptureWriter,
         armed_by: str | None,
     ) -> CaptureRun:
-        consented = bool(armed_by)
-        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=consented)
+        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=bool(armed_by))
         name = f"capture-{capture_id}"
         run.thread = threading.Thread(target=self._run, args=(run,), name=name, daemon=True)
         return run
 
     def _launch(
-        self, capture_id: str, make: Callable[[], CaptureRun], since: int | None = None
+        self, capture_id: str, make: Callable[[DeviceSet], CaptureRun], since: int | None = None
     ) -> None:
         """Begin what `make` prepares in the disk's own time, unless a blackout comes meanwhile."""
         with self._lock:
@@ -226,8 +203,8 @@ class CaptureManager:
             self._preparing = capture_id
         run = None
         try:
-            self.take_stage()  # the bank may have been switched off, and its owner forgotten
-            run = make()
+            self.stage.take()  # the bank may have been switched off, and its owner forgotten
+            run = make(self.stage.devices)  # no folder is made where there are none
             with self._lock:
                 if self._closed or self.blackouts != blackouts:
                     raise Busy("none, but the stage was put dark meanwhile")
@@ -253,7 +230,7 @@ class CaptureManager:
         going = self._preparing if self._running is None else self._running.id
         if going is not None:
             raise Busy(going)
-        self.latch.check()
+        self.stage.latch.check()
 
     @property
     def running(self) -> str | None:
@@ -267,30 +244,11 @@ class CaptureManager:
         run = self._running
         return "idle" if run is None else _not_yet_over(run.status()).state
 
-    def counts(self) -> dict[str, dict[str, float]]:
+    def counts(self) -> dict[str, dict[str, int]]:
         """Since the start: captures by how they ended, frames by what became of them, faults by
         device. Asks neither disk nor device."""
         with self._lock:
-            frames = self._counts["frames"].copy()
-            if self._running is not None:
-                frames.update(self._running.frames())
-            return {**{k: dict(v) for k, v in self._counts.items()}, "frames": dict(frames)}
-
-    def _since_start(self, device: str) -> dict[str, int]:
-        with self._lock:
-            counts = Counter(timeouts=0, faults=0)
-            counts.update(self._by_device[device])
-            if self._running is not None:
-                counts.update(dict(self._running.sequencer.by_device.get(device, {})))
-            return dict(counts)
-
-    def devices_seen(self) -> dict[str, str]:
-        """Each device's state when it was last asked, by kind or a camera's name; asks nobody."""
-        if self.rig_file.devices is None:
-            return {}
-        seen = self._seen.peek()
-        named = {**seen.pop("cameras", {}), **seen}
-        return {k: v["state"] for k, v in named.items() if isinstance(v, dict) and "state" in v}
+            return self._tally.counts(self._running)
 
     def get(self, capture_id: str) -> CaptureStatus:
         """What is known about a capture. Raises `UnknownCapture`."""
@@ -365,16 +323,19 @@ class CaptureManager:
         is how old the answer is. "safety" has the state after the last blackout, and whether it is
         latched. "since_start" counts what a device did to captures since the service started:
         "faults" and "timeouts" ended one; a camera "missed" frames, and was "late" with some."""
-        no_stage = self.rig_file.devices is None
-        seen: dict[str, Any] = {"age_s": None} if no_stage else self._seen.get()
-        cameras = {
-            name: {**entry, "since_start": self._since_start(name)}
-            for name, entry in seen.get("cameras", {}).items()
-        }
-        for kind, entry in seen.items():
-            if isinstance(entry, dict) and "name" in entry:
-                seen[kind] = {**entry, "since_start": self._since_start(entry["name"])}
-        return {**seen, **({"cameras": cameras} if cameras else {}), "safety": self.safety()}
+        seen = self.stage.asked()
+        cameras = seen.pop("cameras", {})
+        with self._lock:
+
+            def counted(name: str, entry: dict[str, Any]) -> dict[str, Any]:
+                return {**entry, "since_start": self._tally.of_device(name, self._running)}
+
+            for kind, entry in seen.items():
+                if isinstance(entry, dict) and "name" in entry:
+                    seen[kind] = counted(entry["name"], entry)
+            if cameras:
+                seen["cameras"] = {name: counted(name, entry) for name, entry in cameras.items()}
+        return {**seen, "safety": self.safety()}
 
     def waits_for(self) -> str | None:
         """What keeps a capture from beginning that nobody stands by; None: nothing does."""
@@ -383,7 +344,7 @@ class CaptureManager:
                 self._check_free()
             except (Busy, Unsafe) as error:
                 return str(error)
-            if self._dark is None or self._dark.blocks:
+            if not self.stage.known_dark:
                 return "nobody knows yet whether the stage is dark"
         return None
 
@@ -391,46 +352,8 @@ class CaptureManager:
         """What is known of the lamps now: {"state", "detail", "latched"}."""
         run = self._running
         if run is None:
-            return self.darkness()
+            return self.stage.darkness()
         return {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
-
-    def _look(self) -> dict[str, Any] | None:
-        """Ask the devices; without a capture, connect for the answer, until one begins."""
-        devices = self._devices
-        with self._talking:
-            if self._running is not None:
-                return devices.status(connect=False)
-            try:
-                return devices.status(connect=True, given_up=lambda: self._running is not None)
-            finally:
-                devices.close()
-
-    def darkness(self) -> dict[str, Any]:
-        """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
-        last, latched = self._dark or Blackout(False, "no blackout yet"), self.latch.latched
-        if latched is not None:
-            return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
-        return {"state": last.state, "detail": last.detail, "latched": None}
-
-    def take_stage(self) -> None:
-        """Have the stage for this service, before anything is commanded. Raises `StageInUse`."""
-        if self._ownership is None:
-            return
-        with self._talking:
-            try:
-                self._ownership.claim(self._devices.lights)
-            finally:
-                self._devices.close()
-
-    def darken(self) -> None:
-        """Put everything off that answers, as the service starts; what does not is latched."""
-        if self.rig_file.devices is None:
-            return
-        with self._talking:
-            try:
-                self._learn(blackout(self._devices, attempts=1))
-            finally:
-                self._devices.close()
 
     def blackout(self) -> dict[str, Any]:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
@@ -438,7 +361,7 @@ class CaptureManager:
         Returns {"safe": bool, "state": "dark" | "unknown, unsafe", "detail": str}; what is unknown
         is to be treated as lit. Waits for no disk, no camera and nobody who asks the devices.
         """
-        devices = self._devices
+        devices = self.stage.devices
         with self._lock:
             self.blackouts += 1
             self._darkening += 1  # nothing may begin until it is over
@@ -449,7 +372,7 @@ class CaptureManager:
                 result = run.sequencer.darken(within_s)
             else:
                 result = blackout(devices, within_s=within_s)
-            self._learn(result)
+            self.stage.learn(result)
             if run is not None and run.thread is not None:
                 run.thread.join(TIDY_S)
         finally:
@@ -471,11 +394,10 @@ class CaptureManager:
             result = run.sequencer.darken(STOP_WITHIN_S)
             run.thread.join(STOP_WITHIN_S)
             if run.thread.is_alive():  # it is stuck somewhere
-                self._learn(result)
+                self.stage.learn(result)
         self._stay_on_exit()
         self.catalogue.close()
-        if self._ownership is not None:
-            self._ownership.release(self._devices.lights)
+        self.stage.release()
         self._root_lock.release()
 
     def _steer(self, capture_id: str, action: str) -> CaptureStatus:
@@ -492,23 +414,21 @@ class CaptureManager:
             self._shoot(run)
 
     def _shoot(self, run: CaptureRun) -> None:
-        # Not while a short connection of `devices` holds a serial port.
-        with self._talking:
-            pass
+        self.stage.wait_for_others()
         try:
             run.sequencer.run()
         finally:
             # `devices` may have opened the links once more after the sequencer closed them.
             try:
-                with self._talking:
-                    run.sequencer.devices.close()
+                with self.stage.alone():
+                    pass
             finally:
                 self._ended(run)
 
     def _ended(self, run: CaptureRun) -> None:
         """Put the run away; its last blackout is what is known of the stage."""
         if run.sequencer.blackout is not None:
-            self._learn(run.sequencer.blackout)
+            self.stage.learn(run.sequencer.blackout)
         status = run.status()
         result = status.outcome or status.state
         kept = run.id != SNAPSHOT
@@ -523,29 +443,12 @@ class CaptureManager:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
         with self._lock:
-            if kept:
-                self._counts["captures"][result] += 1
-                self._counts["frames"].update(run.frames())
-            self._counts["device_faults"].update(run.sequencer.faults)
-            for device, counts in run.sequencer.by_device.items():
-                self._by_device[device].update(counts)
+            self._tally.add(run, result if kept else None)
             if kept or result != "completed":
                 self.ended = status
             self.catalogue.put(status)
             self._running = None
         self.events.publish("capture.over", {"id": run.id, "outcome": result})
-
-    def _learn(self, result: Blackout) -> None:
-        """Keep what a blackout came to, and latch or unlatch."""
-        beams = self._devices.projectors
-        lamps = self._devices.lights.capabilities.reads_back
-        reads_back = lamps and (beams is None or beams.capabilities.reads_back)
-        self._dark = result
-        change = self.latch.learn(result, reads_back)
-        if change is not None:
-            self.audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
-            self.events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
-        self.events.publish("stage.lamps", self.darkness())
 
 
 def _not_yet_over(status: CaptureStatus) -> CaptureStatus:
@@ -553,11 +456,3 @@ def _not_yet_over(status: CaptureStatus) -> CaptureStatus:
     if status.state != "done":
         return status
     return status.model_copy(update={"state": "finishing", "outcome": None})
-
-
-def check_flashing(plan: ResolvedPlan, armed_by: str | None) -> None:
-    """Raise `FlashRefusal` where flashes lack consent, or somebody who answers for them."""
-    cost, consent = plan.cost, plan.plan.consent
-    if cost.flash.needs_consent and not (consent and armed_by):
-        slow = plan.at_rate(SLOW_HZ).cost
-        raise FlashRefusal(cost.flash, consent, seconds=cost.seconds, slow_seconds=slow.seconds)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 from reconstruction import Step
+from reconstruction.files.durable import RESERVE
 from stage_service.config import LONGEST_S, SHORTEST_S, RigFile
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import LeftOutWork, PlanCost, dose_of, folder_bytes
-from stage_service.plan.flash import flash_rate
+from stage_service.plan.flash import SLOW_HZ, FlashRefusal, flash_rate
 from stage_service.plan.limits import check_levels, check_limits
 from stage_service.plan.stepping import LATENCY_S, Run, limited_by, runs, seconds_by_cause
 from stage_service.plan.steps import expand, exposures_of, no_controller, rows_of, swept
@@ -51,6 +54,20 @@ class ResolvedPlan:
     def at_rate(self, hz: float) -> ResolvedPlan:
         """The same steps, at most `hz` a second."""
         return replace(self, plan=self.plan.model_copy(update={"rate_hz": hz}))
+
+    def check_flashing(self, armed_by: str | None) -> None:
+        """Raise `FlashRefusal` where flashes lack consent, or somebody who answers for them."""
+        cost, consent = self.cost, self.plan.consent
+        if cost.flash.needs_consent and not (consent and armed_by):
+            slow = self.at_rate(SLOW_HZ).cost
+            raise FlashRefusal(cost.flash, consent, seconds=cost.seconds, slow_seconds=slow.seconds)
+
+    def check_room(self, folder: Path) -> None:
+        """Raise `PlanError` where its frames do not fit on the disk of `folder`."""
+        needed, free = self.cost.bytes, shutil.disk_usage(folder).free
+        if needed + RESERVE > free:
+            need, kept, have = (f"{n / 1e9:.2f} GB" for n in (needed, RESERVE, free))
+            raise PlanError([f"the plan writes {need} and leaves {kept} free, {folder} has {have}"])
 
     @cached_property
     def cost(self) -> PlanCost:

@@ -31,11 +31,11 @@ def begin(tmp_path: Path) -> Iterator[Begin]:
             manager = CaptureManager(rig_file, tmp_path / root, **more)
             stack.callback(manager.close)
             try:
-                manager.take_stage()
+                manager.stage.take()
             except StageInUse:
                 manager.close()
                 raise
-            manager.darken()
+            manager.stage.darken()
             return manager
 
         yield start
@@ -103,7 +103,7 @@ def test_what_a_killed_service_has_left_is_taken(simulated, begin, tmp_path):
         "from stage_service.acquisition.captures import CaptureManager;"
         "from stage_service.config import load_rig_file;"
         "one = CaptureManager(load_rig_file(*sys.argv[1:3]), Path(sys.argv[3]));"
-        "one.take_stage(); os.kill(os.getpid(), 9)"
+        "one.stage.take(); os.kill(os.getpid(), 9)"
     )
     devices = rig_file.path.with_suffix("") / "devices.toml"
     command = [sys.executable, "-c", code, rig_file.path, devices, tmp_path / "killed"]

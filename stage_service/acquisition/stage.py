@@ -1,0 +1,138 @@
+"""The devices of one stage between captures: who has them, what they said, what is lit."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from stage_service.acquisition.latch import Latch
+from stage_service.acquisition.safety import Blackout, blackout
+from stage_service.config import RigFile
+from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.last_seen import LastSeen
+from stage_service.devices.ownership import Ownership
+from stage_service.records.audit import SERVICE, AuditLog
+from stage_service.records.events import EventLog
+
+
+class Stage:
+    """All who connect to the devices outside a capture go through here, one after the other.
+
+    `lit()` says whether a capture has the devices now. Constructing connects to nothing; raises
+    `StageInUse` while another process on this machine has the stage, `take_over` says that one
+    on another machine has it no more. A blackout that could not be verified is latched (`latch`),
+    which is recorded in `audit`.
+    """
+
+    def __init__(
+        self,
+        rig_file: RigFile,
+        root: Path,
+        audit: AuditLog,
+        events: EventLog,
+        lit: Callable[[], bool],
+        *,
+        take_over: bool = False,
+    ) -> None:
+        self._rig_file, self._audit, self._events, self._lit = rig_file, audit, events, lit
+        self._ownership = None
+        if rig_file.devices is not None:
+            self._ownership = Ownership(rig_file.devices.lights, root, take_over)
+        self.latch = Latch(root / "unsafe.json")
+        self._last: Blackout | None = None
+        self._one = threading.Lock()
+
+    @property
+    def there(self) -> bool:
+        """Whether the rig file names devices at all."""
+        return self._rig_file.devices is not None
+
+    @cached_property
+    def devices(self) -> DeviceSet:
+        """The one set of them; nothing is connected by asking for it."""
+        return DeviceSet.of(self._rig_file)
+
+    @contextmanager
+    def alone(self) -> Iterator[DeviceSet]:
+        """Nobody else connects for a moment (a serial port has room for one); closes after it."""
+        with self._one:
+            try:
+                yield self.devices
+            finally:
+                self.devices.close()
+
+    def wait_for_others(self) -> None:
+        """Return once nobody holds a short connection any more; opens and closes none."""
+        with self._one:
+            pass
+
+    def take(self) -> None:
+        """Have the stage for this service, before anything is commanded. Raises `StageInUse`."""
+        if self._ownership is not None:
+            with self.alone() as devices:
+                self._ownership.claim(devices.lights)
+
+    def release(self) -> None:
+        """Let others have it."""
+        if self._ownership is not None:
+            self._ownership.release(self.devices.lights)
+
+    def darken(self) -> None:
+        """Put everything off that answers, as the service starts; what does not is latched."""
+        if self.there:
+            with self.alone() as devices:
+                self.learn(blackout(devices, attempts=1))
+
+    def learn(self, result: Blackout) -> None:
+        """Keep what a blackout came to, and latch or unlatch."""
+        beams = self.devices.projectors
+        lamps = self.devices.lights.capabilities.reads_back
+        reads_back = lamps and (beams is None or beams.capabilities.reads_back)
+        self._last = result
+        change = self.latch.learn(result, reads_back)
+        if change is not None:
+            self._audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
+            self._events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
+        self._events.publish("stage.lamps", self.darkness())
+
+    def darkness(self) -> dict[str, Any]:
+        """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
+        last, latched = self._last or Blackout(False, "no blackout yet"), self.latch.latched
+        if latched is not None:
+            return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
+        return {"state": last.state, "detail": last.detail, "latched": None}
+
+    @property
+    def known_dark(self) -> bool:
+        """Whether a blackout has come to something that a capture may begin after."""
+        return self._last is not None and not self._last.blocks
+
+    def asked(self) -> dict[str, Any]:
+        """What the devices say, with its age; they are asked anew, but not waited for."""
+        return self._seen.get() if self.there else {"age_s": None}
+
+    def states(self) -> dict[str, str]:
+        """Each device's state when it was last asked, by kind or a camera's name; asks nobody."""
+        if not self.there:
+            return {}
+        seen = self._seen.peek()
+        named = {**seen.pop("cameras", {}), **seen}
+        return {k: v["state"] for k, v in named.items() if isinstance(v, dict) and "state" in v}
+
+    @cached_property
+    def _seen(self) -> LastSeen:
+        return LastSeen(self._look, self.devices.unseen())
+
+    def _look(self) -> dict[str, Any] | None:
+        """Ask the devices; without a capture, connect for the answer, until one begins."""
+        with self._one:
+            if self._lit():
+                return self.devices.status(connect=False)
+            try:
+                return self.devices.status(connect=True, given_up=self._lit)
+            finally:
+                self.devices.close()
