@@ -43,8 +43,19 @@ _SLOWED = 0.8
 _ALTERNATIONS = 2
 """Of global parameters and cells, each with what it knows of the other."""
 _MORE_ROUNDS = 6
+SURE, _DRAWS = 0.975, 2000
+"""How often a result's whole pictures must be better than the start's, and draws of their parts."""
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared prior deviation, beside the image loss."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """What a fit found and did not take, with its error."""
+
+    maps: HairMaps
+    lights: LightDeviations
+    error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +63,11 @@ class Outcome:
     """What a fit found, and how it came to an end.
 
     `ended` is "converged", "all steps taken", or why it ended early; `start_error` and `error` are
-    validation errors of the start and of the result, under fresh random numbers and alike for
-    both. `history` holds (seconds, step, validation error).
+    those of whole pictures of all pairs, at the start and at the result, under fresh random numbers
+    and alike for both (`FitProblem.whole_error`). `sure` is the share of random draws of the parts
+    of the hair in which the best of what was found is better than the start (bootstrap): below
+    `SURE`, maps and lights are the start's, and `refused` is what was found. `history` holds
+    (seconds, step, validation error).
     """
 
     maps: HairMaps
@@ -63,6 +77,8 @@ class Outcome:
     error: float
     steps: int
     history: list[tuple[float, int, float]] = field(default_factory=list)
+    sure: float = 1.0
+    refused: Refused | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +104,10 @@ def run(
     monitor: Monitor | None = None,
     seed: int = 0,
 ) -> Outcome:
-    """Fit from `maps` and `lights` (the calibration where None); never returns a worse guess."""
+    """Fit from `maps` and `lights` (the calibration where None).
+
+    What is found is taken where whole pictures are clearly better with it; see `Outcome`.
+    """
     lights = LightDeviations.calibrated(len(problem.lights)) if lights is None else lights
     options = options or InverseRenderingOptions()
     return _Fit(problem, maps, lights, options, monitor or Monitor(), seed).run()
@@ -302,25 +321,34 @@ class _Fit:
         """The best of the result and of what it came from, by fresh random numbers."""
         effort = self.options.effort
         seed = (self.seed << 16) + (1 << 24)
-        start, found = self._raw(self.start.resized(state.first["sigma_a"].shape[:3])), state.gain
-        guesses = [(state.average, found, ended)]
+        start, gain = self._raw(self.start.resized(state.first["sigma_a"].shape[:3])), state.gain
+        guesses = [(state.average, gain, ended)]
         if state.step:
-            guesses.append((state.first, found, f"{ended}; kept the first maps, which are better"))
-        if (found != self.lights.gain).any():
+            guesses.append((state.first, gain, f"{ended}; kept the first maps, which are better"))
+        if (gain != self.lights.gain).any():
             kept = f"{ended}; kept all but the intensities, which is better"
-            guesses.append((start, found, kept))
-        guesses.append((start, self.lights.gain, f"{ended}; kept the start, which is better"))
-        validation = self._validation
-        errors = [self.problem.error(r, g, validation, effort, seed) for r, g, _ in guesses]
-        best = int(np.argmin(errors)) if min(errors) < errors[-1] else len(errors) - 1
+            guesses.append((start, gain, kept))
+        guesses.append((start, self.lights.gain, ""))
+        used = self.pairs.used
+        parts = [self.problem.whole_error(r, g, used, effort, seed) for r, g, _ in guesses]
+        *errors, begun = (float(x.mean()) for x in parts)
+        best = int(np.argmin(errors))
         raw, gain, how = guesses[best]
-        self.series.append((time.perf_counter() - self.begun, state.step, errors[best]))
-        if best == len(errors) - 1:
-            # in cells, though all alike: the next variant need not tell them apart again
-            maps, lights = self.start.resized(raw["sigma_a"].shape[:3]), self.lights
-        else:
-            maps, lights = decode(raw), self.problem.deviations(raw, gain)
-        return Outcome(maps, lights, how, errors[-1], errors[best], state.step, self.series)
+        maps, lights = decode(raw), self.problem.deviations(raw, gain)
+        error, steps, sure = errors[best], state.step, _sure(parts[-1] - parts[best])
+        if sure >= SURE:
+            return Outcome(maps, lights, how, begun, error, steps, self.series, sure)
+        refused, kept = Refused(maps, lights, error), f"{ended}; kept the start"
+        # in cells, though all alike: the next variant need not tell them apart again
+        maps = self.start.resized(start["sigma_a"].shape[:3])
+        return Outcome(maps, self.lights, kept, begun, begun, steps, self.series, sure, refused)
+
+
+def _sure(parts: Array) -> float:
+    """In which share of draws, with replacement, the sum of `parts (B,)` is positive."""
+    rng, count = np.random.default_rng(0), len(parts)
+    drawn = rng.multinomial(count, np.full(count, 1 / count), _DRAWS)
+    return float((drawn @ parts > 0).mean())
 
 
 def _copied(raw: Raw) -> Raw:

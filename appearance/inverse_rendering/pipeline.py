@@ -11,7 +11,7 @@ from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.found_lights import lights_as_found, save_lights
 from appearance.inverse_rendering.global_parameters import FOUND
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
-from appearance.inverse_rendering.loop import Monitor, Outcome, run
+from appearance.inverse_rendering.loop import SURE, Monitor, Outcome, run
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
 from appearance.inverse_rendering.problem import FitProblem, memory_needed
 from appearance.inverse_rendering.unknowns import LightDeviations
@@ -44,9 +44,12 @@ def fit_maps(
     The head is the model's. Writes `hair_maps.npz`, `lights.json`, `inverse_rendering.png` where
     images are held out (captured, rendered and error maps) and the stage "inverse_rendering" of
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
-    the fit is done. Returns `{"ended", "steps", "error", "start_error", "held_out": {"start" |
+    the fit is done. Where whole training pictures are not clearly better with what was found than
+    with Sun's fit, it goes to the model's folder "rejected", with a warning. Returns `{"ended",
+    "steps", "error", "start_error", "sure", "accepted", "held_out": {"start" |
     "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the latter where images are held
-    out. Raises `CaptureError` or `ModelError` naming what is missing.
+    out; see `Outcome` for errors, of Sun's fit and of what was found. Raises `CaptureError` or
+    `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     training = held_out.training(capture)
@@ -62,27 +65,31 @@ def fit_maps(
         depth = request.max_depth
         if depth is None:
             o = views[0]
-            found = bounce_limit(scene, o.camera, 0.01, pixels=o.pixels, seed=seed)
-            depth = min(found.depth, MOST_DEPTH)
+            limit = bounce_limit(scene, o.camera, 0.01, pixels=o.pixels, seed=seed)
+            depth = min(limit.depth, MOST_DEPTH)
         options = replace(request.fit, effort=replace(request.fit.effort, max_depth=depth))
         problem = FitProblem(mapped, views, fitted.exposure.scale, np.array(fitted.skin))
         start = HairMaps.of(fitted.hair)
         fit = _Fit(problem, model, stage, progress, seed)
         one_colour = fit.run(replace(options, variant="original"), start, None, (0.05, 0.3))
-        outcome = one_colour
+        outcome, taken = one_colour, one_colour.error < one_colour.start_error
         if options.variant != "original":
             outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
+            taken = taken or outcome.error < outcome.start_error
+        found = outcome if taken or outcome.refused is None else outcome.refused
         for name, (least, most) in FOUND.items():
-            if not least <= (value := float(getattr(outcome.maps, name))) <= most:
+            if not least <= (value := float(getattr(found.maps, name))) <= most:
                 stage.warn(f"{name} {value:.2f} is beyond {least} to {most}: too far to be sure of")
-        outcome.maps.save(model, mapped.root_uv)
-        save_lights(model, outcome.lights, problem.lights)
+        found.maps.save(model, mapped.root_uv)
+        save_lights(model, found.lights, problem.lights)
         progress("judging held-out images", 0.92)
         result: dict[str, Any] = {
             "ended": outcome.ended,
             "steps": outcome.steps,
-            "start_error": outcome.start_error,
-            "error": outcome.error,
+            "start_error": one_colour.start_error,
+            "error": found.error,
+            "sure": outcome.sure,
+            "accepted": taken,
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
@@ -91,12 +98,14 @@ def fit_maps(
                 name: Judged(mapped.with_maps(maps).with_skin(fitted.skin), rig)
                 for name, maps, rig in (
                     ("start", start, capture.rig),
-                    ("inverse_rendering", outcome.maps, replace(capture.rig, lights=lights)),
+                    ("inverse_rendering", found.maps, replace(capture.rig, lights=lights)),
                 )
             }
             judging = Sampling(request.judged_spp, depth, seed)
             result["held_out"] = judge(model, frames, fits, fitted.exposure, judging)
             result |= scores_unavailable()
+        if not taken:
+            model.reject("hair_maps.npz", "lights.json")
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     model.write_report(report)
     for variant in ("original", options.variant):
@@ -160,6 +169,13 @@ class _Fit:
         series = Series(f"inverse rendering, {options.variant}", measured)
         series.points = [(seconds, error) for seconds, _, error in outcome.history]
         self.stage.series.append(series)
-        if outcome.steps < options.steps and outcome.ended != "converged":
+        if outcome.refused is not None:
+            self.stage.warn(
+                f"{options.variant}: whole training pictures are not clearly better with what was "
+                f"found, loss {outcome.refused.error:.4f} against {outcome.error:.4f} before "
+                f"(better in {outcome.sure:.0%} of random draws of parts of the hair, {SURE:.1%} "
+                f"are asked for): it is not taken"
+            )
+        elif outcome.steps < options.steps and outcome.ended != "converged":
             self.stage.warn(f"{options.variant}: {outcome.ended}")
         return outcome

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -24,7 +24,7 @@ from appearance.render.olat import render_olat, render_olat_parts
 from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import AnyFloats, Array, Ints
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
 ValidationSet = Sequence[tuple[Patch, Array]]
 """Patches, and the share `(k, P, 3)` of its weight that each value keeps."""
@@ -40,6 +40,8 @@ _ALL = 1e-9
 """A light so dim casts its shadow ray: which do must not depend on the hair."""
 _LEAST_SPP = 16
 """Of indirect light, whose noise is no less for small pictures."""
+_WHOLE_PATHS, _PARTS = 1 << 15, 9
+"""Paths of whole pictures of all views together, and parts of a view's hair, about."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
 
@@ -164,6 +166,28 @@ class FitProblem:
             weight = share * losses.weights(0.5 * (a.level + b.level))
             values.append(losses.squares(one, other, weight, a.valid))
         return float(np.mean(values)) if values else 0.0
+
+    def whole_error(self, raw: Raw, gain: Array, used: Bools, effort: Effort, seed: int) -> Array:
+        """What parts of the hair add to the error of whole pictures, at `gain (L,)`, `(B,)`.
+
+        Their mean is the weighted mean squared difference, noise taken off, of all hair pixels of
+        the pairs `used (V, L)`, alike for all of them. A part is a ninth of a view's pixels under
+        all its lights: other parts have other paths.
+        """
+        views = [k for k in range(len(self.views)) if used[k].any()]
+        paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))
+        effort = replace(effort, spp=int(np.clip(paths, 1, 2 * effort.spp)))
+        parts, counted = [], 0
+        for k in views:
+            whole = np.arange(len(self.views[k].pixels))
+            lights = np.flatnonzero(used[k])
+            patch = Patch(k, lights, np.ones(len(lights)), whole)
+            a, b = self._twice(raw, gain, patch, effort, seed + k)
+            weight = losses.weights(0.5 * (a.level + b.level)) * a.valid[..., None]
+            squares = ((a.rendered - a.captured) * (b.rendered - b.captured) * weight).sum((0, 2))
+            parts += [x.sum() for x in np.array_split(squares, min(_PARTS, len(squares)))]
+            counted += 3 * int(a.valid.sum())
+        return np.array(parts) * (len(parts) / max(counted, 1))
 
     def validation(
         self, raw: Raw, gain: Array, pairs: Sequence[Batch], effort: Effort, seed: int

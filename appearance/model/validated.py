@@ -31,11 +31,12 @@ def fit_validated(
     """`fit_maps` under some lights, and Sun's fit kept where others say that it is better.
 
     Of the lights that are not `held_out`, `request.lights` are fitted and others judge,
-    `request.validation_lights` or a quarter of them all: directions far apart. Where the mean PSNR
-    of the validation frames is not higher than that of Sun's fit, maps and lights go to the model's
-    folder "rejected" with a warning in the report: whatever is rendered later is Sun's fit. Returns
-    what `fit_maps` does, with `{"validation": {"start" | "inverse_rendering": {"psnr", "ssim",
-    "relative_error"}}}` instead of "held_out", and "rendered": "inverse_rendering" or "sun_fit".
+    `request.validation_lights` or a quarter of them all: directions far apart. Where whole training
+    pictures are not clearly better, or the mean PSNR of the validation frames is not higher than
+    that of Sun's fit, maps and lights go to the model's folder "rejected" with a warning in the
+    report: whatever is rendered later is Sun's fit. Returns what `fit_maps` does, with
+    `{"validation": {"start" | "inverse_rendering": {"psnr", "ssim", "relative_error"}}}` instead of
+    "held_out", and "rendered": "inverse_rendering" or "sun_fit".
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     training = held_out.training(capture)
@@ -58,7 +59,9 @@ def fit_validated(
     stage = report["inverse_rendering"]
     stage.figures.pop("held_out", None)
     validation, rendered = result.pop("held_out", {}), "inverse_rendering"
-    if validation:
+    if not result["accepted"]:
+        rendered = "sun_fit"
+    elif validation:
         sun, found = (validation[name]["psnr"] for name in ("start", "inverse_rendering"))
         if found <= sun:
             rendered = "sun_fit"

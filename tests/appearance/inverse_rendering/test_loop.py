@@ -9,7 +9,9 @@ import pytest
 
 from appearance import HairAppearance, InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering import loop
 from appearance.inverse_rendering.loop import Monitor, run
+from appearance.inverse_rendering.unknowns import LightDeviations
 from reconstruction import BadOptions, parse_options
 
 START = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.35))
@@ -95,6 +97,28 @@ def test_a_fit_from_the_truth_does_not_leave_it_for_noise(plain, tufted, origina
     few = replace(tufted.quick, pixels=20, spp=1, gradient_spp=1)
     found = run(plain, HairMaps.of(tufted.truth), options=replace(original, steps=10, effort=few))
     assert far(found.maps, tufted.truth) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("begins", "offered", "taken"),
+    [("true", "light", False), ("light", "true", True), ("true", "true", False)],
+)
+def test_what_whole_pictures_speak_against_is_not_taken(
+    plain, tufted, original, monkeypatch, begins, offered, taken
+):
+    """Whatever the fit's own pixels say."""
+    hair = {
+        "true": HairMaps.of(tufted.truth),
+        "light": HairMaps.of(replace(tufted.truth, sigma_a=(0.03, 0.06, 0.15))),
+    }
+
+    def solve(problem, raw, gain, *args):
+        return problem.encode(hair[offered], LightDeviations.calibrated(len(gain))), gain
+
+    monkeypatch.setattr(loop, "solve_global_parameters", solve)
+    found = run(plain, hair[begins], options=replace(original, gauss_newton=True))
+    np.testing.assert_allclose(found.maps.sigma_a[0, 0, 0], tufted.truth.sigma_a, rtol=1e-6)
+    assert (found.refused is None) == taken
 
 
 @pytest.mark.parametrize(

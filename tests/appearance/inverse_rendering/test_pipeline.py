@@ -9,9 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from appearance import Exposure, HairAppearance, HeldOut, InverseRenderingRequest, fit_maps
+from appearance import (
+    Exposure,
+    FittedModel,
+    HairAppearance,
+    HeldOut,
+    InverseRenderingRequest,
+    fit_maps,
+)
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering import pipeline
+from appearance.inverse_rendering import loop, pipeline
 from appearance.inverse_rendering.loop import Outcome
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -128,7 +135,7 @@ def test_held_out_cameras_are_judged_under_the_lights_as_found(made, tufted, tmp
     def found(problem, *args, **more):
         lights = LightDeviations.calibrated(len(problem.lights))
         twice = replace(lights, gain=np.full(len(problem.lights), 2.0))
-        return Outcome(truth, twice, "converged", 0.0, 0.0, 1, [])
+        return Outcome(truth, twice, "converged", 1.0, 0.5, 1, [])
 
     monkeypatch.setattr(pipeline, "run", found)
     request = replace(REQUEST, judged_spp=256)
@@ -139,6 +146,30 @@ def test_held_out_cameras_are_judged_under_the_lights_as_found(made, tufted, tmp
     assert judged["start"]["relative_error"] < 0.8
 
 
+def test_a_fit_that_is_not_taken_leaves_suns_to_be_rendered(made, tmp_path, monkeypatch):
+    """White hair, offered for the brown of the frames, where Sun's fit is grey."""
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    for name in ("hair_maps.npz", "lights.json"):
+        other.remove(name)
+    white = HairMaps.of(HairAppearance((0.001, 0.001, 0.001), 0.4, 0.3))
+
+    def solve(problem, raw, gain, *args):
+        return problem.encode(white, LightDeviations.calibrated(len(gain))), gain
+
+    monkeypatch.setattr(loop, "solve_global_parameters", solve)
+    request = replace(REQUEST, fit=replace(REQUEST.fit, variant="original"))
+    found = fit_maps(capture, other, held_out=HELD_OUT, request=request)
+    assert not found["accepted"]
+    assert found["error"] > found["start_error"]
+    fits = FittedModel.alternatives(other, capture)
+    assert FittedModel.load(other, capture).maps.sigma_a.max() == pytest.approx(0.2)
+    assert fits["inverse_rendering"].maps.sigma_a.max() == pytest.approx(0.001, rel=1e-3)
+    (warning,) = other.report()["inverse_rendering"].warnings
+    assert warning.startswith("original: whole training pictures are not clearly better")
+
+
 def test_a_roughness_beyond_what_is_found_again_is_warned_of(made, tufted, tmp_path, monkeypatch):
     capture, model = made
     other = Model(tmp_path / "model")
@@ -147,7 +178,7 @@ def test_a_roughness_beyond_what_is_found_again_is_warned_of(made, tufted, tmp_p
 
     def found(problem, *args, **more):
         return Outcome(
-            far, LightDeviations.calibrated(len(problem.lights)), "converged", 0.0, 0.0, 1, []
+            far, LightDeviations.calibrated(len(problem.lights)), "converged", 1.0, 0.5, 1, []
         )
 
     monkeypatch.setattr(pipeline, "run", found)
