@@ -64,7 +64,7 @@ class Outcome:
 
     `ended` is "converged", "all steps taken", or why it ended early; `start_error` and `error` are
     those of whole pictures of all pairs, at the start and at the result, under fresh random numbers
-    and alike for both (`FitProblem.whole_error`). `sure` is the share of random draws of the parts
+    and alike for both (`FitProblem.whole_errors`). `sure` is the share of random draws of the parts
     of the hair in which the best of what was found is better than the start (bootstrap): below
     `SURE`, maps and lights are the start's, and `refused` is what was found. `history` holds
     (seconds, step, validation error).
@@ -329,8 +329,8 @@ class _Fit:
             kept = f"{ended}; kept all but the intensities, which is better"
             guesses.append((start, gain, kept))
         guesses.append((start, self.lights.gain, ""))
-        used = self.pairs.used
-        parts = [self.problem.whole_error(r, g, used, effort, seed) for r, g, _ in guesses]
+        pairs = [(raw, gain) for raw, gain, _ in guesses]
+        parts = self.problem.whole_errors(pairs, self.pairs.used, effort, seed)
         *errors, begun = (float(x.mean()) for x in parts)
         best = int(np.argmin(errors))
         raw, gain, how = guesses[best]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -40,7 +40,7 @@ _ALL = 1e-9
 """A light so dim casts its shadow ray: which do must not depend on the hair."""
 _LEAST_SPP = 16
 """Of indirect light, whose noise is no less for small pictures."""
-_WHOLE_PATHS, _PARTS = 1 << 15, 9
+_WHOLE_PATHS, _PARTS = 1 << 17, 9
 """Paths of whole pictures of all views together, and parts of a view's hair, about."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
@@ -167,27 +167,40 @@ class FitProblem:
             values.append(losses.squares(one, other, weight, a.valid))
         return float(np.mean(values)) if values else 0.0
 
-    def whole_error(self, raw: Raw, gain: Array, used: Bools, effort: Effort, seed: int) -> Array:
-        """What parts of the hair add to the error of whole pictures, at `gain (L,)`, `(B,)`.
+    def whole_errors(
+        self, guesses: Sequence[tuple[Raw, Array]], used: Bools, effort: Effort, seed: int
+    ) -> Array:
+        """What parts of the hair add to the error of whole pictures, of each guess `(G, B)`.
 
-        Their mean is the weighted mean squared difference, noise taken off, of all hair pixels of
-        the pairs `used (V, L)`, alike for all of them. A part is a ninth of a view's pixels under
-        all its lights: other parts have other paths.
+        Their mean over B is the weighted mean squared difference, noise taken off, of all hair
+        pixels of the pairs `used (V, L)`. All guesses have the same weights, at the middle of what
+        was captured and what they render. A part is a ninth of a view's pixels under all its
+        lights: other parts have other paths.
         """
         views = [k for k in range(len(self.views)) if used[k].any()]
         paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))
-        effort = replace(effort, spp=int(np.clip(paths, 1, 2 * effort.spp)))
+        spent = {"spp": int(np.clip(paths, 1, 2 * effort.spp)), "max_depth": effort.max_depth}
         parts, counted = [], 0
         for k in views:
-            whole = np.arange(len(self.views[k].pixels))
-            lights = np.flatnonzero(used[k])
-            patch = Patch(k, lights, np.ones(len(lights)), whole)
-            a, b = self._twice(raw, gain, patch, effort, seed + k)
-            weight = losses.weights(0.5 * (a.level + b.level)) * a.valid[..., None]
-            squares = ((a.rendered - a.captured) * (b.rendered - b.captured) * weight).sum((0, 2))
-            parts += [x.sum() for x in np.array_split(squares, min(_PARTS, len(squares)))]
-            counted += 3 * int(a.valid.sum())
-        return np.array(parts) * (len(parts) / max(counted, 1))
+            o, lights = self.views[k], np.flatnonzero(used[k])
+            patch = Patch(k, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
+            halves = np.zeros((len(guesses), 2, len(lights), len(o.pixels), 3))
+            for g, (raw, gain) in enumerate(guesses):
+                scene, camera, packed, pixels = self._seen(raw, gain, patch)
+                for h in (0, 1):
+                    first = seed + k + (h << 20)
+                    halves[g, h] = render_olat(
+                        scene, camera, packed, seed=first, pixels=pixels, **spent
+                    )
+            halves *= self.scale
+            rendered = losses.level(halves.mean(axis=(0, 1)))
+            weight = losses.weights(0.5 * (self._level[k][lights] + rendered))
+            product = (halves - o.radiance[lights] * self.scale).prod(axis=1)
+            squares = (product * weight * o.valid[lights][..., None]).sum(axis=(1, 3))
+            slices = np.array_split(squares, min(_PARTS, len(o.pixels)), axis=1)
+            parts += [x.sum(axis=1) for x in slices]
+            counted += 3 * int(o.valid[lights].sum())
+        return np.array(parts).T * (len(parts) / max(counted, 1))
 
     def validation(
         self, raw: Raw, gain: Array, pairs: Sequence[Batch], effort: Effort, seed: int
