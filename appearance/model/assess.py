@@ -18,12 +18,14 @@ from appearance.metrics.scores import (
     scores_unavailable,
     ssim,
 )
+from appearance.model.animation import turning_light, write_animation
 from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
-from appearance.model.relight import relight
+from appearance.model.relight import environment_map, relight
 from appearance.observations import HeldOut, Observed, observe_hair
+from appearance.render.mixed import Environment
 from appearance.render.smoothed import olat_smoothed
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
@@ -43,6 +45,8 @@ INTERPOLATED = {
 SHOWN = {"held_out_lights": 4, "held_out_camera": 2}
 """Rows of the comparison by group."""
 MAX_DEPTH = 16
+TURNING_SIZE, TURNING_SPP = 256, 6
+"""Of `relit.webp`."""
 BASELINE_PIXELS, BASELINE_LIGHTS = 100, 48  # of each camera: what mean colour and albedo come from
 
 
@@ -90,7 +94,8 @@ def assess(
     are given (`appearance.metrics.lpips`), and a reason beside the groups where not.
 
     Writes `comparison.png` where there is something to compare (lights: `front_lights`),
-    `relit.png` and `relit.exr` (see `relight`) and the stage "images" of the report, which warns of
+    `relit.png` and `relit.exr` (see `relight`), `relit.webp` where `options.turning_frames` asks
+    for it (see `turning_light`), and the stage "images" of the report, which warns of
     every baseline that is not beaten.
     """
     options = options or AssessOptions()
@@ -107,6 +112,14 @@ def assess(
         progress("relighting", 0.8)
         size, spp = options.relit_size, options.relit_spp
         relight(fitted, model, environment, size=size, spp=spp, seed=seed)
+        if options.turning_frames:
+            progress("relighting under light that turns", 0.9)
+            room = Environment(environment_map(environment))
+            sampling = Sampling(TURNING_SPP, MAX_DEPTH, seed)
+            turning = turning_light(fitted, room, options.turning_frames, TURNING_SIZE, sampling)
+            write_animation(model.file("relit.webp"), turning)
+        else:
+            model.remove("relit.webp")
     model.write_report(report)
     progress("images compared", 1.0)
     return {**result, **scores_unavailable()}

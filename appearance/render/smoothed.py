@@ -98,13 +98,13 @@ def environment_smoothed(
     )
     one, other = (direct_environment(scene, camera, envmap, 6 * spp, 2 * seed + k) for k in (1, 2))
     sigma = max(SIGMA, camera.width / 160)
-    factor = _mean_factor(scene, camera, envmap)
+    factor = mean_factor(scene, camera, envmap)
     # a field has the detail of single strands: what is smooth is the light without it
     indirect = factor * smoothed(((whole - first) / factor)[None], share, sigma)[0]
     return without_rare(one, other, share, sigma) + indirect
 
 
-def _mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
+def mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
     """About what the scene's field multiplies an environment's light by `(H, W, 3)`."""
     out = np.ones((camera.height, camera.width, 3), np.float32)
     index = covered_pixels(scene, camera)

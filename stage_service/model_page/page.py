@@ -38,6 +38,7 @@ HERO = ("relit.png", "render.png", "comparison.png")
 """The picture at the top: the first that is there."""
 SHOWN = {
     "relit.png": "The result under an environment map that no camera saw.",
+    "relit.webp": "The same while the environment turns round.",
     "comparison.png": "Frames that no fit has seen: captured, rendered, and the baselines.",
     "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
     "render.png": "What hairstage render drew last.",

@@ -70,9 +70,14 @@ def add(commands: Commands) -> None:
         "--turntable", action="store_true", help="an animation: the model and the room turn"
     )
     moves.add_argument(
+        "--turning-light",
+        action="store_true",
+        help="an animation: the environment turns, the model stays",
+    )
+    moves.add_argument(
         "--sway", type=float, metavar="DEGREES", help="an animation: the hair swings, at the tips"
     )
-    render.add_argument("--frames", type=int, default=24, help="of a turntable or a sway")
+    render.add_argument("--frames", type=int, default=24, help="of an animation")
     render.add_argument("--size", type=int, help="pixels across, where no --camera says")
     render.add_argument(
         "--spp", type=int, help="samples a pixel; default: 64, in an animation 6, smoothed"
@@ -85,8 +90,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, where
     there are any), in the pose of its capture or of other --strands. With a field, its hair is what
-    the capture's frames say of it. A turntable, hair that sways, or strands of several poses become
-    a WebP animation, their indirect light smoothed.
+    the capture's frames say of it. A turntable, light that turns, hair that sways, or strands of
+    several poses become a WebP animation, their indirect light smoothed.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
@@ -115,7 +120,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if capture is None and args.field == "interpolation":
         raise ValueError("--field interpolation needs the frames: say whose with --capture")
     poses: list[Strands] = [] if args.strands is None else read_poses(args.strands)
-    moves = args.turntable or args.sway is not None or len(poses) > 1
+    moves = args.turntable or args.turning_light or args.sway is not None or len(poses) > 1
     _check_animation(args, len(poses), moves)
     progress("building the scene", 0.0)
     model = Model(args.model)
@@ -163,10 +168,15 @@ def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
         return
     if args.field == "interpolation":
         raise ValueError("an animation shows the model or its field, not --field interpolation")
-    if poses and (args.turntable or args.sway is not None):
-        raise ValueError("--strands of other poses goes without --turntable and --sway")
-    if args.turntable and (args.light or args.camera):
-        raise ValueError("--turntable goes round under a map: without --light and --camera")
+    turns = args.turntable or args.turning_light
+    if poses and (turns or args.sway is not None):
+        raise ValueError(
+            "--strands of other poses goes without --turntable, --turning-light and --sway"
+        )
+    if turns and (args.light or args.camera):
+        raise ValueError(
+            "--turntable and --turning-light are under a map: without --light and --camera"
+        )
     if not 2 <= args.frames <= 1000:
         raise ValueError(f"--frames {args.frames}: expected 2 to 1000")
 
@@ -180,11 +190,18 @@ def _animate(
     progress: Progress,
 ) -> dict[str, Any]:
     """Write the animation that was asked for; what there is to tell of it."""
-    from appearance.model.animation import moving, sway, turntable, write_animation
+    from appearance.model.animation import (
+        moving,
+        sway,
+        turning_light,
+        turntable,
+        write_animation,
+    )
 
     camera, lights, maps, sampling = lit
-    if args.turntable:
-        frames = turntable(fitted, maps[0], args.frames, camera.width, sampling, progress)
+    if args.turntable or args.turning_light:
+        turning = turntable if args.turntable else turning_light
+        frames = turning(fitted, maps[0], args.frames, camera.width, sampling, progress)
     else:
         shown = poses or sway(fitted.strands, args.frames, args.sway)
         frames = moving(fitted, shown, camera, (lights, maps), sampling, progress)

@@ -61,6 +61,7 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
         + ", ".join(f"{k} {v:.0f} s" for k, v in results["stages"].items()),
         f"everything is in {out.resolve()}: results.json, capture/, model/, truth/, logs/",
         f"begin with {out.resolve() / 'model' / 'index.html'}",
+        f"the hair under light that turns: {out.resolve() / 'model' / 'relit.webp'}",
         f"turn the hair: hairstage view {out / 'model'} --capture {out / 'capture'} "
         f"--truth {out / 'truth' / 'strands.npz'}",
     )

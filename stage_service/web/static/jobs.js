@@ -125,7 +125,7 @@ function jobOf(view, id) {
     const link = (path) => `/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
     const has = (path) => list.some((f) => f.path === path);
     page.replaceChildren(...(has("index.html") ? [h("h2", "Report"), h("p", h("a", { href: link("index.html"), target: "_blank", rel: "noopener" }, "the report on a page of its own"))] : []),
-      ...["relit.png", "comparison.png"].filter(has).map((f) => h("figure", h("img", { src: link(f), alt: f, loading: "lazy" }), h("figcaption", f))));
+      ...["relit.webp", "relit.png", "comparison.png"].filter(has).map((f) => h("figure", h("img", { src: link(f), alt: f, loading: "lazy" }), h("figcaption", f))));
     timed.hidden = stages.childElementCount === 0;
     files.hidden = list.length === 0;
     files.replaceChildren(h("details", h("summary", `Files (${list.length})`), h("table", h("tbody", list.map((f) => h("tr", h("td", h("a", { href: link(f.path), download: "" }, f.path)), h("td.n", bytes(f.bytes))))))));

@@ -6,10 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from appearance.model.animation import sway, write_animation
+from appearance import Environment, Exposure, FittedModel, HairAppearance, HeldOut, Sampling
+from appearance.bsdf.maps import HairMaps
+from appearance.model.animation import CELLS, cell_means, sway, turning_light, write_animation
 from appearance.model.relight import three_quarter_view
+from appearance.render.environment_maps import studio
+from appearance.render.smoothed import environment_smoothed
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import StrandFileError
 from reconstruction.files.strands import read_poses
+
+HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
+SKIN = 0.5, 0.35, 0.28
 
 
 def test_a_sway_keeps_roots_and_lengths_and_turns_back(small):
@@ -74,3 +82,41 @@ def test_the_camera_goes_round_at_one_distance(small):
     np.testing.assert_allclose(at[0][:2], -at[2][:2], atol=1e-6)
     assert abs(at[0][:2] @ at[1][:2]) < 1e-6
     assert at[0][0] * at[1][1] - at[0][1] * at[1][0] > 0, "counter-clockwise from above"
+
+
+def test_a_turning_map_keeps_its_light_and_turns_counter_clockwise():
+    rng = np.random.default_rng(0)
+    envmap = rng.uniform(size=(33, 50, 3))
+    solid = -np.diff(np.cos(np.linspace(0, np.pi, CELLS[0] + 1)))
+    height = np.repeat(solid, CELLS[1])[:, None]
+    z = -np.diff(np.cos(np.linspace(0, np.pi, 34)))[:, None, None]
+    mean = (envmap * z).sum((0, 1)) / (50 * z.sum())
+    for turned in (0.0, 0.27, 1.4):
+        cells = cell_means(envmap, turned)
+        np.testing.assert_allclose((cells * height).sum(0) / height.sum(), mean, rtol=1e-6)
+    spot = np.zeros((40, 96, 3))
+    spot[20, 48] = 1.0  # along +x, and a quarter of a turn on along +y: columns go clockwise
+    at = [cell_means(spot, t).sum(1).argmax() % CELLS[1] for t in (0.0, 0.25)]
+    assert at == [12, 6]
+
+
+def test_a_ball_under_turning_light_is_as_an_environment_renders_it(small):
+    model = FittedModel(
+        strands=small.tuft(60),
+        head=small.ball(),
+        appearance=FittedAppearance(
+            HAIR, (0.4, 0.3, 0.2), SKIN, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()
+        ),
+        maps=HairMaps.of(HAIR),
+    )
+    room = Environment(studio(40))
+    frames = turning_light(model, room, 4, 16, Sampling(8, 4))
+    for k, frame in enumerate(frames):
+        turned = np.roll(room.envmap, -20 * k, axis=1)
+        camera = three_quarter_view(model.strands, 16)
+        true = environment_smoothed(model.scene(), camera, turned, Sampling(16, 4))
+        assert np.abs(frame - true).mean() < 0.1 * true.mean()
+    means = frames.mean(axis=(1, 2, 3))
+    assert means.max() > 1.2 * means.min(), "the room is not alike from all sides"
+    with pytest.raises(ValueError, match="needs a frame"):
+        turning_light(model, room, 0, 16, Sampling(1))
