@@ -32,7 +32,7 @@ VARIANTS: dict[Variant, tuple[tuple[str, ...], bool]] = {
     "correctives": ((*COLOUR, "rotation"), True),
     "lights": ((*COLOUR, "rotation", "position", "turn", "profile", "gain"), True),
 }
-"""The ablations: what is free, and whether colour and correctives vary over the volume."""
+"""The ablations: what may be free, and whether colour and correctives vary over the volume."""
 PRIORS = {"position": 0.005, "turn": np.radians(2.0), "profile": 0.03, "rotation": 0.2}
 """Standard deviations about the calibration, and of correctives in radians."""
 _LATEST = 0.04
@@ -126,6 +126,7 @@ class _Fit:
         self.problem, self.options, self.monitor, self.seed = problem, options, monitor, seed
         self.start, self.lights = maps, lights
         free, self.spatial = VARIANTS[options.variant]
+        free = tuple(name for name in free if options.free_index or name != "eta")
         self.solves = [n for n in free if n in WIDE] if options.gauss_newton else []
         self.turns = options.gauss_newton and "rotation" in free
         kept = {"gain", "rotation"} if self.turns else {"gain"}

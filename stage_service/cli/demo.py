@@ -31,16 +31,6 @@ MARK = ".hairstage-demo"
 EVERY_NTH_LIGHT = 28
 """One of so many lights is held out: a dozen of 331. Of few lights, four are."""
 
-INVERSE_RENDERING = {
-    "lights": 12,
-    "validation_lights": 4,
-    "hair_pixels": 600,
-    "judged_spp": 24,
-    "max_depth": 8,
-    "fit": {"variant": "original", "effort": {"pixels": 120, "spp": 32}},
-}
-"""What a minute buys: the numbers that all hair shares; variant "spatial" takes several."""
-
 TURNING_FRAMES = 36
 """Of the animation that the demo ends with: under a minute of one core, however many they are."""
 
@@ -149,7 +139,6 @@ def _capture(
         "environment": args.environment,
         "seed": args.seed,
         "truth": str(truth),
-        "inverse_rendering": INVERSE_RENDERING,
         "assess": {"turning_frames": TURNING_FRAMES},
     }
     body: dict[str, Any] = {"plan": {}, "pipeline": {"name": "full", "options": options}}

@@ -43,10 +43,11 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Write MODEL/appearance.json: roughness and colour of hair and skin (method sun).
     inverse_rendering goes on from there, with a sun fit first where there is none that held out the
-    same: hair that varies over the scalp and along strands, and the lights as they are found, in
-    MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With --field, MODEL/
-    field.npz holds what the hair reflects beyond that, on top of a fit that is there already where
-    it held out the same. With held-out cameras or lights, judge the model on them.
+    same: roughness and colour of all hair by rendering or, with --options '{"fit": {"variant":
+    "lights"}}', of hair that varies over the scalp and along strands, and the lights as they are
+    found, in MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With --field,
+    MODEL/field.npz holds what the hair reflects beyond that, on top of a fit that is there already
+    where it held out the same. With held-out cameras or lights, judge the model on them.
     """
     from appearance import HeldOut
     from appearance.sun_fit.fitted_appearance import FittedAppearance

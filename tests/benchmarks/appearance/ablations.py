@@ -39,6 +39,8 @@ from reconstruction import Progress, read_strands, silent
 from reconstruction.arrays import Array
 
 OPTIONS = InverseRenderingOptions(
+    variant="lights",
+    free_index=True,
     steps=30,
     check_every=30,
     shape=(6, 24, 24),
@@ -83,7 +85,7 @@ class Ladders:
     capture: Path | None = None
 
 
-PLAIN = Effort(spp=16, gradient_spp=16)
+PLAIN = Effort(pixels=600, spp=16, gradient_spp=16)
 """Paths of the plain version: as many for the picture as for its gradient."""
 
 
@@ -395,6 +397,8 @@ def _off(found: dict[str, Any]) -> str:
 
 
 QUICK = InverseRenderingOptions(
+    variant="lights",
+    free_index=True,
     steps=2,
     check_every=2,
     shape=(2, 2, 2),

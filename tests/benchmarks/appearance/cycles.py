@@ -36,6 +36,7 @@ HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = InverseRenderingOptions(
     variant="original",
+    free_index=True,
     validation_views=6,
     effort=Effort(pixels=300, spp=384, gradient_spp=48, max_depth=12),
 )

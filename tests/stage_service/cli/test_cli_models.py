@@ -111,7 +111,7 @@ def test_a_render_of_fitted_maps_is_nearer_to_a_frame_that_no_fit_has_seen(made,
     found = fitted
     assert found["appearance"] == made.model.json("appearance.json")
     assert found["error"] < found["start_error"]
-    assert len(made.model.json("lights.json")) == 18  # of 23, a quarter of which judge
+    assert len(made.model.json("lights.json")) == 12  # of 23, and four judge
     mapped = error_of_render(made, capsys)
     with_maps = made.model.arrays("hair_maps.npz")
     made.model.remove("hair_maps.npz")
