@@ -70,7 +70,8 @@ def solve_global_parameters(
     has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Roughness is found
     within `FOUND`; a narrower beta_n ends at up to 0.3. Hair that begins too bright in all channels
     is darkened before anything else moves: a wide lobe would explain its picture as well. (Black
-    hair: beta_m within 10 %, its index off by up to 0.15 from a grey start.)
+    hair from a grey start: beta_m within 10 %, its index off by up to 0.15; with the index held,
+    beta_m 0.31 to 0.40 for 0.25.)
     Takes the time of five to sixteen pictures of twice `effort.spp` paths a pixel. Where a picture
     is not finite, it gives back what it got.
     """

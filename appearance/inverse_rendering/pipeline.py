@@ -28,6 +28,8 @@ from reconstruction.report.report import Series, free_memory
 JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
+BLACKER = 3.0
+"""Times the start's absorption, beyond which black hair ends too rough where the index is held."""
 
 
 def fit_maps(
@@ -46,9 +48,10 @@ def fit_maps(
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
     the fit is done. Where whole training pictures are not clearly better with what was found than
     with Sun's fit, it goes to the model's folder "rejected", with a warning. Returns `{"ended",
-    "steps", "error", "start_error", "sure", "accepted", "held_out": {"start" |
+    "steps", "error", "start_error", "sure", "accepted", "doubts", "held_out": {"start" |
     "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the latter where images are held
-    out; see `Outcome` for errors, of Sun's fit and of what was found. Raises `CaptureError` or
+    out; see `Outcome` for errors, of Sun's fit and of what was found; "doubts" are warnings for
+    whoever renders what was found. Raises `CaptureError` or
     `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
@@ -77,9 +80,6 @@ def fit_maps(
             outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
             taken = taken or outcome.error < outcome.start_error
         found = outcome if taken or outcome.refused is None else outcome.refused
-        for name, (least, most) in FOUND.items():
-            if not least <= (value := float(getattr(found.maps, name))) <= most:
-                stage.warn(f"{name} {value:.2f} is beyond {least} to {most}: too far to be sure of")
         found.maps.save(model, mapped.root_uv)
         save_lights(model, found.lights, problem.lights)
         progress("judging held-out images", 0.92)
@@ -90,6 +90,7 @@ def fit_maps(
             "error": found.error,
             "sure": outcome.sure,
             "accepted": taken,
+            "doubts": _doubts(start, found.maps),
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
@@ -112,6 +113,22 @@ def fit_maps(
         model.checkpoint(variant).unlink(missing_ok=True)
     progress("inverse rendering done", 1.0)
     return result
+
+
+def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
+    """What a user has to know of fitted roughness before believing it."""
+    doubts = [
+        f"{name} {value:.2f} is beyond {least} to {most}: too far to be sure of"
+        for name, (least, most) in FOUND.items()
+        if not least <= (value := float(getattr(found, name))) <= most
+    ]
+    before, after = (float(x.sigma_a.mean()) for x in (start, found))
+    if after > max(1.0, BLACKER * before):
+        doubts.append(
+            f"beta_m {found.beta_m:.2f} may be too rough: the hair is black, and Sun's fit is "
+            f"brighter, sigma_a {before:.2g} against {after:.2g}"
+        )
+    return doubts
 
 
 def _check_memory(

@@ -73,6 +73,9 @@ def fit_validated(
             )
     else:
         stage.warn("too few lights to leave some out: nothing says whether the maps are better")
+    doubts = result.pop("doubts")
+    if rendered == "inverse_rendering":
+        stage.warnings += doubts
     result |= {"validation": validation, "rendered": rendered, "lights": len(used) - judges}
     stage.figures |= result
     model.write_report(report)
