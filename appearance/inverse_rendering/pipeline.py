@@ -28,6 +28,8 @@ from reconstruction.report.report import Series, free_memory
 JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
+FROM_SUN = 1.15
+"""Times Sun's roughness, or one over it, that the fit to pictures may end at without a doubt."""
 BLACKER = 3.0
 """Times the start's absorption, beyond which black hair ends too rough where the index is held."""
 
@@ -127,6 +129,11 @@ def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
         doubts.append(
             f"beta_m {found.beta_m:.2f} may be too rough: the hair is black, and Sun's fit is "
             f"brighter, sigma_a {before:.2g} against {after:.2g}"
+        )
+    if not doubts and abs(np.log(found.beta_m / start.beta_m)) > np.log(FROM_SUN):
+        doubts.append(
+            f"beta_m {found.beta_m:.2f} is not what the highlights say, {start.beta_m:.2f} by "
+            "Sun's fit: strands that lie beside their true places look rougher in pictures"
         )
     return doubts
 

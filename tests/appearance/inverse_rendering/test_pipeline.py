@@ -173,10 +173,11 @@ def test_a_fit_that_is_not_taken_leaves_suns_to_be_rendered(made, tmp_path, monk
     [
         (HairAppearance((0.06, 0.12, 0.3), 0.93, 0.35), "beta_m 0.93 is beyond 0.05 to 0.8"),
         (HairAppearance((1.7, 1.7, 1.7), 0.36, 0.3), "beta_m 0.36 may be too rough"),
+        (HairAppearance((0.2, 0.2, 0.2), 0.6, 0.3), "beta_m 0.60 is not what the highlights say"),
     ],
 )
 def test_a_roughness_that_is_not_found_again_is_doubted(made, tmp_path, monkeypatch, hair, doubt):
-    """Beyond what is; and that of black hair from the grey start of `made`."""
+    """Beyond what is; that of black hair from the grey start of `made`; far from that start."""
     capture, model = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)
