@@ -218,10 +218,12 @@ def _panels() -> list[Light]:
 def write_animation(path: Path, frames: Floats, seconds: float = SECONDS) -> None:
     """Write radiance `(T, H, W, 3)` as an endless WebP of `seconds`, all frames exposed alike.
 
-    Raises `ValueError` where `path` is no `.webp`.
+    Raises `ValueError` where `path` is no `.webp`, or radiance is not finite.
     """
     if path.suffix != ".webp":
         raise ValueError(f"{path}: an animation is a .webp file")
+    if not np.isfinite(frames).all():
+        raise ValueError(f"{path}: an animation wants finite radiance, and this has NaN or inf")
     lit = frames[frames.sum(axis=-1) > 0]
     exposed = Exposure.of([lit])(frames) if len(lit) else frames
     values = np.rint(np.clip(exposed, 0, 1) * 255).astype(np.uint8)

@@ -73,6 +73,9 @@ def test_an_animation_is_read_back_by_another_reader(tmp_path):
     assert cv2.imreadanimation(str(tmp_path / "film.webp"))[0]
     with pytest.raises(ValueError, match=r"\.webp"):
         write_animation(tmp_path / "film.png", frames)
+    frames[2, 3, 4] = np.nan
+    with pytest.raises(ValueError, match="NaN"):
+        write_animation(tmp_path / "film.webp", frames)
 
 
 def test_the_camera_goes_round_at_one_distance(small):

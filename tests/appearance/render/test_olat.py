@@ -7,6 +7,7 @@ import pytest
 from benchmarks.renderers.path_reference import PathReference
 
 from appearance import HairAppearance, build_scene, render_olat
+from appearance.render import olat
 from appearance.render.coverage import covered_pixels
 from appearance.render.olat import render_olat_parts
 from appearance.scene.hair_appearance import DiffuseHair
@@ -150,6 +151,32 @@ def test_same_seed_same_bytes(tufted):
     a, b, other = (render_olat(scene, camera, lights, spp=8, seed=s) for s in (3, 3, 4))
     assert a.tobytes() == b.tobytes()
     assert (a != other).any()
+
+
+def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
+    tufted, monkeypatch, caplog
+):
+    scene, camera, lights = tufted
+    sound = render_olat(scene, camera, lights, spp=8)
+    row, column = np.argwhere(sound.all(axis=(0, 3)))[0]
+    pixel, right, times = row * camera.width + column, olat._Plan.render, [0]
+
+    def spoilt(plan, index, spp, seed):
+        out = right(plan, index, spp, seed)
+        if spp == 8 and times[0]:
+            out[:, 1, index == pixel] = np.nan
+            times[0] -= 1
+        return out
+
+    monkeypatch.setattr(olat._Plan, "render", spoilt)
+    times[0] = 1
+    again = render_olat(scene, camera, lights, spp=8)
+    assert np.argwhere((again != sound).any(axis=(0, 3))).tolist() == [[row, column]]
+    assert np.isfinite(again).all()
+    assert str(pixel) in caplog.text
+    times[0] = 2
+    with pytest.raises(FloatingPointError, match=str(pixel)):
+        render_olat(scene, camera, lights, spp=8)
 
 
 def test_a_moved_subject_is_a_moved_stage(small):
