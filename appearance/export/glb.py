@@ -54,7 +54,7 @@ class Glb:
         return self._add("nodes", {"name": name, "mesh": mesh})
 
     def hair_material(self, name: str, texture: Ints) -> int:
-        """A two-sided material that is cut out by the alpha of the BGRA picture `texture`."""
+        """A two-sided material that is cut out by the alpha of `texture (H, W, 4)`, BGRA."""
         _, png = cv2.imencode(".png", texture)
         view = self._view(png.tobytes())
         image = self._add("images", {"name": name, "mimeType": "image/png", "bufferView": view})

@@ -135,7 +135,7 @@ def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, In
 
 
 def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
-    """Indices of `count` guides (fewer where there are not as many shapes), each strand's guide.
+    """Indices `(G,)` of `count` guides, or of as many as have a shape, and each strand's `(S,)`.
 
     k-means of the strands' points at `SHAPE` equal arc lengths; a guide is the strand nearest to
     its cluster's mean.

@@ -27,7 +27,7 @@ class Places:
 
     @classmethod
     def of(cls, root_uv: Array) -> Places:
-        """Of the strands that are fitted."""
+        """Of the strands that are fitted, their roots at `root_uv (S, 2)`."""
         return cls(root_uv, np.ones(len(root_uv)), np.arange(len(root_uv)))
 
 

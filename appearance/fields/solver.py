@@ -56,17 +56,17 @@ class LeastSquares:
         return (self.ridge * each).astype(np.float32)
 
     def right(self) -> Floats:
-        """The right side of the normal equations."""
+        """The right side `(N, v · n · 3)` of the normal equations."""
         return self._gathered([seen.gram.right for seen in self.views])
 
     def times(self, coefficients: Floats) -> Floats:
-        """The left side of the normal equations times `coefficients`."""
+        """The left side of the normal equations times `coefficients (N, v · n · 3)`."""
         fine: Floats = self.nested @ coefficients
         pixels = [seen.gram.times(seen.basis.at_pixels(fine)) for seen in self.views]
         return np.asarray(self._gathered(pixels) + self.penalty * coefficients)
 
     def diagonal(self) -> Floats:
-        """About the diagonal of the left side."""
+        """About the diagonal `(N, v · n · 3)` of the left side."""
         k = degrees(self.degree)
         total = np.zeros((self.nested.shape[0], self.shape[1]), np.float32)
         for seen in self.views:
@@ -76,13 +76,13 @@ class LeastSquares:
         return np.asarray(squared.T @ total + self.penalty)
 
     def error(self, coefficients: Floats, views: Sequence[Seen] | None = None) -> float:
-        """The weighted squared error on `views`, or those of the fit, without the ridge."""
+        """Squared error of `coefficients (N, v · n · 3)` on `views`, or on those of the fit."""
         fine = self.nested @ coefficients
         used = self.views if views is None else views
         return sum(seen.gram.error(seen.basis.at_pixels(fine)) for seen in used)
 
     def objective(self, coefficients: Floats) -> float:
-        """What is minimised: the error and the ridge's part."""
+        """What is minimised over `coefficients (N, v · n · 3)`: the error and the ridge's part."""
         ridge = np.sum(self.penalty * coefficients**2, dtype=np.float64)
         return self.error(coefficients) + float(ridge)
 
@@ -100,7 +100,7 @@ def conjugate_gradients(
     start: Floats | None = None,
     on_iteration: Iteration = ignore,
 ) -> Floats:
-    """The coefficients that minimise `system`, from `start` (0 where None).
+    """The coefficients `(N, v · n · 3)` that minimise `system`, from `start` (0 where None).
 
     Preconditioned by the diagonal. Ends after `iterations`, or once the preconditioned gradient has
     fallen to `tolerance` of the start's from 0. A coefficient that no observation meets stays 0.
@@ -145,7 +145,7 @@ def adam(
 ) -> Floats:
     """The reference: Adam (Kingma & Ba 2015), a random view under a random light a step.
 
-    `samples` are those of the views of `system`, whose minimum is looked for.
+    `samples` are those of the views of `system`, whose minimum `(N, v · n · 3)` is looked for.
     """
     rng = np.random.default_rng(options.seed)
     x, first, second = (np.zeros(system.shape, np.float32) for _ in range(3))

@@ -106,12 +106,12 @@ class Data:
         return LeastSquares(seen, self.nested, self.options.degree, ridge)
 
     def solved(self, system: LeastSquares, start: Floats | None, told: Iteration) -> Floats:
-        """Its minimum, by conjugate gradients."""
+        """Its minimum `(N, v · n · 3)`, by conjugate gradients."""
         options = self.options
         return conjugate_gradients(system, options.iterations, options.tolerance, start, told)
 
     def pixel_field(self, view: int, fine: Floats) -> PixelField:
-        """The field of values at the finest grid's anchors, at a view's pixels."""
+        """The field of `fine (M, v · n · 3)` at the finest grid's anchors, at a view's pixels."""
         found = (self.unit * self.bases[view].at_pixels(fine)).astype(np.float32)
         additive, alone = self.options.kind != "modulation", self.options.kind == "whole"
         return PixelField(found, self.views[view].hits.middle(), additive, alone=alone)

@@ -93,7 +93,7 @@ class LinearisedPictures:
         self._first = (at < paths.starts[1])[:, None]
 
     def picture(self) -> Array:
-        """The pictures."""
+        """The pictures `(2, L, P, 3)`, of each half of the samples."""
         return self._film(self._light)
 
     def change(self, moved: Mapping[str, Any], *, first_hit: bool = False) -> Array:
@@ -208,7 +208,7 @@ def _moving(value: Any) -> Any:
 
 
 def half_of(samples: Ints) -> Ints:
-    """Which half each of a pixel's samples belongs to: a chessboard on the grid over the pixel."""
+    """The half `(n,)`, 0 or 1, of a pixel's `samples (n,)`: a chessboard on the grid over it."""
     side = int(len(samples) ** 0.5)
     return (samples + (samples // side if side % 2 == 0 else 0)) & 1
 

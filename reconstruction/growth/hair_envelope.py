@@ -86,7 +86,7 @@ def build_envelope(
 def build_hull(
     masked: MaskedCapture, *, grid: float, stage: Stage
 ) -> tuple[VoxelGrid, dict[str, Array]]:
-    """As `build_envelope` without sweep and head: the visual hull of the hair's masks alone.
+    """As `build_envelope` without sweep and head: the hull of the masks, depths `(H, W)` by camera.
 
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
