@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from stage_service.acquisition.control import Caller, Control
+from stage_service.captures.control import Caller, Control
 from stage_service.records.events import EventLog
 from stage_service.records.lease import Lease
 from stage_service.service_models import LeaseGrant, LeaseRequest, LeaseView, RenewRequest

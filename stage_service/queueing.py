@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from stage_service.acquisition.capture_queue import CaptureQueue, Entry
-from stage_service.acquisition.captures import Busy, CaptureManager
-from stage_service.acquisition.control import Caller, Control
 from stage_service.acquisition.states import CaptureStatus
+from stage_service.captures.capture_queue import CaptureQueue, Entry
+from stage_service.captures.control import Caller, Control
+from stage_service.captures.manager import Busy, CaptureManager
 from stage_service.plan.resolved import resolve
 from stage_service.service_models import CaptureRequest, QueueRequest, QueueView
 

@@ -14,12 +14,12 @@ from reconstruction import Capture, CaptureError
 from reconstruction.calibration.boards import CalibrationError
 from reconstruction.containment import inside, is_file_name
 from reconstruction.geometry.rig import RigError
-from stage_service.acquisition.captures import CaptureManager
-from stage_service.acquisition.catalogue import UnknownCapture
-from stage_service.acquisition.control import Caller, Control
-from stage_service.acquisition.snapshots import SNAPSHOT, one_step
 from stage_service.acquisition.states import CaptureStatus, Outcome
 from stage_service.calibrating import BoardView, Calibrating, CalibrationView
+from stage_service.captures.catalogue import UnknownCapture
+from stage_service.captures.control import Caller, Control
+from stage_service.captures.manager import CaptureManager
+from stage_service.captures.snapshots import SNAPSHOT, one_step
 from stage_service.config import RigFile
 from stage_service.frames import UnknownFrame, read_frame, steps_of
 from stage_service.inputs import BadInput, check_new, read_head, read_masks

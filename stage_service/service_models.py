@@ -11,9 +11,9 @@ from reconstruction import Camera, Projector
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import StepKind
 from reconstruction.containment import LONGEST_NAME
-from stage_service.acquisition.capture_queue import Entry
-from stage_service.acquisition.latch import Latched
 from stage_service.acquisition.states import CaptureStatus
+from stage_service.captures.capture_queue import Entry
+from stage_service.captures.latch import Latched
 from stage_service.config import CaptureDefaults, Exposure, Level, RigFile, Strict
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan

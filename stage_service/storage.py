@@ -28,8 +28,8 @@ from reconstruction.capture.writer import JournalInUse, utc_now
 from reconstruction.containment import inside, is_file_name
 from reconstruction.files.durable import flush, require_free, write_json, write_whole
 from reconstruction.reading import read_json
-from stage_service.acquisition.captures import CaptureManager
-from stage_service.acquisition.control import Caller, Control
+from stage_service.captures.control import Caller, Control
+from stage_service.captures.manager import CaptureManager
 from stage_service.jobs.queue import JobQueue
 from stage_service.jobs.records import Job
 

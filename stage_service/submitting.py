@@ -10,8 +10,8 @@ from hashlib import sha256
 from pathlib import Path
 
 from reconstruction import Capture, Model
-from stage_service.acquisition.control import Caller, Control
-from stage_service.acquisition.snapshots import SNAPSHOT
+from stage_service.captures.control import Caller, Control
+from stage_service.captures.snapshots import SNAPSHOT
 from stage_service.inputs import BadInput, check_named
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.pipelines import PIPELINES

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction.files.durable import RESERVE
-from stage_service.acquisition.captures import CaptureManager
+from stage_service.captures.manager import CaptureManager
 from stage_service.devices.last_seen import LastSeen
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue

@@ -23,12 +23,12 @@ from reconstruction.capture.writer import JournalInUse
 from reconstruction.containment import NotContained
 from reconstruction.files.durable import DiskFull
 from reconstruction.reading import printable
-from stage_service.acquisition.capture_queue import QueueFull, UnknownEntry
-from stage_service.acquisition.captures import Busy
-from stage_service.acquisition.catalogue import UnknownCapture
-from stage_service.acquisition.control import Forbidden
-from stage_service.acquisition.latch import CannotAcknowledge, Unsafe
 from stage_service.acquisition.states import WrongState
+from stage_service.captures.capture_queue import QueueFull, UnknownEntry
+from stage_service.captures.catalogue import UnknownCapture
+from stage_service.captures.control import Forbidden
+from stage_service.captures.latch import CannotAcknowledge, Unsafe
+from stage_service.captures.manager import Busy
 from stage_service.devices.ownership import StageInUse
 from stage_service.frames import UnknownFrame
 from stage_service.inputs import BadInput

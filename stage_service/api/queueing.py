@@ -6,9 +6,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response, status
 
-from stage_service.acquisition.capture_queue import Entry
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Steers
+from stage_service.captures.capture_queue import Entry
 from stage_service.service_models import MoveRequest, QueueRequest, QueueView, ResumeRequest
 
 router = APIRouter(tags=["queue"])

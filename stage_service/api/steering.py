@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Query, Request, Security, status
 from fastapi.security import HTTPBearer, SecurityScopes
 
-from stage_service.acquisition.control import Caller
 from stage_service.api.lanes import OnLanes
+from stage_service.captures.control import Caller
 from stage_service.records.audit import Action
 from stage_service.records.tokens import SCOPES
 from stage_service.service import Service

@@ -9,8 +9,8 @@ import pytest
 import simulators.world
 import stage_service.devices.cameras.link
 from reconstruction import CaptureWriter, verify
-from stage_service.acquisition.captures import CaptureManager
 from stage_service.acquisition.sequencer import Sequencer
+from stage_service.captures.manager import CaptureManager
 from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve

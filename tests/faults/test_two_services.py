@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from stage_service.acquisition.captures import CaptureManager
+from stage_service.captures.manager import CaptureManager
 from stage_service.config import RigFile
 from stage_service.devices import ownership
 from stage_service.devices.ownership import StageInUse
@@ -100,7 +100,7 @@ def test_what_a_killed_service_has_left_is_taken(simulated, begin, tmp_path):
     rig_file, _ = simulated()
     code = (
         "import os, sys; from pathlib import Path;"
-        "from stage_service.acquisition.captures import CaptureManager;"
+        "from stage_service.captures.manager import CaptureManager;"
         "from stage_service.config import load_rig_file;"
         "one = CaptureManager(load_rig_file(*sys.argv[1:3]), Path(sys.argv[3]));"
         "one.stage.take(); os.kill(os.getpid(), 9)"

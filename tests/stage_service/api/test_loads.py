@@ -20,9 +20,9 @@ from serving import Client, serving
 from waiting import until
 
 from reconstruction import CaptureWriter, Step
-from stage_service.acquisition import captures as manager_module
-from stage_service.acquisition import status_index
-from stage_service.acquisition.catalogue import Catalogue
+from stage_service.captures import manager as manager_module
+from stage_service.captures import status_index
+from stage_service.captures.catalogue import Catalogue
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""

@@ -11,8 +11,8 @@ import pytest
 from serving import Client, serving, slug
 from waiting import until
 
-from stage_service.acquisition import capture_queue
-from stage_service.acquisition.captures import Busy, CaptureManager
+from stage_service.captures import capture_queue
+from stage_service.captures.manager import Busy, CaptureManager
 from stage_service.cli import main
 from stage_service.config import SafetyLimits
 from stage_service.plan.capture_plan import CapturePlan

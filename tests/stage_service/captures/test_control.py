@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from stage_service.acquisition.latch import CannotAcknowledge, Latch, Unsafe
 from stage_service.acquisition.safety import Blackout
+from stage_service.captures.latch import CannotAcknowledge, Latch, Unsafe
 from stage_service.records.audit import AuditLog
 from stage_service.records.lease import Leased, Leases, NoLease, RootInUse, RootLock
 

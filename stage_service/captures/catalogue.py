@@ -9,7 +9,7 @@ from pathlib import Path
 
 from reconstruction.reading import printable
 from stage_service.acquisition.states import CaptureStatus, read_status
-from stage_service.acquisition.status_index import FILES, StatusIndex
+from stage_service.captures.status_index import FILES, StatusIndex
 
 log = logging.getLogger("hairstage.captures")
 PAUSE_S = 0.2

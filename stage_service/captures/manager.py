@@ -1,4 +1,4 @@
-"""The captures of one stage: start, steer, list. The only seam that the API's routes call."""
+"""The captures of one stage: start, steer, list."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from typing import Any, TypeVar
 from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
 from reconstruction.capture.writer import utc_now
-from stage_service.acquisition.capture_run import CaptureRun, Tally, plan_of
-from stage_service.acquisition.catalogue import Catalogue
-from stage_service.acquisition.latch import Unsafe
 from stage_service.acquisition.safety import blackout, off_on_exit
-from stage_service.acquisition.snapshots import APART_S, SNAPSHOT
-from stage_service.acquisition.stage import Stage
 from stage_service.acquisition.states import (
     CaptureStatus,
     State,
     WrongState,
     possible,
 )
+from stage_service.captures.capture_run import CaptureRun, Tally, plan_of
+from stage_service.captures.catalogue import Catalogue
+from stage_service.captures.latch import Unsafe
+from stage_service.captures.snapshots import APART_S, SNAPSHOT
+from stage_service.captures.stage import Stage
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan

@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import write_json
 from reconstruction.reading import printable, read_json
-from stage_service.acquisition.captures import Busy
 from stage_service.background import Background
+from stage_service.captures.manager import Busy
 from stage_service.records.events import EventLog
 from stage_service.records.lease import Leased
 

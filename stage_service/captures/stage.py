@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from stage_service.acquisition.latch import Latch
 from stage_service.acquisition.safety import Blackout, blackout
+from stage_service.captures.latch import Latch
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.last_seen import LastSeen

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from reconstruction import Camera, CaptureWriter, Light, Rig, Step
-from stage_service.acquisition import status_index
 from stage_service.acquisition.states import CaptureStatus, read_status
-from stage_service.acquisition.status_index import StatusIndex
+from stage_service.captures import status_index
+from stage_service.captures.status_index import StatusIndex
 
 STEPS = (Step(0, "dark", 0.01), Step(1, "olat", 0.01, light="light_000"))
 

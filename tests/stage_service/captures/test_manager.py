@@ -19,9 +19,9 @@ from waiting import until as waited
 
 from reconstruction import CaptureError, verify
 from reconstruction.geometry.rig import RigError
-from stage_service.acquisition.captures import Busy, CaptureManager
-from stage_service.acquisition.catalogue import UnknownCapture
 from stage_service.acquisition.states import WrongState
+from stage_service.captures.catalogue import UnknownCapture
+from stage_service.captures.manager import Busy, CaptureManager
 from stage_service.config import RigFile
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError
@@ -247,7 +247,7 @@ def test_a_damaged_capture_is_listed_with_its_reason_and_harms_no_other(manager,
 PROCESS = """
 import sys, time
 from pathlib import Path
-from stage_service.acquisition.captures import CaptureManager
+from stage_service.captures.manager import CaptureManager
 from stage_service.config import load_rig_file
 from stage_service.plan.capture_plan import CapturePlan
 manager = CaptureManager(load_rig_file(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,1 @@
+"""The captures of one stage: begun, steered, queued, listed."""
