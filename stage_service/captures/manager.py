@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,6 +45,9 @@ TIDY_S = 1.0
 """How long a blackout, once it is dark, waits for the capture's folder to be finished."""
 ANSWER_S = 5.0
 """A blackout is answered within this time, or three times the slowest timeout_s of the devices."""
+TOLD_S = 1.0
+"""What has not been read back dark by then is told as unknown, before the blackout is answered."""
+UNREAD = "a blackout is under way: not everything has said yet that it is dark"
 
 
 class Busy(RuntimeError):
@@ -101,6 +105,7 @@ class CaptureManager:
         self.blackouts = 0  # begun since the start
         self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
+        self._unread = 0  # of these, those whose devices have not all answered
         self.catalogue = Catalogue(self.folder, root / "captures.index")
         self._tally = Tally()
         self._looked = -APART_S
@@ -351,6 +356,9 @@ class CaptureManager:
     def safety(self) -> dict[str, Any]:
         """What is known of the lamps now: {"state", "detail", "latched"}."""
         run = self._running
+        if self._unread:
+            latched = self.stage.darkness()["latched"]
+            return {"state": "unknown, unsafe", "detail": UNREAD, "latched": latched}
         if run is None:
             return self.stage.darkness()
         return {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
@@ -359,19 +367,32 @@ class CaptureManager:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
 
         Returns {"safe": bool, "state": "dark" | "unknown, unsafe", "detail": str}; what is unknown
-        is to be treated as lit. Waits for no disk, no camera and nobody who asks the devices.
+        is to be treated as lit. Waits for no disk, no camera and nobody who asks the devices. Until
+        it is over `safety` says "unknown, unsafe", and after `TOLD_S` an event does.
         """
         devices = self.stage.devices
         with self._lock:
             self.blackouts += 1
             self._darkening += 1  # nothing may begin until it is over
+            self._unread += 1
             run = self._running
+        late = threading.Timer(TOLD_S, lambda: self.events.publish("stage.lamps", self.safety()))
+        late.daemon = True
         try:
+            with suppress(RuntimeError):  # no thread can be had: the answer tells
+                late.start()
             within_s = max(ANSWER_S, 3 * devices.slowest_s)
-            if run is not None:
-                result = run.sequencer.darken(within_s)
-            else:
-                result = blackout(devices, within_s=within_s)
+            try:
+                if run is not None:
+                    result = run.sequencer.darken(within_s)
+                else:
+                    result = blackout(devices, within_s=within_s)
+            finally:
+                late.cancel()
+                if late.ident is not None:
+                    late.join()  # what it has to say comes before the answer
+                with self._lock:
+                    self._unread -= 1
             self.stage.learn(result)
             if run is not None and run.thread is not None:
                 run.thread.join(TIDY_S)

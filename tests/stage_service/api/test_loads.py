@@ -118,15 +118,24 @@ def test_while_cameras_hang_and_everybody_asks_how_the_devices_are(rig_file, wor
             assert_it_can_be_darkened(http, world, None)
 
 
-def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(rig_file, world, tmp_path):
+def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
+    rig_file, world, tmp_path, monkeypatch
+):
     with serving(rig_file, tmp_path) as http:
         assert http.get("/devices").json()["safety"]["state"] == "dark"
         world.show = "ON 65535"
         with stuck_lights(world):
             flood(http, "GET", "/devices", count=5)
+            monkeypatch.setattr(manager_module, "TOLD_S", 0.0)
+            flood(http, "POST", "/devices/blackout", count=1)
+            until(lambda: http.get("/health").json()["lamps"] == "unknown, unsafe")
+            events = http.service.events.after
+            until(lambda: any("under way" in str(e.data) for e in events(0, 99)))
             answer = http.post("/devices/blackout").json()
             assert answer["state"] == "unknown, unsafe"
             assert "light bank" in answer["detail"]
+            kinds = [e.kind for e in events(0, 99) if "unknown" in str(e.data)]
+            assert kinds.index("stage.lamps") < kinds.index("stage.blackout"), "told before it ends"
             assert world.show == "OFF"
             health = http.get("/health").json()
             assert (health["status"], health["lamps"]) == ("unsafe", "unknown, unsafe")
