@@ -144,11 +144,7 @@ class ServiceClient:
     ) -> dict[str, Any]:
         """Poll a capture until it is done; `check` may raise to give up waiting."""
 
-        def show(status: dict[str, Any]) -> None:
-            frames = f"{status['frames_written']} of {status['frames_planned']} frames"
-            progress(f"{status['state']}, {frames}", status["step"] / max(status["steps"], 1))
-
-        return self._follow(f"/captures/{capture}", show, check)
+        return self._follow(f"/captures/{capture}", lambda s: progress(*_capture_told(s)), check)
 
     def follow_job(
         self, job: str, progress: Progress, check: Callable[[], None] = lambda: None
@@ -174,6 +170,21 @@ class ServiceClient:
                 return status
             check()
             time.sleep(0.3)
+
+
+def _capture_told(status: dict[str, Any]) -> tuple[str, float]:
+    """What a capture is at, in words, and the share of its frames that have arrived."""
+    running, planned = status["progress"], status["frames_planned"]
+    if running is None:
+        done, more = status["frames_written"], ""
+    else:
+        by_camera = running["frames"].values()
+        done, here = sum(by_camera), sum(n > min(by_camera) for n in by_camera)
+        of = running["light"] or running["projector"] or running["kind"]
+        more = f", {of}: {here} of {len(by_camera)} cameras" if here else ""
+        if running["seconds_left"] is not None:
+            more += f", {running['seconds_left']:.0f} s left"
+    return f"{status['state']}, {done} of {planned} frames{more}", done / max(planned, 1)
 
 
 def _problem(response: httpx.Response) -> CommandError:
