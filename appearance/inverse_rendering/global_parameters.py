@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,18 @@ class Evidence:
     seed: int = 0
 
 
+class Solved(NamedTuple):
+    """What was found: `raw` and `gain (L,)`.
+
+    `left_open`: by name, the standard error of an estimate over the width of `WIDE` that it begins
+    with, of the channel known least; 1 is a flat response, which the pictures say nothing of.
+    """
+
+    raw: Raw
+    gain: Array
+    left_open: dict[str, float]
+
+
 def solve_global_parameters(
     problem: FitProblem,
     raw: Raw,
@@ -62,7 +74,7 @@ def solve_global_parameters(
     names: Sequence[str],
     evidence: Evidence,
     progress: Progress = silent,
-) -> tuple[Raw, Array]:
+) -> Solved:
     """`raw` and `gain (L,)` with the numbers called `names` solved for.
 
     "sigma_a" moves all cells' logits alike in each channel; "gain" is the lights' intensities,
@@ -94,7 +106,7 @@ def solve_global_parameters(
         progress("global parameters", turn / _TURNS)
         step = system.step(raw, gain, turn)
         if not np.isfinite(step).all():
-            return given
+            return Solved(*given, system.left_open())
         for number, d in zip(numbers, step * system.wide, strict=True):
             raw, gain = _moved(raw, gain, number, d)
         gain = gain / np.exp(np.log(gain).mean())
@@ -106,9 +118,10 @@ def solve_global_parameters(
             break
     # each is of independent noise, once the first has come near
     last = estimates[1:] or estimates
-    return (
+    return Solved(
         raw | {n: np.mean([r[n] for r, _ in last], axis=0) for n in names if n in raw},
         np.exp(np.mean([np.log(g) for _, g in last], axis=0)),
+        system.left_open(),
     )
 
 
@@ -147,6 +160,14 @@ class _System:
         self.wide = np.array([WIDE[name] for name, _ in numbers])
         self.bends = np.array([name != "gain" for name, _ in numbers])
         self.noise: list[Array] = [np.zeros(0)] * len(self.patches)
+        self.error = np.ones(len(numbers))
+
+    def left_open(self) -> dict[str, float]:
+        """Of the latest step; see `Solved`."""
+        out: dict[str, float] = {}
+        for (name, _), error in zip(self.numbers, self.error, strict=True):
+            out[name] = max(out.get(name, 0.0), float(error))
+        return out
 
     def step(self, raw: Raw, gain: Array, turn: int) -> Array:
         """How far to move each number, by its width."""
@@ -174,6 +195,7 @@ class _System:
             normal = back @ half[:, :-1] + np.eye(len(size))
             step = -np.linalg.solve(normal, back @ half[:, -1] + about)
             step = np.clip(step, -_FARTHEST, _FARTHEST)
+        self.error = np.sqrt(np.diag(np.linalg.inv(normal)))
         return step
 
     def _patch(self, raw: Raw, gain: Array, k: int, turn: int) -> tuple[Array, Array, Array]:

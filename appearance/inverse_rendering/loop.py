@@ -67,7 +67,8 @@ class Outcome:
     and alike for both (`FitProblem.whole_errors`). `sure` is the share of random draws of the parts
     of the hair in which the best of what was found is better than the start (bootstrap): below
     `SURE`, maps and lights are the start's, and `refused` is what was found. `history` holds
-    (seconds, step, validation error).
+    (seconds, step, validation error). `left_open`: see `global_parameters.Solved`; empty where no
+    number was solved for, or the fit went on from a checkpoint.
     """
 
     maps: HairMaps
@@ -79,6 +80,7 @@ class Outcome:
     history: list[tuple[float, int, float]] = field(default_factory=list)
     sure: float = 1.0
     refused: Refused | None = None
+    left_open: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ class _Fit:
         self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
         self.spread = problem.spread(self.pairs, options.validation_views, options.images)
         self.series: list[tuple[float, int, float]] = []
+        self.left_open: dict[str, float] = {}
 
     def run(self) -> Outcome:
         self.begun, self.worked = time.perf_counter(), time.process_time()
@@ -205,7 +208,9 @@ class _Fit:
                 self.monitor.progress(what, 0.5 * (begun + share) / rounds)
 
             evidence = Evidence(self.spread, self.options.effort, (self.seed << 4) + k)
-            raw, gain = solve_global_parameters(self.problem, raw, gain, solves, evidence, progress)
+            raw, gain, self.left_open = solve_global_parameters(
+                self.problem, raw, gain, solves, evidence, progress
+            )
             self._record(raw, gain, "global parameters", 0.5 * (k + 1) / rounds)
             if cells:
                 raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
@@ -336,13 +341,14 @@ class _Fit:
         best = int(np.argmin(errors))
         raw, gain, how = guesses[best]
         maps, lights = decode(raw), self.problem.deviations(raw, gain)
-        error, steps, sure = errors[best], state.step, _sure(parts[-1] - parts[best])
-        if sure >= SURE:
-            return Outcome(maps, lights, how, begun, error, steps, self.series, sure)
-        refused, kept = Refused(maps, lights, error), f"{ended}; kept the start"
+        sure, kept = _sure(parts[-1] - parts[best]), f"{ended}; kept the start"
         # in cells, though all alike: the next variant need not tell them apart again
-        maps = self.start.resized(start["sigma_a"].shape[:3])
-        return Outcome(maps, self.lights, kept, begun, begun, steps, self.series, sure, refused)
+        as_begun = self.start.resized(start["sigma_a"].shape[:3])
+        told = Outcome(as_begun, self.lights, kept, begun, begun, state.step, self.series, sure)
+        told = replace(told, left_open=self.left_open)
+        if sure < SURE:
+            return replace(told, refused=Refused(maps, lights, errors[best]))
+        return replace(told, maps=maps, lights=lights, ended=how, error=errors[best])
 
 
 def _sure(parts: Array) -> float:

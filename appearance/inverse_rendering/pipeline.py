@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -28,6 +29,8 @@ from reconstruction.report.report import Series, free_memory
 JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
+FLAT = 0.7
+"""Left open of a number's width, beyond which its response is flat: of its square, half."""
 FROM_SUN = 1.15
 """Times Sun's roughness, or one over it, that the fit to pictures may end at without a doubt."""
 BLACKER = 3.0
@@ -92,7 +95,8 @@ def fit_maps(
             "error": found.error,
             "sure": outcome.sure,
             "accepted": taken,
-            "doubts": _doubts(start, found.maps),
+            "doubts": _doubts(start, found.maps) + _flat(one_colour.left_open),
+            "left_open": one_colour.left_open,
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
@@ -136,6 +140,16 @@ def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
             "Sun's fit: strands that lie beside their true places look rougher in pictures"
         )
     return doubts
+
+
+def _flat(left_open: Mapping[str, float]) -> list[str]:
+    """Which numbers the pictures say next to nothing of."""
+    return [
+        f"{name} is not known: pictures hardly answer to it (its standard error is {open_:.0%} of "
+        "the width that it began with), and it stays about where it began"
+        for name, open_ in left_open.items()
+        if open_ > FLAT
+    ]
 
 
 def _check_memory(

@@ -113,7 +113,7 @@ def test_what_whole_pictures_speak_against_is_not_taken(
     }
 
     def solve(problem, raw, gain, *args):
-        return problem.encode(hair[offered], LightDeviations.calibrated(len(gain))), gain
+        return problem.encode(hair[offered], LightDeviations.calibrated(len(gain))), gain, {}
 
     monkeypatch.setattr(loop, "solve_global_parameters", solve)
     found = run(plain, hair[begins], options=replace(original, gauss_newton=True))

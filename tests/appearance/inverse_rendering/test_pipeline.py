@@ -154,7 +154,7 @@ def test_a_fit_that_is_not_taken_leaves_suns_to_be_rendered(made, tmp_path, monk
     white = HairMaps.of(HairAppearance((0.001, 0.001, 0.001), 0.4, 0.3))
 
     def solve(problem, raw, gain, *args):
-        return problem.encode(white, LightDeviations.calibrated(len(gain))), gain
+        return problem.encode(white, LightDeviations.calibrated(len(gain))), gain, {}
 
     monkeypatch.setattr(loop, "solve_global_parameters", solve)
     request = replace(REQUEST, fit=replace(REQUEST.fit, variant="original"))
@@ -191,6 +191,22 @@ def test_a_roughness_that_is_not_found_again_is_doubted(made, tmp_path, monkeypa
     monkeypatch.setattr(pipeline, "run", found)
     (told,) = fit_maps(capture, other, request=REQUEST)["doubts"]
     assert told.startswith(doubt)
+
+
+def test_a_number_that_pictures_say_nothing_of_is_told(made, tmp_path, monkeypatch):
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    start = HairMaps.of(FittedAppearance.load(model).hair)
+
+    def found(problem, *args, **more):
+        same = LightDeviations.calibrated(len(problem.lights))
+        known = {"beta_m": 0.1, "beta_n": 0.95}
+        return Outcome(start, same, "converged", 1.0, 0.5, 1, [], left_open=known)
+
+    monkeypatch.setattr(pipeline, "run", found)
+    (told,) = fit_maps(capture, other, request=REQUEST)["doubts"]
+    assert told.startswith("beta_n is not known")
 
 
 def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
