@@ -118,7 +118,8 @@ def fit(
         red, green, blue = (
             x if np.isfinite(x) else None for x in colours.absorption_error(first.pairs).tolist()
         )
-        known = Uncertainty(found.error, found.low, found.high, (red, green, blue))
+        sigma_a = (red, green, blue)
+        known = Uncertainty(found.error, found.low, found.high, sigma_a, found.tangents_deg)
         stage.figures["sigma_a_error"] = list(known.sigma_a)
         for warning in known.warnings(colours.hair.sigma_a):
             stage.warn(warning)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from pydantic import TypeAdapter
 
+from appearance.bsdf.longitudinal import roughness_without_scatter
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
@@ -22,13 +24,15 @@ class Uncertainty:
 
     `beta_m` is the standard error of log β_M, `beta_m_low` and `beta_m_high` the ends of an
     interval of about 95 %; `sigma_a (3,)` the standard error of log sigma_a, None where the hair's
-    colour does not answer to it.
+    colour does not answer to it. `tangents_deg` is how far the strands' inclinations are off, root
+    mean square; None where a fit of an earlier version did not say.
     """
 
     beta_m: float
     beta_m_low: float
     beta_m_high: float
     sigma_a: tuple[float | None, float | None, float | None]
+    tangents_deg: float | None = None
 
     def warnings(self, sigma_a: tuple[float, float, float]) -> list[str]:
         """What a user has to know of an absorption `sigma_a` before believing it."""
@@ -60,6 +64,15 @@ class FittedAppearance:
     printed_v: float
     held_out: HeldOut
     uncertainty: Uncertainty | None = None
+
+    def fibre_beta_m(self, beta_m: float) -> float | None:
+        """The fibres' β_M, where pictures of these strands ask for `beta_m`: without their scatter.
+
+        None where the scatter of directions is not known, or is most of what the pictures show.
+        """
+        if self.uncertainty is None or self.uncertainty.tangents_deg is None:
+            return None
+        return roughness_without_scatter(beta_m, math.radians(self.uncertainty.tangents_deg))
 
     def save(self, model: Model) -> None:
         """Write `appearance.json`."""

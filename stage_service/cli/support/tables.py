@@ -48,6 +48,9 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     hair = Table("appearance", *(PICTURES.get(name, name) for name in fits))
     for key, what in _APPEARANCE.items():
         hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
+    if any("fibre_beta_m" in figures for figures in fits.values()):
+        fibres = (figures.get("fibre_beta_m", []) for figures in fits.values())
+        hair.add_row("β_M without strands' scatter", *(_numbers(x) for x in fibres))
     for key, what in _ERRORS.items():
         if any(key in figures for figures in fits.values()):
             hair.add_row(what, *(_per_cent(figures.get(key)) for figures in fits.values()))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from appearance import Exposure, HairAppearance, HeldOut
-from appearance.sun_fit.fitted_appearance import FittedAppearance
+from appearance.bsdf.maps import HairMaps
+from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
 from reconstruction import Model
 from stage_service.jobs.evaluation import evaluate_appearance
 
@@ -23,11 +26,18 @@ def test_one_colour_under_two_azimuthal_roughnesses_is_one_colour(tmp_path):
     ours = HairAppearance((0.1, 0.2, 0.4), 0.5, 0.2)
     factor = (chiang(0.2) / chiang(0.6)) ** 2
     true = HairAppearance(tuple(factor * s for s in ours.sigma_a), 0.3, 0.6)
-    FittedAppearance(
+    sun = FittedAppearance(
         ours, (0.5,) * 3, (0.4, 0.3, 0.2), Exposure(1.0), 0.2, 0.2, 0.2, HeldOut()
-    ).save(Model(tmp_path))
+    )
+    known = Uncertainty(0.1, 0.4, 0.6, (0.1, 0.1, 0.1), 12.0)
+    replace(sun, uncertainty=known).save(Model(tmp_path))
     truth = tmp_path / "truth.json"
     truth.write_text(json.dumps({"hair": true.to_dict(), "skin": [0.5, 0.4, 0.3]}))
+    HairMaps.of(replace(ours, beta_m=0.518)).save(Model(tmp_path), np.zeros((1, 2)))
+    figures = evaluate_appearance(Model(tmp_path), truth)
+    # 12° off: by Chiang's formula what is left of the lobe of 0.518 is that of 0.4
+    assert figures["inverse_rendering"]["fibre_beta_m"] == pytest.approx(0.4, abs=2e-3)
+    Model(tmp_path).remove("hair_maps.npz")
     figures = evaluate_appearance(Model(tmp_path), truth)
     assert figures["fitted"]["colour"] == pytest.approx(figures["true"]["colour"], rel=1e-6)
     assert (figures["fitted"]["beta_m"], figures["true"]["beta_m"]) == (0.5, 0.3)
