@@ -79,7 +79,7 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
         try:
             problem = answer.get(timeout=max(0.0, deadline - time.monotonic()))
         except queue.Empty:
-            problem = f" {device.name}: not dark within {within_s:g} s."
+            problem = f" {device.name}: not dark within {within_s:.3g} s."
         if problem and can.dead_man:
             problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
         problems += problem

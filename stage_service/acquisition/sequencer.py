@@ -165,13 +165,16 @@ class Sequencer:
         """Stop at once and put everything off, whatever the run's thread is stuck in.
 
         Returns the blackout with which the run ends in order, or else one of the caller's own,
-        after which the run lights nothing any more. Each takes `within_s` seconds at most.
+        after which the run lights nothing any more. Takes `ORDERLY_S` + `within_s` seconds at most;
+        off is sent before a lamp is waited for that the run is just putting on.
         """
         self.stop_now()
         if self._dark.wait(ORDERLY_S) and self.blackout is not None:
             return self.blackout
-        with self._exposing.no_light(within_s):
-            return blackout(self.devices, within_s=within_s)
+        deadline = time.monotonic() + within_s
+        blackout(self.devices, attempts=1, within_s=0.0)  # what hears it goes dark now
+        with self._exposing.no_light(within_s / 2):
+            return blackout(self.devices, within_s=deadline - time.monotonic())
 
     def run(self) -> Outcome:
         """Shoot what is missing and finish the capture folder; returns the outcome.

@@ -23,6 +23,7 @@ from reconstruction import CaptureWriter, Step
 from stage_service.captures import manager as manager_module
 from stage_service.captures import status_index
 from stage_service.captures.catalogue import Catalogue
+from stage_service.devices.lights.modbus import ModbusLightBank
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
@@ -141,6 +142,19 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
             assert (health["status"], health["lamps"]) == ("unsafe", "unknown, unsafe")
         assert_it_can_be_darkened(http, world, None)
         assert http.get("/health").json()["status"] == "ok"
+
+
+def test_projectors_go_dark_while_the_run_waits_for_a_lamp(rig_file, world, tmp_path, monkeypatch):
+    """Not one deadline after another: that of the lamp first, then that of the blackout."""
+    monkeypatch.setattr(manager_module, "ANSWER_S", 3600.0)
+    with serving(rig_file, tmp_path) as http:
+        with stuck(monkeypatch, ModbusLightBank, "select") as waiting:
+            http.post("/captures", json=LONG)
+            until(lambda: waiting() > 0)
+            world.show = "ON 65535"
+            flood(http, "POST", "/devices/blackout", count=1)
+            until(lambda: world.show == "OFF")
+        assert_it_can_be_darkened(http, world, None)
 
 
 @contextmanager
