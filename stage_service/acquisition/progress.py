@@ -65,6 +65,7 @@ class RunProgress:
         self._pace = Pace()
         self._done = 0
         self._step: Step | None = None
+        self._here = 0
         self._run: Sequence[Step] = ()
         self._came = dict.fromkeys(frames, 0)  # of the box's run that is under way
         self._began = self._first_at = self._told_at = 0.0
@@ -77,7 +78,13 @@ class RunProgress:
     def begin(self, step: Step) -> None:
         """The service is about to light this step."""
         with self._lock:
-            self._step, self._began = step, self._clock()
+            self._step, self._began, self._here = step, self._clock(), 0
+        self._say()
+
+    def answered(self) -> None:
+        """One more camera has, of those that the service's own step waits for."""
+        with self._lock:
+            self._here += 1
         self._say()
 
     def arrived(self, camera: str) -> None:
@@ -91,6 +98,7 @@ class RunProgress:
             if self._step is step:
                 self._pace.took([step], self._clock() - self._began)
             self._count(step)
+            self._here = 0
         self._say()
 
     def begin_run(self, steps: Sequence[Step]) -> None:
@@ -128,6 +136,7 @@ class RunProgress:
                 **{k: about.get(k) for k in ("kind", "light", "projector", "row")},
                 by_box=bool(self._run),
                 frames={name: n + self._came[name] for name, n in self._frames.items()},
+                here=min(self._here, len(self._frames)),
                 again=self.again,
                 seconds_left=self._left(live),
             )

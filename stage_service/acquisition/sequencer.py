@@ -327,7 +327,7 @@ class Sequencer:
             pulse = self._exposing.expose(step)
             self._pulses.fired(pulse.count)
             with self._timings.on("cameras"):
-                shot = cameras(lambda camera: camera.read(self._cancel))
+                shot = cameras(self._read)
             for camera in self.devices.cameras:
                 frame = shot[camera.name]
                 self._account(camera, frame, pulse)
@@ -358,6 +358,11 @@ class Sequencer:
                 self.by_device[camera]["missed"] += 1
             self.progress.again += len(cameras) * again
             self._notify("capture.frame_missing", {**lost, "shot_again": again})
+
+    def _read(self, camera: CameraDevice) -> Frame | None:
+        frame = camera.read(self._cancel)
+        self.progress.answered()
+        return frame
 
     def _account(self, camera: CameraDevice, frame: Frame | None, pulse: Pulse) -> None:
         account = self._accounts[camera.name]

@@ -76,7 +76,8 @@ class Machine:
 class Progress(BaseModel):
     """What a run is at: the step's light, or projector and row; `by_box`: the trigger box clocks.
 
-    `step` counts steps whose frames have all arrived, `frames` those of each camera that have;
+    `step` counts steps whose frames have all arrived, `frames` those of each camera that have,
+    `here` cameras that have answered for the step that is being waited for;
     `again` frames that are shot again. `seconds_left` goes by the steps that were measured: None
     while they are too few, and not counting a pause.
     """
@@ -90,6 +91,7 @@ class Progress(BaseModel):
     row: int | None = None
     by_box: bool = False
     frames: dict[str, int]
+    here: int = 0
     again: int
     seconds_left: float | None
 

@@ -179,7 +179,8 @@ def _capture_told(status: dict[str, Any]) -> tuple[str, float]:
         done, more = status["frames_written"], ""
     else:
         by_camera = running["frames"].values()
-        done, here = sum(by_camera), sum(n > min(by_camera) for n in by_camera)
+        done = sum(by_camera)
+        here = running["here"] or sum(n > min(by_camera) for n in by_camera)
         of = running["light"] or running["projector"] or running["kind"]
         more = f", {of}: {here} of {len(by_camera)} cameras" if here else ""
         if running["seconds_left"] is not None:

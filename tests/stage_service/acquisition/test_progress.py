@@ -25,6 +25,9 @@ def test_time_left_is_that_of_the_steps_that_were_measured():
     for step in STEPS[:10]:
         run.begin(step)
         clock.now += 60.0 if step.index == 0 else 2.0  # the first waits for a camera to warm up
+        run.answered()
+        assert (told[-1].here, told[-1].frames["a"]) == (1, step.index)
+        run.answered()
         run.arrived("a")
         run.arrived("b")
         run.done(step)
@@ -40,6 +43,7 @@ def test_time_left_is_that_of_the_steps_that_were_measured():
         run.done(step)
     now = run.now()
     assert (now.step, now.kind, now.row, now.frames) == (13, "scanline", 12, {"a": 10, "b": 10})
+    assert now.here == 0
     assert now.seconds_left == 17 * 0.5
     assert len(told) >= 13
 
