@@ -53,11 +53,13 @@ def fit_maps(
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
     the fit is done. Where whole training pictures are not clearly better with what was found than
     with Sun's fit, it goes to the model's folder "rejected", with a warning. Returns `{"ended",
-    "steps", "error", "start_error", "sure", "accepted", "doubts", "fibre_beta_m", "held_out":
-    {"start" | "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the latter where
-    images are held out; see `Outcome` for errors, of Sun's fit and of what was found; "doubts" are
-    warnings for whoever renders what was found. "fibre_beta_m" is the roughness without the scatter
-    of the strands' directions that Sun's fit measured; None where none was, or it is most of it.
+    "steps", "error", "start_error", "sure", "accepted", "doubts", "fibre_beta_m",
+    "fibre_beta_m_range", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
+    "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
+    fit and of what was found; "doubts" are warnings for whoever renders what was found.
+    "fibre_beta_m" is the roughness without the scatter of the strands' directions that Sun's fit
+    measured, its range that by two of the scatter's standard errors; None where none was, or it is
+    most of it.
     What is rendered keeps the scatter: it belongs to these strands. Raises `CaptureError` or
     `ModelError` naming what is missing.
     """
@@ -99,6 +101,7 @@ def fit_maps(
             "sure": outcome.sure,
             "accepted": taken,
             "fibre_beta_m": fibre,
+            "fibre_beta_m_range": fitted.fibre_beta_m_range(found.maps.beta_m),
             "doubts": _doubts(start, found.maps, fibre) + _flat(one_colour.left_open),
             "left_open": one_colour.left_open,
         }

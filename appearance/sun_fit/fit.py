@@ -119,7 +119,8 @@ def fit(
             x if np.isfinite(x) else None for x in colours.absorption_error(first.pairs).tolist()
         )
         sigma_a = (red, green, blue)
-        known = Uncertainty(found.error, found.low, found.high, sigma_a, found.tangents_deg)
+        tangents = found.tangents_deg, found.tangents_error_deg
+        known = Uncertainty(found.error, found.low, found.high, sigma_a, *tangents)
         stage.figures["sigma_a_error"] = list(known.sigma_a)
         for warning in known.warnings(colours.hair.sigma_a):
             stage.warn(warning)

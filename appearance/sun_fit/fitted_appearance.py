@@ -25,7 +25,8 @@ class Uncertainty:
     `beta_m` is the standard error of log β_M, `beta_m_low` and `beta_m_high` the ends of an
     interval of about 95 %; `sigma_a (3,)` the standard error of log sigma_a, None where the hair's
     colour does not answer to it. `tangents_deg` is how far the strands' inclinations are off, root
-    mean square; None where a fit of an earlier version did not say.
+    mean square, `tangents_error_deg` its standard error; None where a fit of an earlier version
+    did not say.
     """
 
     beta_m: float
@@ -33,6 +34,7 @@ class Uncertainty:
     beta_m_high: float
     sigma_a: tuple[float | None, float | None, float | None]
     tangents_deg: float | None = None
+    tangents_error_deg: float | None = None
 
     def warnings(self, sigma_a: tuple[float, float, float]) -> list[str]:
         """What a user has to know of an absorption `sigma_a` before believing it."""
@@ -73,6 +75,19 @@ class FittedAppearance:
         if self.uncertainty is None or self.uncertainty.tangents_deg is None:
             return None
         return roughness_without_scatter(beta_m, math.radians(self.uncertainty.tangents_deg))
+
+    def fibre_beta_m_range(self, beta_m: float) -> tuple[float, float] | None:
+        """`fibre_beta_m` with the scatter two standard errors more, and less.
+
+        The low end is 0 where more scatter would be too much of the lobe to tell. None where the
+        scatter's error is not known; what `beta_m` is off by comes on top.
+        """
+        known = self.uncertainty
+        if known is None or known.tangents_deg is None or known.tangents_error_deg is None:
+            return None
+        ends = (known.tangents_deg + k * known.tangents_error_deg for k in (2, -2))
+        low, high = (roughness_without_scatter(beta_m, math.radians(max(e, 0.0))) for e in ends)
+        return None if high is None else (low or 0.0, high)
 
     def save(self, model: Model) -> None:
         """Write `appearance.json`."""

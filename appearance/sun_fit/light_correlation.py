@@ -182,7 +182,8 @@ class Roughness:
     and between views, and `systematic`. `low`, `high` are the ends of an interval of about 95 %,
     inside `range`, that of the renderings. `views` are the answers of single views that have pairs
     enough. `misfit` is the χ² of the best match per degree of freedom. `tangents_deg` is how far
-    inclinations are off, root mean square, more than in the renderings.
+    inclinations are off, root mean square, more than in the renderings, and `tangents_error_deg`
+    its standard error.
     """
 
     beta_m: float
@@ -194,6 +195,7 @@ class Roughness:
     views: tuple[float, ...]
     misfit: float
     tangents_deg: float
+    tangents_error_deg: float
     systematic: float = 0.0
 
     def after(self, other: Roughness) -> Roughness:
@@ -210,6 +212,7 @@ class Roughness:
             low=float(max(self.low / wider, self.range[0])),
             high=float(min(self.high * wider, self.range[1])),
             tangents_deg=other.tangents_deg,
+            tangents_error_deg=other.tangents_error_deg,
             systematic=systematic,
         )
 
@@ -291,16 +294,16 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
     )
     chi2 = by_correlation + by_profile.min(axis=2)
     best = np.array([_lowest(x, c) for c in chi2.T])
+    profiles = by_profile[chi2.argmin(axis=0), np.arange(len(chosen))]
+    shifts = np.array([_lowest(_SHIFTS, p) for p in profiles])
     answer, alone = best[0], best[len(left_out) + 1 :]
-    scatter = float(np.sqrt((len(left_out) - 1) * best[jackknife].var()))
-    between = float(alone.std(ddof=1) / np.sqrt(len(alone))) if len(alone) > 1 else 0.0
+    scatter, between = _errors(best, len(left_out))
     least = chi2[:, 0].min()
     bins = captured.pairs.shape[1] + (_INNER.stop - _INNER.start) // 2
     misfit = float(least / (bins - 4))
     error = float(np.hypot(max(scatter, between) * max(misfit, 1.0) ** 0.5, _BETWEEN_RENDERINGS))
     inside = x[chi2[:, 0] <= least + 4 * max(misfit, 1.0)]
     low, high = min(answer - 2 * error, inside[0]), max(answer + 2 * error, inside[-1])
-    shift = _SHIFTS[by_profile[chi2[:, 0].argmin(), 0].argmin()]
     return Roughness(
         float(np.exp(answer)),
         error,
@@ -310,8 +313,19 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
         scatter * max(misfit, 1.0) ** 0.5,
         tuple(np.exp(alone).tolist()),
         misfit,
-        float(np.degrees(shift) / 2),
+        float(np.degrees(shifts[0]) / 2),
+        float(np.degrees(max(_errors(shifts, len(left_out)))) / 2),
     )
+
+
+def _errors(answers: Array, parts: int) -> tuple[float, float]:
+    """Standard errors of the first of `answers (N,)`: the jackknife's, and between views.
+
+    The next `parts` of them leave out a part of the hair each; the rest are those of single views.
+    """
+    left_out, alone = answers[1 : parts + 1], answers[parts + 1 :]
+    between = alone.std(ddof=1) / np.sqrt(len(alone)) if len(alone) > 1 else 0.0
+    return float(np.sqrt((parts - 1) * left_out.var())), float(between)
 
 
 def _relative(total: Array, count: Array) -> Array:

@@ -56,9 +56,9 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
 
     Fitted is what is rendered; where inverse rendering was run, both fits also stand by themselves
     (`sun_fit`, `inverse_rendering`), the latter with the fibres' β_M, without the scatter of the
-    strands' directions (`fibre_beta_m`), where it is known. Of maps the colour is the mean
-    over the cells. Sun's fit has the standard errors of its logarithms: `beta_m_error`, and
-    `sigma_a_error (3,)`, in which None stands for what the colour does not tell.
+    strands' directions (`fibre_beta_m`, `fibre_beta_m_range`), where it is known. Of maps the
+    colour is the mean over the cells. Sun's fit has the standard errors of its logarithms:
+    `beta_m_error`, and `sigma_a_error (3,)`, where None stands for what the colour does not tell.
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
@@ -89,6 +89,8 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
             out["inverse_rendering"] = figures(maps, sun.skin)
             if (fibre := sun.fibre_beta_m(maps.beta_m)) is not None:
                 out["inverse_rendering"]["fibre_beta_m"] = fibre
+                ends = sun.fibre_beta_m_range(maps.beta_m)
+                out["inverse_rendering"]["fibre_beta_m_range"] = ends and list(ends)
             out["fitted"] = out["inverse_rendering" if folder is model else "sun_fit"]
     return {
         **out,

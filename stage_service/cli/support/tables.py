@@ -49,8 +49,7 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     for key, what in _APPEARANCE.items():
         hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
     if any("fibre_beta_m" in figures for figures in fits.values()):
-        fibres = (figures.get("fibre_beta_m", []) for figures in fits.values())
-        hair.add_row("β_M without strands' scatter", *(_numbers(x) for x in fibres))
+        hair.add_row("β_M without strands' scatter", *map(_fibres, fits.values()))
     for key, what in _ERRORS.items():
         if any(key in figures for figures in fits.values()):
             hair.add_row(what, *(_per_cent(figures.get(key)) for figures in fits.values()))
@@ -195,6 +194,11 @@ def _per_cent(value: Any) -> str:
 def _numbers(value: Any) -> str:
     values = value if isinstance(value, list) else [value]
     return ", ".join(f"{x:.3g}" for x in values)
+
+
+def _fibres(figures: Mapping[str, Any]) -> str:
+    value, ends = (figures.get(key) for key in ("fibre_beta_m", "fibre_beta_m_range"))
+    return _numbers(value or []) + ("" if ends is None else f" ({ends[0]:.3g} to {ends[1]:.3g})")
 
 
 def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Group:

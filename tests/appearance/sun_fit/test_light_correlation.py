@@ -65,6 +65,15 @@ def test_tangents_that_are_off_leave_the_roughness(family, beta, shift_deg, nois
     assert found.tangents_deg == pytest.approx(shift_deg / 2, abs=3)  # a broad lobe hides it
 
 
+def test_the_tangents_error_says_what_other_pixels_would_have_said(family):
+    """Twelve other draws of the shifts, by lobes that do not hide them, against one draw's word."""
+    draws = [match_roughness(highlight(0.2, 20, 0.5, seed=k), family) for k in range(12)]
+    scatter = np.std([d.tangents_deg for d in draws], ddof=1)
+    told = np.median([d.tangents_error_deg for d in draws])
+    assert 0.4 * scatter < told < 2.5 * scatter
+    assert abs(np.mean([d.tangents_deg for d in draws]) - 10) < 3 * told
+
+
 def test_a_profile_alone_would_read_tangents_that_are_off_as_roughness(family):
     """The same lobes without the pairs: what the correlation is there for."""
     profile = [h.profiles(np.ones((1, 2 * SIDE**2)))[0, 0] for _, h in family]
