@@ -12,6 +12,7 @@ import re
 import resource
 import shutil
 import signal
+import struct
 import sys
 import tomllib
 from collections import Counter
@@ -19,8 +20,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import camera_writers as writers
+import cv2
 import numpy as np
 
+from appearance.render.environment_maps import load_environment
 from reconstruction import (
     Camera,
     Capture,
@@ -34,7 +38,12 @@ from reconstruction import (
     verify,
     write_strands,
 )
+from reconstruction.files.cameras import read_cameras
 from reconstruction.files.exr import read_exr, write_exr
+from reconstruction.files.lights import read_lights
+from reconstruction.files.pictures import Sensor, read_picture
+from reconstruction.files.points import read_points
+from reconstruction.geometry.ies import read_ies
 from reconstruction.reading import parse_json
 from stage_service.acquisition.states import read_status
 from stage_service.config import load_rig_file
@@ -129,6 +138,56 @@ def _exr(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
     return file, read_exr
 
 
+def _picture(name: str, kind: type[np.integer[Any]]) -> Callable[..., Any]:
+    def make(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
+        file = folder / name
+        values = np.random.default_rng(0).integers(np.iinfo(kind).max, size=(6, 8, 3), dtype=kind)
+        assert cv2.imwrite(str(file), values)
+        return file, lambda path: read_picture(path, Sensor(), (8, 6))
+
+    return make
+
+
+def _cameras(write: Callable[..., None], name: str, part: str = "") -> Callable[..., Any]:
+    def make(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
+        write(folder / name, _rig().cameras)
+        return folder / name / part, lambda _: read_cameras(folder / name)
+
+    return make
+
+
+def _file(name: str, data: bytes, read: Callable[[Path], Any]) -> Callable[..., Any]:
+    def make(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
+        (folder / name).write_bytes(data)
+        return folder / name, read
+
+    return make
+
+
+def _hdr(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
+    file = folder / "room.hdr"
+    assert cv2.imwrite(str(file), np.random.default_rng(0).random((6, 12, 3), np.float32))
+    return file, load_environment
+
+
+def _floats(count: int) -> bytes:
+    return np.linspace(-1, 1, count, dtype="<f4").tobytes()
+
+
+PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n%send_header\n" % b"".join(
+    b"property float %s\n" % n for n in (b"x", b"y", b"z", b"nx", b"ny", b"nz")
+)
+IES = b"""IESNA:LM-63-2002
+[TEST] none
+TILT=NONE
+1 1000 1.5 5 1 1 2 0.1 0.1 0
+1.0 1.0 20
+0 22.5 45 67.5 90
+0
+100 90 70 40 0
+"""
+
+
 def _obj(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
     file = folder / "head.obj"
     lines = [f"v {i} {i % 3} 0.5" for i in range(8)] + ["g scalp"]
@@ -158,7 +217,36 @@ FORMATS = {
     **{n.split(".")[0]: _of_capture(n) for n in ("journal.jsonl", "plan.json", "manifest.json")},
     "rig": _of_capture("rig.json"),
     **{suffix: _strands(suffix) for suffix in ("npz", "hair", "usda", "usdc")},
+    "tfx": _file(
+        "strands.tfx",
+        struct.pack("<f9I", 4.0, 3, 4, 160, *[0] * 6) + bytes(120) + _floats(48),
+        read_strands,
+    ),
+    "data": _file(
+        "strands.data",
+        struct.pack("<ii", 2, 4) + _floats(12) + struct.pack("<i", 3) + _floats(9),
+        read_strands,
+    ),
     "obj": _obj,
+    "ply": _file("scan.ply", PLY + _floats(54), read_points),
+    "points": _file("scan.csv", b"x,y,z\n0.1,0.2,0.3\n-1,2e-1,.5\n", read_points),
+    "lights": _file("lights.csv", b"name,x,y,z\na,0.1,0.2,0.3\nb,-1,2e-1,.5\n", read_lights),
+    "lamps": _file(
+        "lights.json", b'{"lights": [{"name": "a", "position": [1, 0.5, 2]}]}', read_lights
+    ),
+    "ies": _file("lamp.ies", IES, read_ies),
+    "hdr": _hdr,
+    "png": _picture("frame.png", np.uint8),
+    "png16": _picture("frame.png", np.uint16),
+    "tiff": _picture("frame.tif", np.uint16),
+    "jpeg": _picture("frame.jpg", np.uint8),
+    "avif": _picture("frame.avif", np.uint8),
+    "colmap": _cameras(writers.write_colmap_text, "sparse", "images.txt"),
+    "colmap_lenses": _cameras(writers.write_colmap_text, "sparse", "cameras.txt"),
+    "colmap_binary": _cameras(writers.write_colmap_binary, "sparse", "images.bin"),
+    "metashape": _cameras(writers.write_metashape, "cameras.xml"),
+    "transforms": _cameras(writers.write_transforms, "transforms.json"),
+    "opencv": _cameras(writers.write_opencv, "opencv", "cam_0.yml"),
     "toml": _toml,
     "options": _json(
         {

@@ -14,6 +14,9 @@ from typing import Any
 from reconstruction.arrays import Array
 from simulators.frames.responses import Responder, Response
 
+_ENDED_S = 5.0
+"""Until the system says how a process ended whose pipe is closed."""
+
 
 class RenderError(RuntimeError):
     """The rendering process failed or ended; the message has its reason."""
@@ -71,6 +74,7 @@ class RenderProcess(_Remote):
                 self._ours.send((what, (camera, *args)))
                 fine, answer = self._ours.recv()
             except (OSError, EOFError) as error:
+                self._process.join(_ENDED_S)  # the pipe closes before the system says why
                 code = self._process.exitcode
                 raise RenderError(
                     f"the rendering process ended (exit code {code}) in {what} of {camera}; its "

@@ -92,5 +92,5 @@ def _read_json(path: Path) -> CameraFile:
 def _root(path: Path) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(plain_file(path).read_bytes())
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError) as error:  # LookupError: no such encoding
         raise CameraFileError(f"{path}: broken XML ({error})") from error

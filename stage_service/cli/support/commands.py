@@ -39,24 +39,26 @@ class Output:
     """Prints one JSON object on stdout, or text for people."""
 
     def __init__(self, as_json: bool) -> None:
-        self.as_json = as_json
+        self.as_json, self._stdout = as_json, sys.stdout
 
     def result(self, data: dict[str, Any], text: Any = None) -> None:
         """Print a command's result: `data` as JSON, or `text` (a string or a rich renderable)."""
         if self.as_json:
-            print(json.dumps(data, allow_nan=False), flush=True)
+            print(json.dumps(data, allow_nan=False), file=self._stdout, flush=True)
             return
         from rich.console import Console
 
         shown = json.dumps(data, indent=1, allow_nan=False) if text is None else text
         # A table in a file or a log has no window to fit.
-        width = None if sys.stdout.isatty() else 120
-        Console(width=width, highlight=False).print(shown, markup=False, soft_wrap=True)
+        width = None if self._stdout.isatty() else 120
+        console = Console(width=width, highlight=False, file=self._stdout)
+        console.print(shown, markup=False, soft_wrap=True)
 
     def error(self, kind: str, detail: str, **more: Any) -> None:
         """Say what went wrong: on stderr, and with --json as the one object on stdout too."""
         if self.as_json:
-            print(json.dumps({"error": {"type": kind, "detail": detail, **more}}), flush=True)
+            said = {"error": {"type": kind, "detail": detail, **more}}
+            print(json.dumps(said), file=self._stdout, flush=True)
         print(f"hairstage: {detail}", file=sys.stderr, flush=True)
 
     def note(self, text: str) -> None:
@@ -216,7 +218,8 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
     args = parser.parse_args(argv)
     output = Output(as_json=args.json)
     try:
-        return args.run(args, output) or 0
+        with contextlib.redirect_stdout(sys.stderr):  # OpenEXR's warnings do not belong to a result
+            return args.run(args, output) or 0
     except KeyboardInterrupt:
         output.error("Interrupted", "interrupted")
         return 130

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import camera_writers as writers
 import cv2
 import numpy as np
 import pytest
@@ -17,14 +17,6 @@ from reconstruction.files.cameras import CameraFileError, read_cameras
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModel, LensModelCamera
 from reconstruction.geometry.placement import PlacementOptions, placed, resized
-
-_spec = importlib.util.spec_from_file_location(
-    "camera_writers", Path(__file__).with_name("camera_writers.py")
-)
-assert _spec is not None
-assert _spec.loader is not None
-writers = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(writers)
 
 POINTS = np.random.default_rng(3).uniform(-0.12, 0.12, (200, 3))
 LENS = np.array([-0.12, 0.03, 2e-3, -1e-3, 0.01])
@@ -136,6 +128,7 @@ def test_cameras_that_metashape_has_not_aligned_are_told(tmp_path: Path) -> None
     good = path.read_text()
     for old, new, words in (
         ("<document", "<documents", "broken XML"),
+        ('encoding="UTF-8"', 'encoding="UTF-x"', "broken XML"),
         ('sensor_id="2"', 'sensor_id="22"', "cam_02: there is no sensor '22'"),
         ('label="cam_03">', 'label="cam_03"><transform>1 2 3</transform>', "expected 16 finite"),
         ("LOCAL_CS", "GEOGCS", "on the globe .* local coordinates"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 
 import numpy as np
 import pytest
@@ -87,3 +88,10 @@ def test_a_subject_that_moves_is_seen_to_move(tiny_rig, subject):
     expected = after.mean(axis=0) - before.mean(axis=0)
     assert np.linalg.norm(expected) > 0.5
     assert middle(k) - middle(0) == pytest.approx(expected, abs=0.5)
+
+
+def test_how_a_renderer_ended_is_told():
+    process = RenderProcess(functools.partial(os._exit, 7))
+    with pytest.raises(RenderError, match="exit code 7"):
+        process.lights("cam_a")
+    process.stop()

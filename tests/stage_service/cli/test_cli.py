@@ -21,7 +21,7 @@ import pytest
 from reconstruction import CaptureWriter, Rig, Step, Strands, write_exr, write_strands
 from stage_service.cli import build_parser, main
 from stage_service.cli.support.children import Children
-from stage_service.cli.support.commands import CommandError, rig_path
+from stage_service.cli.support.commands import CommandError, rig_path, run_command
 
 RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 
@@ -71,6 +71,19 @@ def test_help_is_fast_because_nothing_heavy_is_imported():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_what_libraries_print_is_no_part_of_a_result(capsys):
+    def noisy(args, output):
+        print("Warning: a binding's own")
+        output.result({"found": 1})
+
+    parser = argparse.ArgumentParser()
+    parser.set_defaults(run=noisy, json=True)
+    assert run_command(parser, []) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out) == {"found": 1}
+    assert "Warning" in shown.err
 
 
 def test_wrong_usage_is_exit_code_2(capsys):
