@@ -31,6 +31,7 @@ import numpy as np
 from reconstruction.arrays import Bools, Floats
 from reconstruction.capture.exposures import Merged, Unchanged, flattened, merge
 from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.grey_ball import PlacedBall, Scale
 from reconstruction.capture.import_geometry import Geometry
 from reconstruction.capture.import_settings import (
     SETTINGS,
@@ -51,6 +52,9 @@ from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.placement import PlacementError, resized
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
+
+BALL_FRAMES = 48
+"""Frames that are read, evenly spread, for what a grey ball says."""
 
 
 def import_folder(
@@ -80,7 +84,7 @@ class Import:
     """A folder as it was understood: nothing but names and sizes has been read yet.
 
     `shot` are the cameras of the pictures, by name; `lenses` of those whose pictures are resampled,
-    as a rig cannot hold their lens; `rig` is the capture's.
+    as a rig cannot hold their lens; `rig` is the capture's; `ball` is grey and tells W/(sr m²).
     """
 
     folder: Path
@@ -90,6 +94,7 @@ class Import:
     lenses: Mapping[str, Lens]
     found: Found
     head: Mesh | None
+    ball: PlacedBall | None = None
 
     @classmethod
     def of(
@@ -121,7 +126,15 @@ class Import:
         lit = {s.light for s in found.steps}
         rig = Rig(folder.name, kept, tuple(x for x in lights if x.name in lit), projectors)
         head = _head(folder / "head.obj")
-        return cls(folder, settings, rig, cameras, lenses, found, head)
+        ball = None
+        if settings.grey_ball is not None:
+            if settings.units == "relative" or settings.scale != 1:
+                raise ImportProblem("a grey_ball stands for `scale`: leave `units` and it out")
+            try:
+                ball = PlacedBall.of(settings.grey_ball, cameras)
+            except ValueError as error:
+                raise ImportProblem(f"grey_ball.{error}") from error
+        return cls(folder, settings, rig, cameras, lenses, found, head, ball)
 
     @property
     def missing(self) -> list[tuple[Step, str]]:
@@ -136,6 +149,8 @@ class Import:
     @property
     def relative(self) -> bool:
         """Whether nothing says what the pictures' numbers are in W/(sr m²)."""
+        if self.ball is not None:
+            return False
         if self.settings.units is not None:
             return self.settings.units == "relative"
         files = [p for b in self.found.frames.values() for p in b.values()]
@@ -192,7 +207,7 @@ class Import:
         """
         subjects = self._subjects(progress)
         masks = {n: _mask(p, self.shot[n]) for n, p in self.found.hair.items()}
-        notes = {"notes": list(self.found.notes), "relative": self.relative}
+        notes = {"notes": [*self.found.notes, *self._ball_says], "relative": self.relative}
         plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": notes}
         writer = CaptureWriter.create(
             out, self.rig, plan, masks=self._undistorted(masks), head=self.head,
@@ -222,13 +237,49 @@ class Import:
 
     def frame(self, bracket: Bracket, camera: str) -> Merged:
         """The files of one frame, merged, in the pixels of the pictures. Raises `ImportProblem`."""
+        return self._merged(bracket, camera, self._scale.value)
+
+    def _merged(self, bracket: Bracket, camera: str, scale: float) -> Merged:
         size = (self.shot[camera].width, self.shot[camera].height)
         try:
             pictures = {s: read_picture(p, self.settings.sensor, size) for s, p in bracket.items()}
         except PictureError as error:
             raise ImportProblem(str(error)) from error
-        merged = merge(pictures, self.settings.scale)
+        merged = merge(pictures, scale)
         return flattened(merged, self._flats[camera]) if camera in self._flats else merged
+
+    @cached_property
+    def _scale(self) -> Scale:
+        """The user's scale, or the grey ball's, by `BALL_FRAMES` frames at most."""
+        if self.ball is None:
+            return Scale(self.settings.scale, 0.0, ())
+        shown = [
+            (step, camera)
+            for step in self.found.steps
+            for camera in self.ball.seen
+            if step.kind == "olat" and (step.index, camera) in self.found.frames
+        ]
+        factors = []
+        for step, camera in shown[:: -(-len(shown) // BALL_FRAMES) or 1]:
+            merged = self._merged(self.found.frames[step.index, camera], camera, 1.0)
+            light = self.rig.light(str(step.light))
+            image, bad = merged.radiance, merged.saturated
+            factors.append(self.ball.factor(self.shot[camera], light, image, bad))
+        try:
+            return Scale.of([f for f in factors if f is not None])
+        except ValueError as error:
+            raise ImportProblem(f"grey_ball: {error}") from error
+
+    @property
+    def _ball_says(self) -> list[str]:
+        if self.ball is None:
+            return []
+        where, scale = ", ".join(f"{x:.3f}" for x in self.ball.center), self._scale
+        said = f"grey ball: {1e3 * self.ball.radius:.0f} mm in radius at ({where}) m; a full "
+        said += f"channel at 1 s is {scale.value:.4g} W/(sr m²), standard error {scale.error:.1%}"
+        if all((x.intensity == 1).all() for x in self.rig.lights):
+            said += ", of lights of 1 W/sr each, as the lights' file gives no intensities"
+        return [said, *self._scale.notes]
 
     @cached_property
     def _flats(self) -> Mapping[str, Floats]:

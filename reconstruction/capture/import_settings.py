@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from reconstruction.capture.folder import CaptureError, Step, StepKind
+from reconstruction.capture.grey_ball import GreyBall
 from reconstruction.capture.import_geometry import GeometryFiles
 from reconstruction.files.pictures import (
     FORMATS,
@@ -60,7 +61,8 @@ class ImportSettings:
     says itself (EXIF); `exposures` names others. `first_light`: the number in a picture's name that
     stands for the first light of the list, those after it following; None: the number that the
     light's own name ends in. `units`: whether a full channel at 1 s is `scale` W/(sr m²), or
-    unknown. `geometry`: the files of cameras and lights, relative to the folder.
+    unknown; a `grey_ball` in view says it instead of `scale`. `geometry`: the files of cameras and
+    lights, relative to the folder.
     """
 
     pictures: Patterns = Patterns()
@@ -70,6 +72,7 @@ class ImportSettings:
     first_light: int | None = None
     units: Literal["radiance", "relative"] | None = None
     scale: Positive = 1.0
+    grey_ball: GreyBall | None = None
     geometry: GeometryFiles = GeometryFiles()
 
 
@@ -205,7 +208,7 @@ def _notes(
         )
     if left:
         out.append(f"{len(left)} pictures match no pattern: {_few(left)}")
-    if settings.units is None and suffixes - {".exr"}:
+    if settings.units is None and settings.grey_ball is None and suffixes - {".exr"}:
         out.append("relative units: no `scale` says what a full channel is in W/(sr m²)")
     return out
 

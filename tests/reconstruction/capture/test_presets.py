@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections import Counter
 from pathlib import Path
 
+import camera_writers as writers
 import cv2
 import numpy as np
 import pytest
@@ -18,14 +18,6 @@ from reconstruction.capture.presets import HATCH, PresetFiles, Take, read_preset
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.placement import PlacementError
 from stage_service.cli import main
-
-_spec = importlib.util.spec_from_file_location(
-    "camera_writers", Path(__file__).parents[1] / "files" / "camera_writers.py"
-)
-assert _spec is not None
-assert _spec.loader is not None
-writers = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(writers)
 
 COUNT = 331
 AT_0 = [0, 20, 41, 62, 83, 104, 125, 146, 167, 188, 209, 230, 251, 272, 293, 314, 335, 348]
