@@ -9,6 +9,7 @@ and what an open console costs a capture.
 from __future__ import annotations
 
 import argparse
+import itertools
 import random
 import statistics
 import time
@@ -146,10 +147,15 @@ def _judge(live: Live) -> dict[str, Any]:
     """Every capture read again: outcomes, frames, and what is wrong."""
     outcomes: dict[str, int] = {}
     frames, wrong = 0, []
-    for capture in live.ask("GET", "/captures"):
-        outcomes[capture["outcome"]] = outcomes.get(capture["outcome"], 0) + 1
-        frames += capture["frames_written"]
-        wrong += [f"{capture['id']}: {problem}" for problem in verify(capture["path"])]
+    page = 1000
+    for offset in itertools.count(0, page):
+        captures = live.ask("GET", f"/captures?limit={page}&offset={offset}")
+        for capture in captures:
+            outcomes[capture["outcome"]] = outcomes.get(capture["outcome"], 0) + 1
+            frames += capture["frames_written"]
+            wrong += [f"{capture['id']}: {problem}" for problem in verify(capture["path"])]
+        if len(captures) < page:
+            break
     return {"outcomes": outcomes, "frames": frames, "wrong": wrong, "at_the_end": live.size()}
 
 
