@@ -148,6 +148,13 @@ def get_few(model: OnModel, body: Light) -> list[dict[str, Any]]:
     return model.lighting.few(dict(body.weights))
 
 
+@reading.post("/{name}/indirect", **BYTES)
+def post_indirect(model: OnModel, body: Light) -> Response:
+    """Light between fibres under these lights: RGBA radiance (float32) of cells of the box of the
+    strands, x fastest. Paths are traced when it is first asked for, which takes seconds."""
+    return _bytes(model.lighting.indirect(dict(body.weights)))
+
+
 @reading.post("/{name}/sums/{camera}.png", **PNG)
 def get_sum(model: OnModel, camera: str, body: Light) -> Response:
     """A camera's captured frames under these lights: their sum, exposed, in the sRGB curve."""

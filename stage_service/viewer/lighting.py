@@ -22,6 +22,7 @@ from appearance.render.visibility import above_faces, reached, within_fibres
 from reconstruction import Capture, Light, Model
 from reconstruction.arrays import Array
 from reconstruction.geometry.lights import dome_positions
+from stage_service.viewer.indirect import BakeOptions, IndirectLight, bake
 from stage_service.viewer.packing import PackedStrands
 from stage_service.viewer.viewed import BadLight
 
@@ -39,7 +40,7 @@ class Lighting:
 
     def __init__(self, model: Model, capture: Capture | None, packed: PackedStrands) -> None:
         self._model, self._capture, self._packed = model, capture, packed
-        self._lock = threading.RLock()
+        self._lock, self._baking = threading.RLock(), threading.Lock()
         self._seen: OrderedDict[int, bytes] = OrderedDict()
         self._sums: tuple[str, LightSums] | None = None
 
@@ -83,7 +84,7 @@ class Lighting:
                 "logistic_scale": float(logistic_scale(hair.beta_n)),
                 "absorption": [float(x) for x in hair.sigma_a],
                 "skin": list(fitted.appearance.skin),
-                "colour": list(fitted.appearance.colour),
+                "cells": [x.tolist() for x in self._box],
                 "one_material": fitted.maps.uniform,
                 "field": fitted.field is not None,
             }
@@ -98,12 +99,7 @@ class Lighting:
 
     def few(self, weights: dict[int, list[float]]) -> list[dict[str, Any]]:
         """The few lights that the shader is to have for all of `weights` (number: RGB)."""
-        full = np.zeros((len(self.lights), 3))
-        for number, value in weights.items():
-            if not 0 <= number < len(self.lights):
-                raise BadLight(f"there is no light number {number}: 0 to {len(self.lights) - 1}")
-            full[number] = value
-        chosen = few_lights(self.lights, full, MOST_LIGHTS)
+        chosen = few_lights(self.lights, self._full(weights), MOST_LIGHTS)
         return [
             {
                 "number": i,
@@ -112,6 +108,36 @@ class Lighting:
             }
             for i, w in chosen
         ]
+
+    def _full(self, weights: dict[int, list[float]]) -> Array:
+        full = np.zeros((len(self.lights), 3))
+        for number, value in weights.items():
+            if not 0 <= number < len(self.lights):
+                raise BadLight(f"there is no light number {number}: 0 to {len(self.lights) - 1}")
+            full[number] = value
+        return full
+
+    @property
+    def _box(self) -> tuple[Array, Array]:
+        """Where the grid of indirect light begins and ends: the box of the strands."""
+        low, points = self._packed.low, self._packed.points.reshape(-1, 3)
+        extent = points.max(axis=0) if len(points) else np.ones(3)
+        return low, low + self._packed.step * np.maximum(extent, 1)
+
+    @cached_property
+    def _indirect(self) -> IndirectLight:
+        return bake(self._scene, self._box, self.lights, BakeOptions())
+
+    def indirect(self, weights: dict[int, list[float]]) -> bytes:
+        """What lights (number: RGB) make of light between fibres: radiance `(n, n, n, 4)`, float32,
+        z, y, x; the last is not used. The first call traces paths for seconds."""
+        full = self._full(weights)
+        with self._baking:
+            baked = self._indirect
+        places = np.array([x.position for x in self.lights])
+        power = np.array([x.intensity_towards(np.zeros(3)) for x in self.lights])
+        lit = baked.lit(places, full * power / (places**2).sum(axis=1, keepdims=True))
+        return np.pad(lit, ((0, 0),) * 3 + ((0, 1),)).astype("<f4").tobytes()
 
     def seen(self, number: int) -> bytes:
         """Whether light `number` reaches each point `(S, n)`, then each vertex of the head: uint8.

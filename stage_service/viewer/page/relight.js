@@ -4,7 +4,7 @@
 import { choice, element, labelled, slider } from "./controls.js";
 import { texture } from "./gl.js";
 import * as net from "./net.js";
-import { dot, unit } from "./space.js";
+import { dot, sub, unit } from "./space.js";
 
 const NEAREST = 3;
 
@@ -30,7 +30,30 @@ export class Relight {
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, wide, high);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, wide, high, gl.RGBA, gl.FLOAT, values);
     });
+    this.between = this.cells(new Float32Array(4), 1);
     picture.setLighting(this);
+  }
+
+  cells(values, side) {
+    const { gl } = this.viewer;
+    return texture(gl, gl.TEXTURE_3D, gl.LINEAR, () => {
+      gl.texStorage3D(gl.TEXTURE_3D, 1, gl.RGBA16F, side, side, side);
+      gl.texSubImage3D(
+        gl.TEXTURE_3D, 0, 0, 0, 0, side, side, side, gl.RGBA, gl.FLOAT, values);
+    });
+  }
+
+  // Light between fibres: the server traces it once, which takes a while; the rest does not wait.
+  async indirect(body) {
+    const { viewer } = this, asked = this.asked = {};
+    if (!this.baked) viewer.status("tracing light between the fibres: once, and it takes a while");
+    const values = new Float32Array(await net.bytes("/indirect", body));
+    this.baked = true;
+    if (asked !== this.asked) return;
+    viewer.gl.deleteTexture(this.between.texture);
+    this.between = this.cells(values, Math.round(Math.cbrt(values.length / 4)));
+    viewer.status("");
+    viewer.draw();
   }
 
   // All lights, or number `only` alone, as bright as if it stood for all turns of `lights`.
@@ -49,11 +72,12 @@ export class Relight {
       uTable: this.table, uVariance: material.variances, uTilt: material.tilt,
       uEta: material.eta, uLogistic: material.logistic_scale, uAbsorption: material.absorption,
       uGrid: [material.cosines, material.turns], uSkin: material.skin,
-      uAmbient: material.colour.map((c) => this.ambient * c / (4 * Math.PI)),
+      uIndirect: this.between, uAmbient: this.ambient,
+      uCells: material.cells[0], uSpan: sub(material.cells[1], material.cells[0]),
     };
   }
 
-  ambient = 0.5;
+  ambient = 1;
 
   // --- the light
   towards(way, colour = [1, 1, 1]) {
@@ -133,13 +157,14 @@ export class Relight {
     this.lights = lights;
     viewer.draw();
     viewer.status("");
+    this.traced = this.indirect(body).catch((error) => viewer.status(error.message));
   }
 
   // --- the panel
   controls() {
     const { viewer, told } = this, { state } = viewer.picture;
     const parts = [element("h2", { textContent: "Light" }), this.dome()];
-    const colour = element("input", { type: "color", value: "#ffffff" });
+    const colour = element("input", { type: "color", value: "#ffffff", ariaLabel: "colour of the paint" });
     this.colour = () => [1, 3, 5].map((i) =>
       (parseInt(colour.value.slice(i, i + 2), 16) / 255) ** 2.2);
     const paint = element("button", { textContent: "Paint" });
@@ -176,8 +201,8 @@ export class Relight {
         viewer.draw();
       })));
       const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and what leaves " +
-        "later) with shadows; light between fibres is an even guess from their colour, set by " +
-        "“indirect”, not computed."];
+        "later) with shadows; light between fibres, times “indirect”, is path-traced once and kept " +
+        "coarsely: some millimetres, the same to every side."];
       if (!told.material.one_material) notes.push("One material is shown: the mean of its map.");
       if (told.material.field) notes.push("The model's field is not shown.");
       notes.push("Of an environment the eight strongest lights are shaded.");

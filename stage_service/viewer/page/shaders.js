@@ -229,7 +229,13 @@ Tilted tilted(float si, float ci, float tilt) {  // the inclination that R, TT, 
 const LIGHTS = `
 uniform int uLights;
 uniform vec3 uLightAt[8], uLightPower[8];
-uniform vec3 uAmbient;
+uniform sampler3D uIndirect;  // of all lights together, in cells from uCells to uCells + uSpan
+uniform vec3 uCells, uSpan;
+uniform float uAmbient;
+vec3 indirect(vec3 p) {
+  vec3 n = vec3(textureSize(uIndirect, 0));
+  return uAmbient * texture(uIndirect, ((p - uCells) / uSpan * (n - 1.0) + 0.5) / n).rgb;
+}
 vec3 incoming(int i, vec3 p, out vec3 l) {
   l = uLightAt[i] - p;
   float d2 = dot(l, l);
@@ -252,11 +258,10 @@ vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) {
   float si = clamp(dot(t, view), -1.0, 1.0), ci = sqrt(max(1.0 - si * si, 1e-8));
   Tilted leans = tilted(si, ci, uTilt);
   vec4 seen0 = texelFetch(uSeen0, at, 0), seen1 = texelFetch(uSeen1, at, 0);
-  vec3 across = (view - si * t) / ci, sum = vec3(0.0);
+  vec3 across = (view - si * t) / ci, sum = indirect(p);
   for (int i = 0; i < uLights; i++) {
     vec3 l;
     vec3 power = incoming(i, p, l);
-    sum += uAmbient * power;
     float seen = i < 4 ? seen0[i] : seen1[i - 4];
     if (seen == 0.0) continue;
     float so = clamp(dot(t, l), -1.0, 1.0), co = sqrt(max(1.0 - so * so, 1e-8));
@@ -327,7 +332,7 @@ vec3 fibre(vec3 t, vec3 view, vec3 l) {
 void main() {
   vec3 p = surface(), l;
   if (dot(uSlice.xyz, p) > uSlice.w) discard;
-  vec3 power = incoming(0, p, l), c = uAmbient * power;
+  vec3 power = incoming(0, p, l), c = indirect(p);
   if (!hidden(p, vStrand, 2e-5)) c += power * fibre(normalize(vTangent), normalize(uEye - p), l);
   oColour = vec4(c * uOpacity, uOpacity);
 }`;
@@ -335,12 +340,12 @@ void main() {
 export const LIT_HEAD = LIGHTS + `
 uniform vec3 uSkin;
 vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
-  vec3 sum = vec3(0.0);
+  vec3 sum = indirect(p);
   for (int i = 0; i < uLights; i++) {
     vec3 l;
     vec3 power = incoming(i, p, l);
     float seen = i < 4 ? seen0[i] : seen1[i - 4];
-    sum += power * (seen * max(dot(n, l), 0.0) / 3.14159265 * uSkin + uAmbient);
+    sum += power * seen * max(dot(n, l), 0.0) / 3.14159265 * uSkin;
   }
   return sum;
 }`;
@@ -353,5 +358,5 @@ vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
   vec3 l, power = incoming(0, p, l);
   float cosine = max(dot(n, l), 0.0);
   bool dark = cosine == 0.0 || hidden(p + 2.0 * uTexel * n, 0xfffffffeu, 2.0 * uTexel);
-  return power * ((dark ? 0.0 : cosine / 3.14159265) * uSkin + uAmbient);
+  return power * (dark ? 0.0 : cosine / 3.14159265) * uSkin + indirect(p);
 }`;

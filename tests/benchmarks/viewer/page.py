@@ -102,9 +102,12 @@ PREPARE = """async () => {
 
 LIGHT = """async (what) => {
     const { relight } = viewer;
-    if (typeof what !== "string") return relight.set(what);
-    const net = await import("/view/page/net.js");
-    return relight.environment(() => net.json(net.ofModel(`/environments/${what}`)));
+    if (typeof what !== "string") await relight.set(what);
+    else {
+        const net = await import("/view/page/net.js");
+        await relight.environment(() => net.json(net.ofModel(`/environments/${what}`)));
+    }
+    await relight.traced;
 }"""
 
 AT_REST = """async ([size, least, ambient]) => {

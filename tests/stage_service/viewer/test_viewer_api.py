@@ -97,6 +97,7 @@ def test_light_that_cannot_be_made_is_refused_with_what_is_wrong(http):
     assert http.post(f"{base}/few", json={"weights": {"4": [1, 1]}}).status_code == 422
     assert http.get(f"{base}/seen/400").status_code == 404
     assert http.get(f"{base}/table").status_code == 404  # no material was fitted
+    assert http.post(f"{base}/indirect", json={"weights": {"4": [1, 1, 1]}}).status_code == 404
 
 
 def test_a_map_becomes_lights_of_its_power(http):
