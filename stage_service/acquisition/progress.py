@@ -69,6 +69,7 @@ class RunProgress:
         self._run: Sequence[Step] = ()
         self._came = dict.fromkeys(frames, 0)  # of the box's run that is under way
         self._began = self._first_at = self._told_at = 0.0
+        self._told: Progress | None = None
 
     def skip(self, steps: Iterable[Step]) -> None:
         """These were shot before this run."""
@@ -161,11 +162,17 @@ class RunProgress:
             self._done += 1
             self._todo[step.kind] -= 1
 
+    def waiting(self) -> None:
+        """The run still waits: tell what came too soon after the last time to be told."""
+        self._say()
+
     def _say(self) -> None:
         with self._lock:
             now = self._clock()
             if now - self._told_at < TELL_S:
                 return
-            self._told_at = now
             progress = self.now()
+            if progress == self._told:
+                return
+            self._told_at, self._told = now, progress
         self._tell(progress)

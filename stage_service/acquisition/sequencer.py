@@ -327,7 +327,7 @@ class Sequencer:
             pulse = self._exposing.expose(step)
             self._pulses.fired(pulse.count)
             with self._timings.on("cameras"):
-                shot = cameras(self._read)
+                shot = cameras(self._read, self.progress.waiting)
             for camera in self.devices.cameras:
                 frame = shot[camera.name]
                 self._account(camera, frame, pulse)

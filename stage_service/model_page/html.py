@@ -38,12 +38,17 @@ def joined(content: Iterable[str]) -> Html:
     return Html("".join(c if isinstance(c, Html) else escape(c) for c in content))
 
 
+def heading(text: str) -> Html:
+    """The cell above a column; over one without a name it is no heading."""
+    return element("th", text, scope="col") if text else element("td")
+
+
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> Html:
     """A table that scrolls by itself where it is too wide; nothing where it has no rows."""
     body = [element("tr", *(element("td", cell) for cell in row)) for row in rows]
     if not body:
         return Html("")
-    top = element("tr", *(element("th", head, scope="col") for head in heads))
+    top = element("tr", *map(heading, heads))
     parts = [element("thead", top)] if any(heads) else []
     inner = element("table", *parts, element("tbody", *body))
     return element("div", inner, class_=f"wide {kind}".strip())

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from reconstruction.report.report import Series, Stage
-from stage_service.model_page.html import Html, element, number, seconds, words
+from stage_service.model_page.html import Html, element, heading, number, seconds, words
 
 WIDTH, HEIGHT = 520, 250
 LEFT, RIGHT, TOP, BOTTOM = 64, 12, 12, 34
@@ -34,7 +34,7 @@ def time_bars(stages: Sequence[Stage]) -> Html:
             )
         )
     heads = ("stage", "", "time", "share", "peak memory")
-    top = element("tr", *(element("th", h, scope="col") for h in heads))
+    top = element("tr", *map(heading, heads))
     inner = element("table", element("thead", top), element("tbody", *rows))
     return element("div", inner, class_="wide time")
 

@@ -15,7 +15,7 @@ from fastapi.responses import FileResponse
 STATIC = Path(__file__).with_name("static")
 FILES = {path.name: path for path in STATIC.iterdir() if path.is_file()}
 FOLDER = "/web/"
-PAGES = {"/": "index.html", "/docs": "docs.html"}
+PAGES = {"/": "index.html", "/docs": "docs.html", "/favicon.ico": "icon.svg"}
 HEADERS = {
     "cache-control": "no-cache",
     "content-security-policy": (
@@ -50,3 +50,9 @@ def console() -> FileResponse:
 def docs() -> FileResponse:
     """The API, from /openapi.json."""
     return get_file(PAGES["/docs"])
+
+
+@router.get("/favicon.ico")
+def icon() -> FileResponse:
+    """What browsers ask for beside pages that name no icon: a model's, the viewer's."""
+    return get_file(PAGES["/favicon.ico"])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Any, TypeVar
 
 from stage_service.devices.cameras.interface import CameraDevice
 from stage_service.devices.errors import Cancelled
 
 T = TypeVar("T")
+LOOK_S = 0.25
 Work = queue.SimpleQueue[tuple[Callable[[CameraDevice], Any], Future[Any]] | None]
 
 
@@ -29,8 +30,12 @@ class FanOut:
             name = f"camera-{camera.name}"
             threading.Thread(target=_serve, args=(camera, work), name=name, daemon=True).start()
 
-    def __call__(self, call: Callable[[CameraDevice], T]) -> dict[str, T]:
+    def __call__(
+        self, call: Callable[[CameraDevice], T], waiting: Callable[[], object] | None = None
+    ) -> dict[str, T]:
         """`call(camera)` for every camera, by name, when all are done.
+
+        Until then `waiting()` is called every `LOOK_S` seconds.
 
         Raises the error of the only camera that failed, or an `ExceptionGroup` of all that did;
         `Cancelled` only where nothing else went wrong.
@@ -38,6 +43,8 @@ class FanOut:
         answers: list[Future[T]] = [Future() for _ in self.cameras]
         for work, answer in zip(self._work, answers, strict=True):
             work.put((call, answer))
+        while waiting is not None and wait(answers, LOOK_S).not_done:
+            waiting()
         errors = [e for a in answers if isinstance(e := a.exception(), Exception)]
         errors = [e for e in errors if not isinstance(e, Cancelled)] or errors[:1]
         if len(errors) == 1:

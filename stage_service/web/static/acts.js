@@ -13,11 +13,14 @@ export function notice(text, kind = "") {
   setTimeout(() => made.remove(), kind === "bad" ? 15_000 : 6000);
 }
 
+const LEFT = new Error("left without a name");
+
 /** Do what a button is for; a refusal is told. */
 export async function attempt(work) {
   try {
     return await work();
   } catch (error) {
+    if (error === LEFT) return undefined;
     notice(error.status === 401 ? "log in again" : error.message, "bad");
     return undefined;
   }
@@ -65,18 +68,19 @@ export function left(c) {
   return s === null || s === undefined ? "time left: not known yet" : `${seconds(s)} left`;
 }
 
-/** Who steers, as the others see it. */
+/** Who steers, as the others see it. Raises `LEFT` where nobody says. */
 export async function askName() {
   const known = localStorage.getItem("name") ?? S.who?.name ?? "";
   if (known) return known;
-  return new Promise((done) => {
+  return new Promise((done, left_) => {
     const field = h("input", { name: "holder", required: true, maxlength: 100, autocomplete: "name" });
     const box = h("dialog", { "aria-label": "who steers" }, h("form", { onsubmit: (event) => {
       event.preventDefault();
       localStorage.setItem("name", field.value);
-      box.remove();
       done(field.value);
-    } }, h("label", "Your name, as the others see it", field), h("button.go", "Steer")));
+      box.close();
+    } }, h("label", "Your name, as the others see it", field), h(".line", h("button.go", "Steer"), button("Cancel", () => box.close()))));
+    box.addEventListener("close", () => { box.remove(); left_(LEFT); }); // nothing, after `done`
     document.body.append(box);
     box.showModal();
   });

@@ -39,7 +39,7 @@ export async function ask(what, body, more = {}) {
   });
   const data = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : null;
   if (answer.ok) return data;
-  if (answer.status === 401 && path !== "/login") login.dispatchEvent(new Event("over"));
+  if (answer.status === 401 && what !== "POST /login") login.dispatchEvent(new Event("over"));
   throw new Problem(answer.status, data ?? {});
 }
 

@@ -103,4 +103,5 @@ export function clock(iso) {
   return at.toDateString() === new Date().toDateString() ? time : `${at.toISOString().slice(0, 10)} ${time}`;
 }
 
-export const words = (name) => name.replaceAll("_", " ");
+/** A name of the API in words, with its unit after a comma. */
+export const words = (name) => name.replace(/_(mm|px|deg|s|hz)$/, (_, unit) => `, ${unit === "hz" ? "Hz" : unit}`).replaceAll("_", " ");

@@ -40,7 +40,7 @@ export function dome(rig, { onpick = null, label = "" } = {}) {
     svg("circle", { class: "rim", r: 1 }),
     svg("circle", { class: "equator", r: Math.SQRT1_2 }),
     svg("path", { class: "head", d: "M-.05.025C-.05-.075.05-.075.05.025L.02.06 0 .085-.02.06Z" }),
-    ...devices, ...spots);
+    ...spots, ...devices);
   let before = [null, null, null, null, null];
   // The one that is lit is another circle over all of them, which moves: nothing else is drawn anew.
   const named = svg("title");

@@ -49,7 +49,7 @@ function jobOf(view, id) {
   const timed = h("section", h("h2", "Stages"), h("table", h("thead", h("tr", h("th", "stage"), h("th.n", "seconds"), h("th", "warnings"))), stages));
   const files = h("section");
   const page = h("section");
-  curves.style.setProperty("--cell", "22rem");
+  curves.style.setProperty("--cell", "18rem");
   view.replaceChildren(title, facts, wrong, what, meter, acts, curves, timed, page, files);
   let last = "";
   let job = null;
@@ -85,13 +85,14 @@ function jobOf(view, id) {
     const rows = {
       "Pipeline": job.pipeline, "State": job.outcome ?? job.state, "Capture": job.capture.split("/").at(-1), "Model": job.model.split("/").at(-1),
       "Begun": clock(job.started), "Took": job.finished && job.started ? seconds((new Date(job.finished) - new Date(job.started)) / 1000) : "–",
-      "Time left": job.state === "running" ? `about ${seconds(timeLeft())}, if steps take alike` : "–",
+      ...(job.state === "running" ? { "Time left": `about ${seconds(timeLeft())}, if steps take alike` } : {}),
     };
     say(facts, ...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
     say(wrong, job.error ? `${job.error.type}: ${job.error.detail}` : "");
     wrong.hidden = !job.error;
     say(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "It waits for a worker." : "");
     meter.hidden = job.state !== "running";
+    what.hidden = job.state === "done";
     meter.value = p?.share ?? 0;
     meter.title = percent(p?.share ?? 0);
     const may = S.who?.scopes.includes("jobs");
@@ -138,7 +139,7 @@ function jobOf(view, id) {
 /** Error against run time, both from 0 or by powers of ten where it spans more than one. */
 function curve(title, series) {
   const points = series.points.filter(([, e]) => Number.isFinite(e));
-  const [width, height, pad] = [440, 190, 56];
+  const [width, height, pad] = [340, 170, 60];
   const errors = points.map(([, e]) => e);
   const log = Math.min(...errors) > 0 && Math.max(...errors) / Math.min(...errors) > 10;
   const f = log ? Math.log10 : (x) => x;
@@ -147,12 +148,14 @@ function curve(title, series) {
   const end = Math.max(...points.map(([t]) => t)) || 1;
   const x = (t) => pad + ((width - pad - 12) * t) / end;
   const y = (e) => height - 26 - ((height - 44) * (f(e) - low)) / (high - low || 1);
+  const [first, final] = [errors[0], errors.at(-1)].map((e) => Math.min(height - 28, y(e) + 4));
+  const apart = Math.abs(first - final) < 12 ? (first < final ? -6 : 6) : 0; // so that neither number covers the other
   const text = (at, up, words_, anchor) => svg("text", { x: at, y: up, "text-anchor": anchor }, words_);
   const said = `${title}: ${series.error} ${number(errors[0])} at the start, ${number(errors.at(-1))} after ${seconds(points.at(-1)[0])}`;
   return h("figure", svg("svg", { class: "curve", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": said },
     svg("path", { class: "axis", d: `M${pad} 12V${height - 26}H${width - 8}` }),
     svg("path", { class: "data", d: `M${points.map(([t, e]) => `${x(t).toFixed(1)} ${y(e).toFixed(1)}`).join("L")}` }),
-    text(pad - 5, y(errors[0]) + 4, number(errors[0]), "end"), text(pad - 5, Math.min(height - 28, y(errors.at(-1)) + 4), number(errors.at(-1)), "end"),
+    text(pad - 5, first + apart, number(errors[0]), "end"), text(pad - 5, final - apart, number(errors.at(-1)), "end"),
     text(width - 8, height - 10, seconds(end), "end"), text(pad, height - 10, "0 s", "start")),
     h("figcaption", `${title} · ${series.error}${log ? " (log scale)" : ""}`));
 }

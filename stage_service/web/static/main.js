@@ -33,7 +33,7 @@ addEventListener("keydown", (event) => {
 });
 
 function bar() {
-  const state = h("strong.state");
+  const state = h("strong.state", { role: "status" }); // steps and seconds beside it would be read out four times a second
   const detail = h("span.detail");
   const steering = h("span.steering");
   const links = Object.entries(VIEWS).map(([name, [title]]) => h("a", { href: `#${name}` }, title));
@@ -49,7 +49,7 @@ function bar() {
   say(stop, "Abort", h("kbd", "F8"));
   say(dark, going, h("kbd", "F9"));
   top.replaceChildren(
-    h(".where", { role: "status" }, state, detail),
+    h(".where", state, detail),
     h("nav", { "aria-label": "views" }, links),
     h(".who", steering, held),
     h(".stops", black, stop, dark),
@@ -85,7 +85,7 @@ function alarmBox() {
     if (S.connected === false) told.push(h(".alarm", h("strong", "No connection to the service. "), `What is shown here is of ${clock(S.lostAt)}; the stage may be lit. It is tried again by itself; `, h("b", "Blackout"), " is, too."));
     if (latch) told.push(unsafe(latch));
     else if (S.health?.lamps === "unknown, unsafe") told.push(h(".alarm", h("strong", "Nobody knows whether the lamps are off. "), `${S.health.lamps_detail} A blackout (F9) finds out.`));
-    if (S.failed) told.push(h(".alarm", h("strong", `Capture ${S.failed.id} failed. `), S.failed.error ?? "", " ", button("seen", () => {
+    if (S.failed) told.push(h(".alarm", h("strong", `Capture ${S.failed.id} failed. `), latch ? (S.failed.error ?? "").split("; blackout: ")[0] : S.failed.error ?? "", " ", button("seen", () => {
       sessionStorage.setItem("seen", S.failed.id);
       S.failed = null;
       changed();
@@ -114,6 +114,7 @@ function show() {
   const [title, module] = VIEWS[name] ?? VIEWS.now;
   shown?.end?.();
   view.replaceChildren();
+  scrollTo(0, 0);
   view.setAttribute("aria-label", title);
   shown = { name: VIEWS[name] ? name : "now", ...module.open(view, location.hash.slice(1).split("/").slice(1)) };
   changed();
@@ -133,7 +134,7 @@ function loginForm() {
     } catch (error) {
       say(wrong, error.message);
     }
-  } }, h("h1", "hairstage"), h("label", "Your token", token), h("p.quiet", "hairstage token show prints it, on the service's machine."), wrong, h("button.go", "Log in")));
+  } }, h("h1", "hairstage"), h("label", "Your token", token), h("p.quiet", h("code", "hairstage token show"), " prints it, on the service's machine."), wrong, h("button.go", "Log in")));
   token.focus();
 }
 

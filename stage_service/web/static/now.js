@@ -15,6 +15,8 @@ const SAID = {
   finishing: "Lights are put off and read back; the last frames are written.",
 };
 
+const SLOW_MS = 1000; // a step that takes longer says how many cameras it still waits for
+
 export function open(view) {
   const picture = dome(S.rig, { label: "the dome from above, with the light that is lit" });
   const lit = h("p.lit", { "aria-live": "off" });
@@ -22,7 +24,7 @@ export function open(view) {
   const said = h("p.said");
   const meter = h("progress", { "aria-label": "steps" });
   const facts = h("dl.facts");
-  const cameras = h("table.cameras", h("thead", h("tr", h("th", "camera"), h("th.n", "frames"), h("th", ""))), h("tbody"));
+  const cameras = h("table.cameras", h("thead", h("tr", h("th", "camera"), h("th.n", "frames"), h("td"))), h("tbody"));
   const byCamera = h("section", h("h2", "Frames by camera"), cameras);
   const missing = h("ul.missing");
   const pause = steering("Pause", () => steer("pause"), { ready: () => S.capture?.state === "running" && !S.capture.progress?.by_box });
@@ -33,7 +35,7 @@ export function open(view) {
   const queueSaid = h("p.quiet");
   view.append(h(".now",
     h("section.stagepicture", { "aria-label": "dome" }, picture.element, lit,
-      h("p.key", h("span.k.todo", "to come"), h("span.k.done", "shot"), h("span.k.gone", "frames missing"), h("span.k.on", "lit"))),
+      h("p.key", h("span.k.todo", "to come"), h("span.k.done", "shot"), h("span.k.gone", "frames missing"), h("span.k.on", "lit"), h("span.k.eye", "camera"), h("span.k.beam", "projector"))),
     h("section.course", { "aria-label": "capture" }, word, said, meter,
       h(".line", pause.element, resume.element, finish.element, h("a.button", { href: "#plan" }, "New capture")),
       facts,
@@ -44,6 +46,7 @@ export function open(view) {
   let steps = null; // of the capture that is shown
   let stepsOf = null;
   let stepsAtEnd = false; // whether they were asked for when it was over
+  const waits = { step: null, slow: false, timer: 0 };
   const lacking = () => new Set((steps ?? []).filter((s) => (stepsAtEnd && !busy() && s.lacks.length && s.index < S.capture.step) || S.missing.some((x) => !x.shot_again && x.step === s.index)).map((s) => s.light).filter(Boolean));
 
   async function steer(action) {
@@ -115,7 +118,7 @@ export function open(view) {
     say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`);
   }
 
-  const lamps = () => ["Lamps", h(S.health?.lamps === "unknown, unsafe" ? "b.bad" : "span", { title: S.health?.lamps_detail }, S.health?.lamps === "dark" ? "dark, verified" : S.health?.lamps ?? "–")];
+  const lamps = () => ["Lamps", h(S.health?.lamps === "unknown, unsafe" ? "b.bad" : "span", { title: S.health?.lamps_detail }, S.health?.lamps === "dark" ? "dark, verified" : S.capture?.state === "paused" && S.health?.lamps === "in use" ? "off for the pause" : S.health?.lamps ?? "–")];
   function disk() {
     const free = S.health?.disk_free_bytes;
     return ["Disk", free === null ? h("b.bad", "does not answer") : `${bytes(free)} free`];
@@ -142,7 +145,16 @@ export function open(view) {
       projector: now.kind === "tracking" ? "all" : now.projector ?? null,
     });
     const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
-    say(lit, busy() ? what : S.health?.lamps === "dark" ? "nothing is lit" : "nobody knows what is lit");
+    waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
+    const answered = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have answered` : "";
+    say(lit, busy() ? what + answered : S.health?.lamps === "dark" ? "nothing is lit" : "nobody knows what is lit");
+  }
+
+  function waitsAt(step) {
+    if (step === waits.step) return;
+    clearTimeout(waits.timer);
+    Object.assign(waits, { step, slow: false });
+    if (step !== null) waits.timer = setTimeout(() => { waits.slow = true; update(); }, SLOW_MS);
   }
 
   function framesBy(c, p) {
@@ -182,7 +194,7 @@ export function open(view) {
     });
   }
 
-  return { update };
+  return { update, end: () => clearTimeout(waits.timer) };
 }
 
 export function planWords(plan = {}) {

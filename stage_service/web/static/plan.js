@@ -34,7 +34,7 @@ export function open(view) {
   get("/openapi.json").then((api) => {
     const schemas = api.components.schemas;
     const d = S.rig.defaults;
-    const hints = { tracking_every: `${d.tracking_every} (rig file)`, retries: `${d.retries} (rig file)`, rate_hz: "as fast as it goes", "rows.last": "the last", lights: "all, or names", projectors: "all, none, or names", consent: "who agreed to what, and when" };
+    const hints = { tracking_every: `${d.tracking_every} (rig file)`, retries: `${d.retries} (rig file)`, rate_hz: "as fast as it goes", "rows.last": "the last", lights: "all, or names", projectors: "all, none, or names", consent: "who agreed, and to what" };
     for (const group of ["exposure", "level"]) for (const [kind, value] of Object.entries(d[group])) hints[`${group}.${kind}`] = `${value} (rig file)`;
     form = formOf(schemas.CapturePlan, schemas, { hints, onchange: typed });
     if (kept) form.fill(kept);

@@ -58,8 +58,8 @@ export function open(view) {
   function update() {
     const x = S.health;
     if (!x) return;
-    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Lamps": `${x.lamps}: ${x.lamps_detail}`, "Root folder": x.root, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait" };
-    say(health, ...Object.entries(facts).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
+    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait", "Lamps": x.problems.includes(x.lamps_detail) ? x.lamps : `${x.lamps}: ${x.lamps_detail}`, "Root folder": x.root };
+    say(health, ...Object.entries(facts).map(([k, v]) => h(v.length > 40 ? "div.long" : "div", h("dt", k), h("dd", v))));
     say(problems, ...x.problems.map((text) => h("li", text)));
     const held = S.lease.holder;
     say(lease, held === null ? "Nobody in particular: anybody may steer." : `${held}, until ${clock(S.lease.expires)}.`,

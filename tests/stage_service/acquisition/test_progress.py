@@ -48,6 +48,19 @@ def test_time_left_is_that_of_the_steps_that_were_measured():
     assert len(told) >= 13
 
 
+def test_what_came_too_soon_to_be_told_is_told_once_while_the_run_waits():
+    clock, told = Watch(), list[Progress]()
+    run = RunProgress(STEPS, dict.fromkeys("abcd", 0), told.append, clock)
+    run.begin(STEPS[0])
+    for _ in range(3):
+        run.answered()
+    assert [now.here for now in told] == [0]
+    for _ in range(9):
+        clock.now += 1.0
+        run.waiting()
+    assert [now.here for now in told] == [0, 3]
+
+
 def test_a_run_of_the_box_is_as_far_as_its_slowest_camera():
     clock, told = Watch(), list[Progress]()
     run = RunProgress(STEPS, {"a": 3, "b": 3}, told.append, clock)

@@ -1,0 +1,311 @@
+"""A whole capture in screenshots, at three sizes, each of them looked over: what is cut off or
+covered, what shines too bright beside a stage, and what axe says of it.
+
+HAIRSTAGE_FILM=folder keeps the pictures. HAIRSTAGE_DEMO=folder, else runs/demo where `make demo`
+has left it, brings hair before the cameras, and a job, its report and its strands to show.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from browsing import Pages, says
+from serving import serving
+from waiting import until
+
+from reconstruction import Capture, Model
+from simulators.frames.frames import FrameMaker
+from simulators.peers.faults import Fault
+from stage_service.api.gate import Access
+from stage_service.model_page import write_page
+from stage_service.records.tokens import Tokens
+
+pytestmark = pytest.mark.slow
+CHECKOUT = Path(__file__).resolve().parents[3]
+SIZES = {"desk": (1280, 800), "tablet": (1024, 768), "upright": (768, 1024)}
+BRIGHTEST = 0.03
+"""Of a white screen's light, what a view may give: a stage's own lamps are some 1,000 lux."""
+PACED = {"rate_hz": 8, "projectors": [], "stepping": "software"}
+
+LOOKED_OVER = """() => {
+  const wrong = [];
+  const box = (x) => x.getBoundingClientRect();
+  const seen = (x) => x.checkVisibility({ visibilityProperty: true }) && box(x).width > 1;
+  const all = (what) => [...document.querySelectorAll(what)].filter(seen);
+  const say = (what, x) => wrong.push(`${what}: ${x?.outerHTML.slice(0, 120)}`);
+  if (document.documentElement.scrollWidth > innerWidth)
+    say("beyond the screen", all("main *, header *").findLast((x) => box(x).right > innerWidth));
+  for (const x of all("button.blackout")) {
+    const { top, bottom, right } = box(x);
+    if (top < 0 || bottom > innerHeight || right > innerWidth) say("out of sight", x);
+  }
+  const modal = document.querySelector("dialog[open], .black");
+  for (const x of modal ? [] : all("button, a.button, nav a, input, select, textarea")) {
+    const { left, right, top, bottom } = box(x);
+    const over = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+    if (!over || x.contains(over) || over.contains(x)) continue;
+    // what is scrolled away lies under what stays, or out of its own box
+    const stays = over.closest("#top, .scrub") ?? x.closest(".list, .wide, aside");
+    if (!stays || over.closest("#top")?.contains(x)) say(`under ${over.outerHTML.slice(0, 60)}`, x);
+  }
+  for (const x of all("button, a.button, nav a, dd, th, td, figcaption, select, h1, h2, p"))
+    if (getComputedStyle(x).display !== "inline" && x.scrollWidth > x.clientWidth + 1)
+      say("cut off", x);
+  return wrong;
+}"""
+SETTLED = "() => new Promise((on) => requestAnimationFrame(() => setTimeout(on, 60)))"
+
+
+class Film:
+    """Screenshots of one page after the other, and what is wrong with them."""
+
+    def __init__(self, folder: Path, axe: Any) -> None:
+        self.folder, self._axe = folder, axe
+        self.wrong: list[str] = []
+        self._taken = 0
+
+    def take(self, page: Any, name: str, *, brightest: float = BRIGHTEST, axe: bool = True) -> None:
+        """A picture of it at each size; the page is left at the first one."""
+        self._taken += 1
+        for size, (width, height) in SIZES.items():
+            page.set_viewport_size({"width": width, "height": height})
+            page.evaluate(
+                "() => new Promise((on) => requestAnimationFrame(() => setTimeout(on, 60)))"
+            )
+            picture = page.screenshot(
+                path=self.folder / f"{self._taken:02d}_{name}_{size}.png", animations="disabled"
+            )
+            told = [*page.evaluate(LOOKED_OVER)]
+            if (light := luminance(picture)) > brightest:
+                told.append(f"{100 * light:.1f} % of a white screen's light")
+            if axe and size != "tablet":
+                for found in self._axe.run(page).response["violations"]:
+                    nodes = [node["html"][:90] for node in found["nodes"]]
+                    told.append(f"axe {found['impact']} {found['id']} {len(nodes)}: {nodes[:3]}")
+            self.wrong += [f"{name}, {size}: {text}" for text in told]
+        page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
+
+
+def luminance(png: bytes) -> float:
+    """The mean of a screenshot's light, by sRGB's curve and weights, of a white one's."""
+    blue, green, red = np.moveaxis(cv2.imdecode(np.frombuffer(png, np.uint8), 1) / 255.0, -1, 0)
+    linear = [
+        np.where(x > 0.04045, ((x + 0.055) / 1.055) ** 2.4, x / 12.92) for x in (red, green, blue)
+    ]
+    return float(np.tensordot([0.2126, 0.7152, 0.0722], linear, 1).mean())
+
+
+@pytest.fixture(scope="module")
+def demo() -> Path | None:
+    """What `make demo` left, where there is such a folder."""
+    folder = Path(os.environ.get("HAIRSTAGE_DEMO", CHECKOUT / "runs/demo"))
+    return folder if (folder / "jobs.sqlite").is_file() else None
+
+
+@pytest.fixture
+def demo_root(demo: Path | None, tmp_path: Path) -> Iterator[None]:
+    """It is what the service serves, for as long as the test takes: it is half a gigabyte."""
+    root = tmp_path / "root"
+    if demo:
+        shutil.copytree(demo, root, symlinks=True)
+        write_page(Model(root / "model"))
+    yield
+    shutil.rmtree(root, ignore_errors=True)
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Film:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe here")
+    folder = Path(os.environ.get("HAIRSTAGE_FILM", tmp_path / "film"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return Film(folder, axe.Axe())
+
+
+@pytest.fixture
+def hold(monkeypatch, demo) -> Iterator[dict[int, Event]]:
+    """`hold[pulse]`: while it is not set, the fourth camera's frame of that pulse is not there.
+
+    Frames are those of the demo's capture, else grey.
+    """
+    held: dict[int, Event] = {}
+    capture = Capture(demo / "capture") if demo else None
+
+    def counts(self, camera, shot, exposure):
+        if camera == "cam_03" and shot.pulse in held:
+            assert held[shot.pulse].wait(120)
+        c = self._rig.camera(camera)
+        image = np.full((c.height, c.width, 3), 0.2 * shot.power.any())
+        lit = np.flatnonzero(shot.power)
+        if capture and lit.size:
+            kind = "olat" if lit.size == 1 else "all_on"
+            light = self._rig.lights[lit[0]].name if lit.size == 1 else None
+            step = next(s for s in capture.steps if (s.kind, s.light) == (kind, light))
+            image = capture.frame(step, camera)
+        return np.clip(np.rint(64 + 50_000 * exposure * image), 0, 4095).astype(np.uint16)
+
+    monkeypatch.setattr(FrameMaker, "counts", counts)
+    yield held
+    for event in held.values():
+        event.set()
+
+
+@pytest.fixture
+def demo_rig(slack: int) -> str:
+    """The demo's rig file; its devices answer as fast as the simulators do."""
+    text = (CHECKOUT / "stage_service/rigs/demo.toml").read_text()
+    return re.sub(r"watchdog_s = [\d.]+", f"watchdog_s = {2 * slack}", text)
+
+
+@pytest.mark.usefixtures("demo_root")
+def test_a_capture_as_a_film(hold, console, film, demo, demo_rig):
+    hold[60] = Event()
+    http, pages = console(Fault("camera", "drop", 20, "cam_05"), rig=demo_rig)
+    page = pages.open()
+    says(page, "Dark, verified")
+    if demo:
+        page.wait_for_selector(".light.shot")
+    film.take(page, "idle")
+
+    page.click("nav >> text=Plan")
+    page.wait_for_selector(".cost .facts")
+    film.take(page, "plan")
+    page.mouse.wheel(0, 900)
+    film.take(page, "plan_lower")
+    page.evaluate("scrollTo(0, 0)")
+    page.fill("[name=rate_hz]", "8")
+    page.fill("[name=projectors]", "none")
+    page.select_option("[name=stepping]", "software")
+    page.wait_for_selector(".cost:has-text('8 Hz')")
+    film.take(page, "plan_with_cost")
+    page.fill("[name=lights]", "light_400")
+    page.wait_for_selector("text=This cannot be shot")
+    film.take(page, "plan_that_cannot_be")
+    pages.complaints.clear()  # Chromium's own, of the refusal
+    page.fill("[name=lights]", "")
+    page.wait_for_selector(".cost .facts")
+    page.click("text=Start now")
+    page.wait_for_selector("dialog")
+    film.take(page, "who_steers")
+    page.fill("[name=holder]", "Ada")
+    page.click("dialog button")
+    says(page, "Shooting")
+    page.wait_for_selector(".missing >> text=shot again")
+    film.take(page, "shooting")
+    page.wait_for_selector("text=3 of 8 cameras have answered")
+    film.take(page, "a_slow_step")
+    page.keyboard.press("F7")
+    page.wait_for_selector(".black:focus")
+    film.take(page, "black", brightest=1e-4)
+    page.keyboard.press("Escape")
+    page.keyboard.press("F8")
+    says(page, "Aborting")
+    film.take(page, "aborting")
+    hold[60].set()
+    says(page, "Dark, verified")
+    film.take(page, "dark_verified")
+    page.click("button:text-is('Shoot what is missing')")
+    says(page, "Shooting")
+    page.click("button:text-is('Pause')")
+    says(page, "Paused")
+    for _ in range(2):
+        http.post("/queue", json={"plan": PACED}, headers=lease(page)).raise_for_status()
+    page.wait_for_selector(".queue li >> nth=1")
+    film.take(page, "paused_with_a_queue")
+    page.keyboard.press("F9")
+    says(page, "Dark, verified")
+    film.take(page, "blackout")
+
+    page.click("nav >> text=Cameras")
+    page.click("text=Take a snapshot")
+    page.wait_for_selector("figcaption:has-text('cam_07') >> text=focus")
+    film.take(page, "cameras", brightest=1)
+    page.click("nav >> text=Frames")
+    until(lambda: page.evaluate("[...document.images].filter((x) => x.naturalWidth).length") == 8)
+    film.take(page, "frames", brightest=1)
+    page.mouse.wheel(0, 400)
+    film.take(page, "frames_lower", brightest=1)
+    page.click("nav >> text=Stage")
+    page.wait_for_selector(".device >> nth=9")
+    film.take(page, "stage")
+    page.click("nav >> text=Jobs")
+    page.wait_for_selector(".curve" if demo else "#view p.quiet:not(:empty)")
+    film.take(page, "jobs")
+    page.mouse.wheel(0, 700)
+    film.take(page, "jobs_lower")
+    page.click("nav >> text=Calibrate")
+    page.wait_for_selector(".poses")
+    film.take(page, "calibrate")
+    page.goto(f"{pages.url}/docs")
+    page.wait_for_selector("details")
+    film.take(page, "docs")
+    if demo:
+        page.goto(f"{pages.url}/jobs/job-{(demo / 'capture').resolve().name}/artifacts/index.html")
+        film.take(page, "report", brightest=1)
+        page.goto(f"{pages.url}/view#model={(demo / 'model').resolve().name}")
+        until(
+            lambda: page.evaluate("Boolean(window.viewer?.complete && viewer.picture?.frames)"),
+            pause=0.5,
+        )
+        film.take(page, "viewer", brightest=1)
+    assert film.wrong == [], "\n".join(film.wrong)
+
+
+def lease(page: Any) -> dict[str, str]:
+    """The header by which the page steers."""
+    token = page.evaluate("JSON.parse(sessionStorage.getItem('lease')).token")
+    return {"Hairstage-Lease": token}
+
+
+def test_what_has_gone_wrong_as_a_film(hold, simulated, browser, film, demo_rig, tmp_path):
+    rig_file, _ = simulated(Fault("lights", "stuck", 30), rig=demo_rig)
+    with serving(rig_file, tmp_path / "root") as http:
+        pages = Pages(browser, str(http.base_url).rstrip("/"))
+        page = pages.open()
+        http.post("/captures", json={"plan": {**PACED, "rate_hz": 20}}).raise_for_status()
+        says(page, "UNSAFE")
+        page.wait_for_selector(".alarm:not(.latch)")
+        film.take(page, "unsafe", brightest=2 * BRIGHTEST)
+        page.click("nav >> text=Stage")
+        page.wait_for_selector(".device >> nth=9")
+        film.take(page, "unsafe_stage", brightest=2 * BRIGHTEST)
+        http.post("/lease", json={"holder": "Eve", "seconds": 600}).raise_for_status()
+        page.click("nav >> text=Plan")
+        page.wait_for_selector("text=Eve steers")
+        page.wait_for_selector(".cost .facts")
+        film.take(page, "another_steers", brightest=2 * BRIGHTEST)
+        assert pages.complaints == []
+    page.wait_for_selector("text=No connection to the service")
+    film.take(page, "no_connection", brightest=2 * BRIGHTEST)
+    pages.close()
+    assert film.wrong == [], "\n".join(film.wrong)
+
+
+def test_whoever_is_not_logged_in_is_asked_to(simulated, browser, tmp_path, film):
+    access = Access(Tokens(tmp_path / "none", "the key"))
+    with serving(simulated()[0], tmp_path / "root", access, all_read=False) as http:
+        pages = Pages(browser, str(http.base_url).rstrip("/"))
+        page = pages.open()
+        page.wait_for_selector("[name=token]:focus")
+        page.keyboard.type("another")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("form .bad:not(:empty)")
+        film.take(page, "login")
+        page.fill("[name=token]", "the key")
+        page.keyboard.press("Enter")
+        says(page, "Dark, verified")
+        stored = page.evaluate("JSON.stringify({...localStorage, ...sessionStorage})")
+        assert "the key" not in stored
+        page.context.clear_cookies()
+        page.reload()
+        page.wait_for_selector("[name=token]:focus")
+        pages.close()
+    assert film.wrong == [], "\n".join(film.wrong)
