@@ -29,8 +29,8 @@ CELL, HEADINGS = 1e-3, 24  # metres and directions: what lies in one cell explai
 
 POINT_DEVIATION = 0.5e-3  # metres of a measured line across itself
 ANGLE_DEVIATION = np.radians(15.0)  # of a measured line of confidence 1
-BEND_DEVIATION = 0.1  # per point: how the turn from one point to the next may change
-GUESS_DEVIATION = 3e-3  # metres that a point moves where nothing holds it
+BEND_DEVIATION = 0.2  # per point: how the turn from one point to the next may change in all
+GUESS_DEVIATION = 3e-3  # metres that a point moves in all where nothing holds it
 COMPATIBLE = np.cos(np.radians(35.0))
 
 _NEIGHBOURS = 6
@@ -74,19 +74,17 @@ def refine(
     """
     lines = Lines(measured)
     kept = worthwhile(strands, lines, options.worth)
-    out = strands.subset(kept)
-    before = residuals(out, lines)
-    start = out.points.astype(float)
+    start = out = strands.subset(kept)
     for _ in range(options.steps):
-        out = gauss_newton_step(out, lines)
-    moved = np.linalg.norm(out.points - start, axis=1)
+        out = gauss_newton_step(out, start, lines)
+    moved = np.linalg.norm(out.points - start.points, axis=1)
     figures = {
         "removed": int((~kept).sum()),
         "strands": len(out),
         "metres_before": float(strands.lengths().sum()),
         "metres": float(out.lengths().sum()),
         "moved_mm": {f"p{q}": float(1e3 * np.percentile(moved, q)) for q in (50, 90, 99)},
-        "residuals_before": before,
+        "residuals_before": residuals(start, lines),
         "residuals": residuals(out, lines),
     }
     return out, figures
@@ -174,13 +172,14 @@ def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
     }
 
 
-def gauss_newton_step(strands: Strands, lines: Lines) -> Strands:
+def gauss_newton_step(strands: Strands, start: Strands, lines: Lines) -> Strands:
     """All points moved at once: onto the lines, along their directions, bending little, roots kept.
 
     Residuals are linear in the points `x (N, 3)` once lines have their points, so a step is one
     banded solve. Each line holds the strand point that is nearest to it (across the line alone);
-    each segment turns to the mean of the lines around it; the displacement bends little from point
-    to point, and is held to 0 where nothing was measured.
+    each segment turns to the mean of the lines around it. The displacement from `start`, the same
+    strands before the first step, bends little from point to point and is held to 0: a prior on
+    each step's own would let strands drift, with directions and away from the lines, without end.
     """
     x = strands.points.astype(float)
     tangents = strands.tangents().astype(float)
@@ -189,13 +188,13 @@ def gauss_newton_step(strands: Strands, lines: Lines) -> Strands:
     last[strands.offsets[1:] - 1] = True
     root = strands.offsets[:-1]
     diagonal = np.zeros((3, n, 3, 3))  # blocks between a point and itself, the next, the one after
-    right = np.zeros((n, 3))
     eye = np.eye(3)
     diagonal[0] += eye / GUESS_DEVIATION**2
     diagonal[0][root] += eye / 1e-12
+    _bend_little(start.points.astype(float), last, diagonal)
+    right = -_product(diagonal, x - start.points)
     _hold_to_lines(x, tangents, lines, diagonal[0], right)
     _turn_to_lines(x, tangents, lines, ~last, diagonal, right)
-    _bend_little(x, last, diagonal)
     return replace(strands, points=(x + _limited(_solve(diagonal, right))).astype(np.float32))
 
 
@@ -252,6 +251,16 @@ def _bend_little(x: Array, last: Bools, diagonal: Array) -> None:
     diagonal[1][i] -= 2 * weight
     diagonal[1][i + 1] -= 2 * weight
     diagonal[2][i] += weight
+
+
+def _product(diagonal: Array, x: Array) -> Array:
+    """The symmetric block-pentadiagonal matrix times `x (N, 3)`."""
+    out = np.einsum("nij,nj->ni", diagonal[0], x)
+    for k in (1, 2):
+        block = diagonal[k, :-k]
+        out[k:] += np.einsum("nij,nj->ni", block, x[:-k])
+        out[:-k] += np.einsum("nji,nj->ni", block, x[k:])
+    return np.asarray(out)
 
 
 def _solve(diagonal: Array, right: Array) -> Array:

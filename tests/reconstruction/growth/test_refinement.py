@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from reconstruction.geometry.strands import Strands
-from reconstruction.growth.refinement import _solve, refine, supported
+from reconstruction.growth.refinement import _product, _solve, refine, supported
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
 
@@ -83,6 +83,14 @@ def test_better_lines_give_better_strands() -> None:
     assert exact[1] < fair[1] < bad[1]
 
 
+def test_more_steps_do_not_follow_the_noise_of_lines_further() -> None:
+    """Six strands for each measured one: most are held by no line, all are turned by some."""
+    start, noisy = strands(6, 2e-4), lines(3e-4, 10.0)
+    few, many = (errors(refine(start, noisy, RefineOptions(steps=n, worth=0))[0]) for n in (3, 12))
+    assert many[0] < 1.1 * few[0]
+    assert many[1] < 1.15 * few[1]
+
+
 def test_copies_and_strands_across_the_measured_ones_go() -> None:
     many = strands(6, 1e-4)
     across = [np.linspace([-5e-3, 2e-3, z], [13e-3, 2e-3, z], 10) for z in (0.01, 0.03)]
@@ -103,7 +111,7 @@ def test_what_lies_far_from_every_line_hardly_moves() -> None:
     assert moved[low].max() < 0.2 * np.median(moved[start.points[:, 2] > 45e-3])
 
 
-def test_the_banded_solution_is_the_dense_one() -> None:
+def test_the_banded_solution_and_product_are_the_dense_ones() -> None:
     rng, n = np.random.default_rng(4), 7
     blocks = rng.normal(size=(3, n, 3, 3))
     blocks[0] = blocks[0] @ blocks[0].transpose(0, 2, 1) + 30 * np.eye(3)
@@ -116,6 +124,7 @@ def test_the_banded_solution_is_the_dense_one() -> None:
     right = rng.normal(size=(n, 3))
     wanted = np.linalg.solve(dense, right.ravel()).reshape(n, 3)
     np.testing.assert_allclose(_solve(blocks, right), wanted, rtol=1e-9)
+    np.testing.assert_allclose(_product(blocks, wanted), right, atol=1e-12)
 
 
 def test_confidence_is_that_of_the_line_that_agrees_best_and_0_far_from_all() -> None:
