@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 
 from appearance.fields.anchors import Grid, Places, anchors_of
 from appearance.fields.hits import Hits
-from appearance.render.harmonics import count_of, harmonics, turns
+from appearance.render.harmonics import harmonics, turns
 from reconstruction.arrays import Floats, Ints
 
 
@@ -18,16 +19,17 @@ from reconstruction.arrays import Floats, Ints
 class ViewBasis:
     """What P pixels of one camera show of a field: a linear map of its coefficients.
 
-    Coefficients `(M, v · n · 3)` belong to M anchors, v harmonics of the direction to the camera
-    and n of that to the light, three channels; the result `(P, n, 3)` are harmonics of the
-    direction to the light in the world. `views (H, M v)` has the weighted harmonics of each hit on
-    hair, `pixels (P, H)` adds hits up, `turned` has the blocks that turn harmonics of the world
-    into those of the strand's frame; None where the field's frame is the world.
+    Coefficients `(M, v · n · c)` belong to M anchors, v harmonics of the direction to the camera
+    and n of that to the light, and c columns: three channels of each of any number of fields. The
+    result `(P, n, c)` are harmonics of the direction to the light in the world. `views (H, M v)`
+    has the weighted harmonics of each hit on hair, `turned (P n, H n)` turns harmonics of the
+    strands' frames into those of the world and adds hits up, `pixel (H,)` is each hit's; the two
+    are None where the field's frame is the world, and `views` is `(P, M v)`.
     """
 
     views: Any
-    pixels: Any
-    turned: list[Floats] | None
+    turned: Any
+    pixel: Ints | None
     harmonics: int
 
     @classmethod
@@ -37,11 +39,11 @@ class ViewBasis:
         """The map of the `hits` for anchors of `grid`; `in_strands`: in the strands' frames."""
         number, low, high, share = anchors_of(hits, grid, places)
         away = hits.towards_camera().reshape(-1, 3)[number]
-        turned = None
+        of_pixel, turned = number // hits.count, None
         if in_strands:
             frames = strand_frames(hits, number)
             away = np.einsum("hi,hij->hj", away, frames)
-            turned = turns(frames, degree)
+            turned = _turning(turns(frames, degree), of_pixel, len(hits.pixels))
         weight = hits.column("weight").ravel()[number]
         y = harmonics(away, degree) * weight[:, None]
         v, count = y.shape[1], len(number)
@@ -53,53 +55,63 @@ class ViewBasis:
             (values.ravel().astype(np.float32), index.ravel().astype(np.int32), bounds),
             shape=(count, grid.count * v),
         )
-        of_pixel = number // hits.count
+        if turned is not None:
+            return cls(views, turned, of_pixel, v)
         pixels: Any = csr_matrix(
             (np.ones(count, np.float32), (of_pixel, np.arange(count))),
             shape=(len(hits.pixels), count),
         )
-        if turned is None:
-            views, pixels = (pixels @ views).tocsr(), None
-        return cls(views, pixels, turned, count_of(degree))
+        return cls((pixels @ views).tocsr(), None, None, v)
 
     def at_pixels(self, coefficients: Floats) -> Floats:
-        """`coefficients (M, v · n · 3)` as harmonics in the world `(P, n, 3)`."""
+        """`coefficients (M, v · n · c)` as harmonics in the world `(P, n, c)`."""
+        n = self.harmonics
         found = self.views @ coefficients.reshape(self.views.shape[1], -1)
-        if self.turned is None:
-            return np.asarray(found.reshape(-1, self.harmonics, 3))
-        local = found.reshape(-1, self.harmonics, 3)
-        for k, block in enumerate(self.turned, 1):
-            part = slice(k * k, (k + 1) ** 2)
-            local[:, part] = np.matmul(block.transpose(0, 2, 1), local[:, part])
-        return np.asarray((self.pixels @ found).reshape(-1, self.harmonics, 3))
+        if self.turned is not None:
+            found = self.turned @ found.reshape(len(found) * n, -1)
+        return np.asarray(found.reshape(-1, n, coefficients.shape[1] // n**2))
 
     def at_anchors(self, values: Floats) -> Floats:
-        """The transpose: `values (P, n, 3)` gathered at the anchors `(M, v · n · 3)`."""
-        flat = values.reshape(len(values), -1)
+        """The transpose: `values (P, n, c)` gathered at the anchors `(M, v · n · c)`."""
+        n = self.harmonics
         if self.turned is not None:
-            flat = self.pixels.T @ flat
-            local = flat.reshape(-1, self.harmonics, 3)
-            for k, block in enumerate(self.turned, 1):
-                part = slice(k * k, (k + 1) ** 2)
-                local[:, part] = np.matmul(block, local[:, part])
-        gathered = self.views.T @ flat
-        v = self.harmonics  # as many of the view as of the light
-        return np.asarray(gathered.reshape(-1, v * self.harmonics * 3))
+            flat = self.turned.T @ values.reshape(len(values) * n, -1)
+        else:
+            flat = values
+        gathered = self.views.T @ flat.reshape(self.views.shape[0], -1)
+        return np.asarray(gathered.reshape(-1, n * n * values.shape[2]))
 
     def squares(self, values: Floats) -> Floats:
-        """About the diagonal that `values (P, n, 3)`, a diagonal at the pixels, has at the anchors.
+        """About the diagonal that `values (P, n, c)`, a diagonal at the pixels, has at the anchors.
 
-        `(M, v · n · 3)`; `values` must be the same within each degree.
+        `(M, v · n · c)`; `values` must be the same within each degree.
         """
-        flat = values.reshape(len(values), -1)
-        if self.turned is not None:
-            flat = self.pixels.T @ flat
         squared = self.views.copy()
-        squared.data = np.abs(squared.data) ** 2
-        if self.turned is not None:
+        squared.data = squared.data**2
+        flat = values.reshape(len(values), -1)
+        if self.pixel is not None:
+            flat = flat[self.pixel]
             # hits of one pixel mostly share an anchor: K of weight 1/K count as one of weight 1
-            squared.data *= np.float32(self.pixels.shape[1] / max(self.pixels.shape[0], 1))
-        return np.asarray((squared.T @ flat).reshape(-1, self.harmonics * self.harmonics * 3))
+            squared.data *= np.float32(len(flat) / max(len(values), 1))
+        n = self.harmonics
+        return np.asarray((squared.T @ flat).reshape(-1, n * n * values.shape[2]))
+
+
+def _turning(blocks: Sequence[Floats], pixel: Ints, pixels: int) -> Any:
+    """Hits' blocks of `turns`, transposed, beside each other as a matrix `(pixels n, H n)`."""
+    count, n = len(pixel), sum(b.shape[1] for b in blocks) + 1
+    parts = [np.ones((count, 1, 1), np.float32), *blocks]
+    index, values = [], []
+    for k, block in enumerate(parts):
+        within = np.arange(k * k, (k + 1) ** 2, dtype=np.int32)
+        # CSC: a column is a harmonic of a hit's frame, its rows those of the world
+        rows = pixel.astype(np.int32)[:, None, None] * n + within
+        index.append(np.broadcast_to(rows, block.shape).reshape(count, -1))
+        values.append(block.reshape(count, -1))
+    each = np.repeat([2 * k + 1 for k in range(len(parts))], [2 * k + 1 for k in range(len(parts))])
+    bounds = np.concatenate([[0], np.cumsum(np.tile(each, count))])
+    flat = np.concatenate(values, axis=1).ravel(), np.concatenate(index, axis=1).ravel(), bounds
+    return csc_matrix(flat, shape=(pixels * n, count * n))
 
 
 def strand_frames(hits: Hits, number: Ints) -> Floats:

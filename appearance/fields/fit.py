@@ -24,6 +24,8 @@ from reconstruction.arrays import Bools, Floats
 MOST_CLAMPED = 0.01
 """Share of the samples that a modulation may make darker than black before they are left out."""
 _CLAMP_ROUNDS = 2
+JUDGED = 1000
+"""Pixels of a view, at most, that judge fits to other pictures."""
 MARGIN = 2.0
 """Standard errors of the gain that a field must bring to be kept."""
 
@@ -42,17 +44,16 @@ class FieldFit:
 
     `validation` has, by group of `GROUPS`, the PSNR in dB of left-out pictures "without" the field
     and "with" ones that were fitted to others, and the "spread" (standard error) of the gain;
-    groups that nothing could be left out for are absent. `gain` is their mean gain and its spread.
-    `errors` are the ridges that were tried with the mean logarithm of the left-out error relative
-    to no field. `clamped` is the share of the samples that are black for being modulated below 0;
-    `warnings` are for the user.
+    groups that nothing could be left out for are absent. `gain` is their mean gain and its spread,
+    `tried` are the ridges that were tried, each with those of its fits. `clamped` is the share of
+    the samples that are black for being modulated below 0; `warnings` are for the user.
     """
 
     field: Field
     ridge: float
     validation: dict[str, dict[str, float]]
     gain: tuple[float, float]
-    errors: list[tuple[float, float]]
+    tried: list[tuple[float, float, float]]
     clamped: float
     warnings: list[str] = dataclasses.field(default_factory=list)
 
@@ -116,15 +117,14 @@ class _Fit:
         self.grid = grids[-1]
         self.folds = Folds.of(len(views), len(views[0].lights), options.folds)
         unit = _unit(views) if options.kind != "modulation" else 1.0
-        bases, grams = [], []
+        bases, grams, judges = [], [], []
         for i, view in enumerate(views):
             monitor.progress(
                 f"{view.hits.camera.name}: reducing its pictures", 0.3 * i / len(views)
             )
-            in_strands = options.kind == "modulation"
-            bases.append(
-                ViewBasis.of(view.hits, self.grid, places, options.degree, in_strands=in_strands)
-            )
+            bases.append(self._basis(view))
+            few = view.some(JUDGED)
+            judges.append((few, bases[-1] if few is view else self._basis(few)))
             samples = view.samples(options, scale, unit)
             grams.append(
                 {
@@ -132,8 +132,14 @@ class _Fit:
                     for part in range(self.folds.of_lights)
                 }
             )
-        self.data = Data(views, bases, grams, nested(grids, places), options, scale, unit)
+        self.data = Data(views, bases, grams, judges, nested(grids, places), options, scale, unit)
         self.warnings: list[str] = []
+
+    def _basis(self, view: Pictures) -> ViewBasis:
+        options, in_strands = self.options, self.options.kind == "modulation"
+        return ViewBasis.of(
+            view.hits, self.grid, self.places, options.degree, in_strands=in_strands
+        )
 
     def run(self) -> FieldFit:
         progress, options = self.monitor.progress, self.options
@@ -208,7 +214,7 @@ def _below(data: Data, number: int, fine: Floats) -> Bools:
     """Where the modulation is below 0 `(L, P, 3)`."""
     view = data.views[number]
     g, points = data.bases[number].at_pixels(fine), view.hits.middle()
-    out = np.zeros(view.rendered.shape, bool)
+    out = np.zeros(view.captured.shape, bool)
     for i, light in enumerate(view.lights):
         y = harmonics(light.position - points, data.options.degree)
         out[i] = (1 + np.einsum("pn,pnc->pc", y, g) < 0) & view.valid[i][:, None]

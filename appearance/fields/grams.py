@@ -13,15 +13,17 @@ from reconstruction.arrays import Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Pixels under single lights: `target` is to be `regressor` times harmonics of the light.
+    """Pixels under single lights: `targets` are to be `regressors` times harmonics of the light.
 
-    `regressor`, `target` and `weight (L, P, 3)`; `points (P, 3)` are what the lights are seen from.
+    `regressors` and `targets (2, L, P, 3)`, two of independent noise; `weight (L, P, 3)`; `points
+    (P, 3)` are what the lights are seen from. What is minimised are the products of the two errors:
+    squares would have the noise of the regressors in them, which pulls what is fitted to 0.
     """
 
     lights: tuple[Light, ...]
     points: Floats
-    regressor: Floats
-    target: Floats
+    regressors: Floats
+    targets: Floats
     weight: Floats
 
     def directions(self, degree: int, light: int) -> Floats:
@@ -30,13 +32,14 @@ class Samples:
 
     def under(self, lights: list[int]) -> Samples:
         """The same pixels under some of the lights, by their numbers."""
-        arrays = (x[lights] for x in (self.regressor, self.target, self.weight))
-        return Samples(tuple(self.lights[i] for i in lights), self.points, *arrays)
+        few = tuple(self.lights[i] for i in lights)
+        regressors, targets = self.regressors[:, lights], self.targets[:, lights]
+        return Samples(few, self.points, regressors, targets, self.weight[lights])
 
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The weighted squared error of a view as a quadratic of its pixels' harmonics.
+    """The weighted error of a view, as `Samples` has it, as a quadratic of its pixels' harmonics.
 
     For coefficients g `(P, n, 3)` it is the sum over pixels and channels of
     g · `matrix` g − 2 `right` · g, and `constant`. `packed (P, 3, n(n + 1)/2)` holds the upper
@@ -55,22 +58,21 @@ class Gram:
             y[i] = samples.directions(degree, i)
         upper = np.triu_indices(y.shape[-1])
         both = (y[..., upper[0]] * y[..., upper[1]]).transpose(1, 0, 2)  # (P, L, pairs)
-        x, w = samples.regressor, samples.weight
-        packed = np.matmul((w * x * x).transpose(1, 2, 0), both)
-        right = np.matmul(y.transpose(1, 2, 0), (w * x * samples.target).transpose(1, 0, 2))
-        constant = float((w * samples.target**2).sum(dtype=np.float64))
+        (x, other), (t, second), w = samples.regressors, samples.targets, samples.weight
+        packed = np.matmul((w * x * other).transpose(1, 2, 0), both)
+        across = np.float32(0.5) * w * (x * second + other * t)
+        right = np.matmul(y.transpose(1, 2, 0), across.transpose(1, 0, 2))
+        constant = float((w * t * second).sum(dtype=np.float64))
         return cls(packed, right, constant)
 
     def times(self, g: Floats) -> Floats:
-        """The matrices times `g (P, n, 3)`."""
+        """The matrices times each of `g (P, n, 3, F)`."""
         n = g.shape[1]
         row, column = np.triu_indices(n)
         full = np.empty((*self.packed.shape[:2], n, n), np.float32)
         full[..., row, column] = self.packed
         full[..., column, row] = self.packed
-        return np.asarray(
-            np.matmul(full, g.transpose(0, 2, 1)[..., None])[..., 0].transpose(0, 2, 1)
-        )
+        return np.asarray(np.matmul(full, g.transpose(0, 2, 1, 3)).transpose(0, 2, 1, 3))
 
     def diagonal(self, degrees: Ints) -> Floats:
         """The matrices' diagonals `(P, n, 3)`, their mean within each degree."""
@@ -89,5 +91,5 @@ class Gram:
 
     def error(self, g: Floats) -> float:
         """The weighted squared error at `g (P, n, 3)`."""
-        change = np.sum(g * (self.times(g) - 2 * self.right), dtype=np.float64)
+        change = np.sum(g * (self.times(g[..., None])[..., 0] - 2 * self.right), dtype=np.float64)
         return self.constant + float(change)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,32 +19,55 @@ from reconstruction.arrays import AnyFloats, Bools, Floats
 class Pictures:
     """One view of a fit.
 
-    `rendered` (inverse rendering's) and `captured (L, P, 3)` are radiance at the pixels of `hits`
-    under each of `lights` alone; `valid (L, P)` is false where a frame is missing or saturated.
+    `halves (2, L, P, 3)`, two independent pictures of inverse rendering's (twice the same where it
+    has no noise), and `captured (L, P, 3)` are radiance at the pixels of `hits` under each of
+    `lights` alone; `valid (L, P)` is false where a frame is missing or saturated. Products of the
+    halves have no noise in the mean: squares would make a fit, and its judge, prefer darkness,
+    whose noise is less.
     """
 
     hits: Hits
     lights: tuple[Light, ...]
-    rendered: Floats
+    halves: Floats
     captured: Floats
     valid: Bools
+
+    def under(self, lights: Sequence[int]) -> Pictures:
+        """The same pixels under some of the lights, by their numbers."""
+        few = tuple(self.lights[i] for i in lights)
+        index = np.asarray(lights, np.int64)
+        captured, valid = self.captured[index], self.valid[index]
+        return Pictures(self.hits, few, self.halves[:, index], captured, valid)
+
+    def some(self, most: int) -> Pictures:
+        """At most `most` of its pixels, evenly chosen."""
+        count = len(self.hits.pixels)
+        if count <= most:
+            return self
+        few = np.linspace(0, count - 1, most).astype(np.int64)
+        hits = replace(self.hits, pixels=self.hits.pixels[few], table=self.hits.table[few])
+        captured, valid = self.captured[:, few], self.valid[:, few]
+        return Pictures(hits, self.lights, self.halves[:, :, few], captured, valid)
 
     def samples(self, options: FieldOptions, scale: float, unit: float = 1.0) -> Samples:
         """What the fit of a kind of field is about, in exposure units: 1 is white.
 
         What is added is counted in `unit`s of radiance per irradiance.
         """
-        rendered, captured = (x.astype(np.float64) * scale for x in (self.rendered, self.captured))
+        halves, captured = (x.astype(np.float64) * scale for x in (self.halves, self.captured))
         level = losses.level(captured)
         if options.kind != "whole":
-            level = 0.5 * (level + rendered)
+            level = 0.5 * (level + halves.mean(axis=0))
         weight = np.where(self.valid[..., None], losses.weights(np.maximum(level, 0)), 0)
         points = self.hits.middle()
-        regressor: AnyFloats = rendered
+        regressors: AnyFloats = halves
         if options.kind != "modulation":
-            regressor = np.stack([irradiance(x, points) for x in self.lights]) * scale * unit
-        target = captured if options.kind == "whole" else captured - rendered
-        arrays = (np.asarray(x, np.float32) for x in (regressor, target, weight))
+            given = np.stack([irradiance(x, points) for x in self.lights]) * scale * unit
+            regressors = np.broadcast_to(given, halves.shape)
+        targets = np.broadcast_to(captured, halves.shape)
+        if options.kind != "whole":
+            targets = captured - halves
+        arrays = (np.asarray(x, np.float32) for x in (regressors, targets, weight))
         return Samples(self.lights, points, *arrays)
 
 

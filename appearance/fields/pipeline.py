@@ -12,11 +12,12 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.maps import MappedStrands
-from appearance.fields.anchors import Places
-from appearance.fields.fit import FieldFit, Monitor, fit_pictures
+from appearance.fields.anchors import Grid, Places
+from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures
 from appearance.fields.hits import RECORD, HitOptions, find_hits
 from appearance.fields.options import FieldRequest
 from appearance.fields.pictures import Pictures
+from appearance.fields.validation import BLOCK
 from appearance.observations import chosen, observe
 from appearance.render.harmonics import count_of
 from appearance.render.smoothed import olat_smoothed
@@ -65,7 +66,10 @@ def fit_field(
     pixels = {name: index for name, index in pixels.items() if len(index)}
     if not pixels:
         raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
-    needed = memory_needed([len(p) for p in pixels.values()], len(rendered.lights), request)
+    strands = len(rendered.mapped.root_uv)
+    needed = memory_needed(
+        [len(p) for p in pixels.values()], len(rendered.lights), strands, request
+    )
     progress(f"will take about {needed:.1f} GB of memory beside the scene", 0.0)
     free = free_memory()
     if free is not None and needed > free:
@@ -104,15 +108,18 @@ def _pictures(
         key.update(np.ascontiguousarray(array).tobytes())
     file = folder / f"{name}-{key.hexdigest()[:16]}-rendered.npy"
     if not file.is_file():
-        # its indirect light smoothed: a noisy regressor would pull what is fitted towards 0
-        made = olat_smoothed(rendered.scene, camera, rendered.lights, sampling, pixels=index)
         folder.mkdir(parents=True, exist_ok=True)
-        with writing(file) as part, part.open("wb") as out:
-            np.save(out, made)
+        size = (2, len(rendered.lights), len(index), 3)
+        with writing(file) as part:
+            made = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=size)
+            for k in range(2):
+                half = replace(sampling, spp=-(-request.spp // 2), seed=2 * seed + k)
+                made[k] = olat_smoothed(rendered.scene, camera, rendered.lights, half, pixels=index)
+            made.flush()
     names = [light.name for light in rendered.lights]
     seen = observe(training, name, names, index)
-    shown: Floats = np.load(file, mmap_mode="r")
-    return Pictures(hits, rendered.lights, shown, seen.radiance, seen.valid)
+    halves: Floats = np.load(file, mmap_mode="r")
+    return Pictures(hits, rendered.lights, halves, seen.radiance, seen.valid)
 
 
 def _materials(scene: HairScene) -> Sequence[Any]:
@@ -125,14 +132,17 @@ def _materials(scene: HairScene) -> Sequence[Any]:
     return parts
 
 
-def memory_needed(pixels: Sequence[int], lights: int, request: FieldRequest) -> float:
+def memory_needed(pixels: Sequence[int], lights: int, strands: int, request: FieldRequest) -> float:
     """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
-    n = count_of(request.fit.degree)
-    hit = RECORD.itemsize + 2 * n * 8 + 4 * sum((2 * k + 1) ** 2 for k in range(1, 4))
-    pixel = (
-        request.hits * hit
-        + (request.fit.folds + 1) * 3 * 4 * (n * (n + 1) // 2 + n)
-        + 8 * 3 * lights
+    n, folds = count_of(request.fit.degree), request.fit.folds
+    turning = sum((2 * k + 1) ** 2 for k in range(request.fit.degree + 1))
+    hit = RECORD.itemsize + 2 * n * 8 + 8 * turning + 4 * n + 8
+    pixel = request.hits * hit + folds * 3 * 4 * (n * (n + 1) // 2 + n) + 12 * 3 * lights
+    judging = sum(min(p, JUDGED) for p in pixels) * 12 * 3 * lights
+    coefficients = 4 * n**2 * 3 * sum(Grid.of(x, strands).count for x in request.fit.levels)
+    at_once = min(max(1, BLOCK // coefficients), folds**2)
+    view = max(pixels) * max(
+        (3 * 8 * 8 + 4 * n * (n + 1) // 2) * lights, 2 * request.hits * n * 3 * 4 * at_once
     )
-    view = max(pixels) * (3 * 8 * 6 * lights + 4 * n * (n + 1) // 2 * lights)
-    return (sum(pixels) * pixel + view) / 1e9
+    fits = (16 * at_once + 3 * folds**2) * coefficients
+    return (sum(pixels) * pixel + judging + view + fits) / 1e9

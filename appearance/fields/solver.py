@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from appearance.fields.basis import ViewBasis
 from appearance.fields.grams import Gram, Samples
 from appearance.render.harmonics import count_of, degrees
-from reconstruction.arrays import Floats
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats
 
 Iteration = Callable[[int, Floats, float], None]
 """Called with the number of iterations done, the coefficients and the gradient's relative size."""
@@ -23,74 +23,144 @@ def ignore(_done: int, _coefficients: Floats, _gradient: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A view in a fit: what its pixels show of a field, and its pictures reduced."""
+    """A view in one or more fits: what its pixels show of a field, and its pictures reduced.
+
+    Its pictures may be in parts, `grams`, of which each belongs to the fits with numbers in `fits`.
+    """
 
     basis: ViewBasis
-    gram: Gram
+    grams: Sequence[Gram]
+    fits: Sequence[tuple[int, ...]] = ((0,),)
+
+    @property
+    def used(self) -> tuple[int, ...]:
+        """The fits that any of its pictures belongs to."""
+        return tuple(sorted(set().union(*self.fits)))
+
+    def summed(self, of: Callable[[Gram, list[int]], Floats]) -> Floats:
+        """The sum `(P, n, 3 · used)` of what the parts `(P, n, 3, …)` add to the fits they are in.
+
+        `of` is told a part and where its fits are among those used.
+        """
+        used, n = self.used, self.basis.harmonics
+        total = np.zeros((len(self.grams[0].right), n, 3, len(used)), np.float32)
+        for gram, fits in zip(self.grams, self.fits, strict=True):
+            at = [used.index(f) for f in fits]
+            found = of(gram, at)
+            for k, f in enumerate(at):
+                total[..., f] += found[..., k % found.shape[-1]]
+        return total.reshape(len(total), n, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """The error of a field on some views, and a ridge: a quadratic of its coefficients.
+    """The errors of F fields on some views, and a ridge: each a quadratic of its coefficients.
 
-    Coefficients `(N, v · n · 3)` are those of all grids; `nested (M, N)` adds grids up at the
-    anchors of the last. `ridge` is that of the degree 0.
+    Coefficients `(N, v · n · 3 · F)` are those of all grids, the fits' side by side: sparse
+    matrices are gone through once for all of them. `nested (M, N)` adds grids up at the anchors of
+    the last. `ridge` is that of the degree 0; what it does not change is `known` to the systems
+    that `dataclasses.replace` makes of this one.
     """
 
     views: Sequence[Seen]
     nested: Any
     degree: int
     ridge: float
+    fits: int = 1
+    known: dict[str, Floats] = field(default_factory=dict, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Of the coefficients."""
-        return self.nested.shape[1], count_of(self.degree) ** 2 * 3
+        return self.nested.shape[1], count_of(self.degree) ** 2 * 3 * self.fits
 
     @property
     def penalty(self) -> Floats:
-        """The ridge of each column `(v · n · 3,)`, growing with the degrees."""
+        """The ridge of each column `(v · n · 3 · F,)`, growing with the degrees."""
         k = degrees(self.degree)
         grows = 1 + k * (k + 1.0)
-        each = np.repeat(np.outer(grows, grows).ravel(), 3)
+        each = np.repeat(np.outer(grows, grows).ravel(), 3 * self.fits)
         return (self.ridge * each).astype(np.float32)
 
     def right(self) -> Floats:
-        """The right side `(N, v · n · 3)` of the normal equations."""
-        return self._gathered([seen.gram.right for seen in self.views])
+        """The right side `(N, v · n · 3 · F)` of the normal equations."""
+        if "right" not in self.known:
+            pixels = [s.summed(lambda gram, _: gram.right[..., None]) for s in self.views]
+            self.known["right"] = self.nested.T @ self._at_anchors(ViewBasis.at_anchors, pixels)
+        return self.known["right"]
 
     def times(self, coefficients: Floats) -> Floats:
-        """The left side of the normal equations times `coefficients (N, v · n · 3)`."""
+        """The left side of the normal equations times `coefficients (N, v · n · 3 · F)`."""
         fine: Floats = self.nested @ coefficients
-        pixels = [seen.gram.times(seen.basis.at_pixels(fine)) for seen in self.views]
-        return np.asarray(self._gathered(pixels) + self.penalty * coefficients)
+        pixels = (_times(seen, g) for seen, g in zip(self.views, self._pixels(fine), strict=True))
+        gathered = self.nested.T @ self._at_anchors(ViewBasis.at_anchors, pixels)
+        return np.asarray(gathered + self.penalty * coefficients)
 
     def diagonal(self) -> Floats:
-        """About the diagonal `(N, v · n · 3)` of the left side."""
-        k = degrees(self.degree)
-        total = np.zeros((self.nested.shape[0], self.shape[1]), np.float32)
-        for seen in self.views:
-            total += seen.basis.squares(seen.gram.diagonal(k))
-        squared = self.nested.copy()
-        squared.data = squared.data**2
-        return np.asarray(squared.T @ total + self.penalty)
-
-    def error(self, coefficients: Floats, views: Sequence[Seen] | None = None) -> float:
-        """Squared error of `coefficients (N, v · n · 3)` on `views`, or on those of the fit."""
-        fine = self.nested @ coefficients
-        used = self.views if views is None else views
-        return sum(seen.gram.error(seen.basis.at_pixels(fine)) for seen in used)
+        """About the diagonal `(N, v · n · 3 · F)` of the left side."""
+        if "diagonal" not in self.known:
+            k = degrees(self.degree)
+            pixels = [s.summed(lambda gram, _: gram.diagonal(k)[..., None]) for s in self.views]
+            squared = self.nested.copy()
+            squared.data = squared.data**2
+            self.known["diagonal"] = squared.T @ self._at_anchors(ViewBasis.squares, pixels)
+        return np.asarray(self.known["diagonal"] + self.penalty)
 
     def objective(self, coefficients: Floats) -> float:
-        """What is minimised over `coefficients (N, v · n · 3)`: the error and the ridge's part."""
+        """What is minimised over `coefficients (N, v · n · 3)` of one fit: its error, the ridge's
+        part."""
         ridge = np.sum(self.penalty * coefficients**2, dtype=np.float64)
-        return self.error(coefficients) + float(ridge)
+        pixels = zip(self.views, self._pixels(self.nested @ coefficients), strict=True)
+        return float(ridge) + sum(gram.error(g) for seen, g in pixels for gram in seen.grams)
 
-    def _gathered(self, pixels: Sequence[Floats]) -> Floats:
-        total = np.zeros((self.nested.shape[0], self.shape[1]), np.float32)
+    def each(self, values: AnyFloats) -> Array:
+        """The sums `(F,)` of `values (N, v · n · 3 · F)` over all that belongs to a fit."""
+        return np.asarray(values.sum(axis=0, dtype=np.float64).reshape(-1, self.fits).sum(axis=0))
+
+    def spread(self, factors: AnyFloats | Bools) -> Floats:
+        """Factors of the fits `(F,)` as those of the columns `(v · n · 3 · F,)`."""
+        return np.tile(factors.astype(np.float32), self.shape[1] // self.fits)
+
+    def _pixels(self, fine: Floats) -> Iterator[Floats]:
+        """Of each view `(P, n, 3 · used)`."""
+        parts: dict[tuple[int, ...], Floats] = {}
+        for seen in self.views:
+            used = seen.used
+            if used not in parts:
+                every = len(used) == self.fits
+                some = fine if every else np.take(_split(fine, self.fits), used, axis=-1)
+                parts[used] = some.reshape(len(fine), -1)
+            yield seen.basis.at_pixels(parts[used])
+
+    def _at_anchors(
+        self, gather: Callable[[ViewBasis, Floats], Floats], pixels: Iterable[Floats]
+    ) -> Floats:
+        """What views have at their pixels, summed up at the finest anchors `(M, v · n · 3 · F)`."""
+        parts: dict[tuple[int, ...], Floats] = {}
         for seen, values in zip(self.views, pixels, strict=True):
-            total += seen.basis.at_anchors(values)
-        return np.asarray(self.nested.T @ total)
+            found = gather(seen.basis, values)
+            if seen.used in parts:
+                parts[seen.used] += found
+            else:
+                parts[seen.used] = found
+        total = np.zeros((self.nested.shape[0], self.shape[1]), np.float32)
+        for used, found in parts.items():
+            if len(used) == self.fits:
+                total += found
+                continue
+            for k, fit in enumerate(used):
+                _split(total, self.fits)[..., fit] += _split(found, len(used))[..., k]
+        return total
+
+
+def _times(seen: Seen, g: Floats) -> Floats:
+    """The matrices of the fits that a view is in, times `g (P, n, 3 · used)`."""
+    each = g.reshape(*g.shape[:2], 3, -1)
+    return seen.summed(lambda gram, at: gram.times(np.take(each, at, axis=-1)))
+
+
+def _split(values: Floats, fits: int) -> Floats:
+    return values.reshape(len(values), -1, fits)
 
 
 def conjugate_gradients(
@@ -100,31 +170,37 @@ def conjugate_gradients(
     start: Floats | None = None,
     on_iteration: Iteration = ignore,
 ) -> Floats:
-    """The coefficients `(N, v · n · 3)` that minimise `system`, from `start` (0 where None).
+    """The coefficients `(N, v · n · 3 · F)` that minimise `system`, from `start` (0 where None).
 
-    Preconditioned by the diagonal. Ends after `iterations`, or once the preconditioned gradient has
-    fallen to `tolerance` of the start's from 0. A coefficient that no observation meets stays 0.
+    Preconditioned by the diagonal. Each fit ends after `iterations`, or once its preconditioned
+    gradient has fallen to `tolerance` of that at 0: the answer is that of F systems solved one by
+    one. A coefficient that no observation meets stays 0. `on_iteration` is told the largest
+    gradient.
     """
     right = system.right()
-    scale = 1 / system.diagonal()
-    at_zero = float(np.sum(right * right * scale, dtype=np.float64))
-    x = np.zeros(system.shape, np.float32) if start is None else start.copy()
-    if at_zero == 0:
-        return np.zeros_like(x)
-    r = right if start is None else right - system.times(x)
-    z = r * scale
-    direction, size = z.copy(), float(np.sum(r * z, dtype=np.float64))
+    scale: Floats = np.float32(1) / system.diagonal()
+    at_zero = system.each(right * right * scale)
+    x = np.zeros(system.shape, np.float32)
+    if start is not None:
+        x += start * system.spread(at_zero > 0)
+    r: Floats = right - system.times(x) if x.any() else right.copy()
+    z: Floats = r * scale
+    direction, size = z.copy(), system.each(r * z)
     for k in range(iterations):
-        if size <= tolerance**2 * at_zero:
+        going = size > tolerance**2 * at_zero
+        if not going.any():
             break
-        image = system.times(np.asarray(direction, np.float32))
-        step = size / float(np.sum(direction * image, dtype=np.float64))
-        x += np.float32(step) * direction
-        r -= np.float32(step) * image
+        image = system.times(direction)
+        curvature = system.each(direction * image)
+        step = system.spread(np.divide(size, curvature, out=np.zeros_like(size), where=going))
+        x += step * direction
+        r -= step * image
         z = r * scale
-        before, size = size, float(np.sum(r * z, dtype=np.float64))
-        direction = z + np.float32(size / before) * direction
-        on_iteration(k + 1, x, float(np.sqrt(size / at_zero)))
+        before, size = size, np.where(going, system.each(r * z), size)
+        along = np.divide(size, before, out=np.zeros_like(size), where=going)
+        direction = z + system.spread(along) * direction
+        left = np.divide(size, at_zero, out=np.zeros_like(size), where=at_zero > 0)
+        on_iteration(k + 1, x, float(np.sqrt(left.max())))
     return x
 
 
@@ -155,8 +231,9 @@ def adam(
         seen, picture = system.views[view], samples[view]
         y = picture.directions(system.degree, light)
         g = seen.basis.at_pixels(system.nested @ x)
-        rendered = np.einsum("pn,pnc->pc", y, g) * picture.regressor[light]
-        off = picture.weight[light] * picture.regressor[light] * (rendered - picture.target[light])
+        answer = np.einsum("pn,pnc->pc", y, g)
+        (x1, x2), (t1, t2) = picture.regressors[:, light], picture.targets[:, light]
+        off = picture.weight[light] * (x1 * x2 * answer - np.float32(0.5) * (x1 * t2 + x2 * t1))
         pulled = seen.basis.at_anchors(y[:, :, None] * off[:, None])
         slope = len(pictures) * (system.nested.T @ pulled) + system.penalty * x
         first += np.float32(0.1) * (slope - first)

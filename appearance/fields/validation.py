@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,16 @@ from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
 from appearance.fields.solver import Iteration, LeastSquares, Seen, conjugate_gradients
 from appearance.metrics.scores import srgb
+from appearance.render.harmonics import count_of
 from appearance.render.pixel_field import PixelField
 from reconstruction import Progress
-from reconstruction.arrays import Array, Floats, Ints
+from reconstruction.arrays import Array, Floats
 
 GROUPS = ("new lights", "new views", "both new")
 _LEAST_LIGHTS = 4
 """Fewer lights are not left out."""
+BLOCK = 64_000_000
+"""Bytes of the coefficients of folds that are solved at once."""
 _PATIENCE = 2
 """Ridges in a row that are worse than the best, after which no weaker one is tried."""
 
@@ -79,42 +82,54 @@ class Folds:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """What fits are made from: views, their bases, and of each the quadratics by part of lights."""
+    """What fits are made from: views, their bases, and of each the quadratics by part of lights.
+
+    `judges` are those of each view's pixels that judge fits, with their bases.
+    """
 
     views: Sequence[Pictures]
     bases: Sequence[ViewBasis]
     grams: Sequence[dict[int, Gram]]
+    judges: Sequence[tuple[Pictures, ViewBasis]]
     nested: Any
     options: FieldOptions
     scale: float
     unit: float
 
-    def system(self, ridge: float, without: tuple[Folds, int] | None = None) -> LeastSquares:
-        """The fit to everything, or to what a fold leaves."""
+    def system(self, ridge: float, without: tuple[Folds, range] | None = None) -> LeastSquares:
+        """The fit to everything, or at once the fits to what each of some folds leaves."""
+        folds, which = without or (None, range(1))
         seen = []
         for i, (basis, parts) in enumerate(zip(self.bases, self.grams, strict=True)):
-            used = list(parts.values())
-            if without is not None:
-                folds, fold = without
-                if folds.views[i] == folds.parts(fold)[0]:
-                    continue
-                used = [gram for part, gram in parts.items() if part != folds.parts(fold)[1]]
-            total = used[0]
-            for gram in used[1:]:
-                total = total + gram
-            seen.append(Seen(basis, total))
-        return LeastSquares(seen, self.nested, self.options.degree, ridge)
+            fits = [
+                tuple(
+                    k
+                    for k, fold in enumerate(which)
+                    if folds is None or folds.group(fold, i, part) is None
+                )
+                for part in parts
+            ]
+            if any(fits):
+                seen.append(Seen(basis, list(parts.values()), fits))
+        return LeastSquares(seen, self.nested, self.options.degree, ridge, len(which))
+
+    def blocks(self, folds: Folds) -> list[range]:
+        """The folds in blocks that are solved at once: as many as `BLOCK` bytes hold."""
+        one = 4 * self.nested.shape[1] * count_of(self.options.degree) ** 2 * 3
+        each = max(1, BLOCK // one)
+        return [range(k, min(k + each, folds.count)) for k in range(0, folds.count, each)]
 
     def solved(self, system: LeastSquares, start: Floats | None, told: Iteration) -> Floats:
         """Its minimum `(N, v · n · 3)`, by conjugate gradients."""
         options = self.options
         return conjugate_gradients(system, options.iterations, options.tolerance, start, told)
 
-    def pixel_field(self, view: int, fine: Floats) -> PixelField:
-        """The field of `fine (M, v · n · 3)` at the finest grid's anchors, at a view's pixels."""
-        found = (self.unit * self.bases[view].at_pixels(fine)).astype(np.float32)
+    def judging(self, view: int, fine: Floats) -> PixelField:
+        """The fields of `fine (M, v · n · 3 · F)` at the pixels that judge a view."""
+        pictures, basis = self.judges[view]
+        found = (self.unit * basis.at_pixels(fine)).astype(np.float32)
         additive, alone = self.options.kind != "modulation", self.options.kind == "whole"
-        return PixelField(found, self.views[view].hits.middle(), additive, alone=alone)
+        return PixelField(found, pictures.hits.middle(), additive, alone=alone)
 
     def fingerprint(self) -> str:
         """Of all that a fit depends on."""
@@ -126,16 +141,16 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The `ridge` that is best of all, all that were tried, and what left-out pictures say.
+    """The `ridge` that is chosen, all that were tried, and what left-out pictures say.
 
-    `tried` are ridges with the mean logarithm, over groups, of the squared error of displayed
-    values relative to no field. `validation` and `gain`: see `FieldFit`. `start` are coefficients
-    near the best; `best` is the ridge's number, from the strongest.
+    `tried` are ridges with the mean gain, over groups, of left-out pictures over those without a
+    field, and its standard error, in dB. `validation` and `gain`: see `FieldFit`. `start` are
+    coefficients near the best; `best` is the ridge's number, from the strongest.
     """
 
     ridge: float
     best: int
-    tried: list[tuple[float, float]]
+    tried: list[tuple[float, float, float]]
     validation: dict[str, dict[str, float]]
     gain: tuple[float, float]
     start: Floats | None
@@ -150,35 +165,39 @@ def cross_validated(
     part in the field that it judges. Killed, it goes on behind the ridges that `checkpoint` has.
     """
     ridges = sorted(data.options.ridges, reverse=True)
+    blocks = data.blocks(folds)
+    systems = [data.system(ridges[0], (folds, block)) for block in blocks]
     without, counts = _squares(data, folds, None)
     state = _State.load(checkpoint, data.fingerprint(), np.ones((0, *without.shape)))
     for k, ridge in enumerate(ridges):
         if k < len(state.squares):
             continue
-        values = [_objective(s, without) for s in state.squares]
-        if values and k - 1 - int(np.argmin(values)) >= _PATIENCE:
+        gains = [_mean_gain(x, without)[0] for x in state.squares]
+        if gains and k - 1 - int(np.argmax(gains)) >= _PATIENCE:
             break
         share = 1 / len(ridges)
-        systems = (data.system(ridge, (folds, f)) for f in range(folds.count))
-        starts: Sequence[Floats | None] = state.latest or [None] * folds.count
+        systems = [replace(system, ridge=ridge) for system in systems]
+        starts: Sequence[Floats | None] = state.latest or [None] * len(systems)
         found = []
-        for fold, (system, start) in enumerate(zip(systems, starts, strict=True)):
-            at = (k + fold / folds.count) * share
-            told = _iterations(f"ridge {ridge:g}, fold {fold + 1} of {folds.count}", at, progress)
-            found.append(data.solved(system, start, told))
+        for block, system, start in zip(blocks, systems, starts, strict=True):
+            at = (k + block.start / folds.count) * share
+            some = f"folds {block.start + 1} to {block.stop} of {folds.count}"
+            found.append(
+                data.solved(system, start, _iterations(f"ridge {ridge:g}, {some}", at, progress))
+            )
         squares, _ = _squares(data, folds, found)
         progress(
-            f"ridge {ridge:g}: left-out error {np.exp(_objective(squares, without)):.3f}",
+            f"ridge {ridge:g}: left-out pictures gain {_mean_gain(squares, without)[0]:.2f} dB",
             (k + 1) * share,
         )
         state = _State(np.concatenate([state.squares, squares[None]]), found)
         state.save(checkpoint, data.fingerprint())
-    values = [_objective(s, without) for s in state.squares]
-    best = int(np.argmin(values))
+    best = _chosen(state.squares)
     judged = np.stack([_elsewhere(state.squares, without, f) for f in range(folds.count)])
-    near = np.asarray(np.mean(state.latest, axis=0), np.float32) if state.latest else None
-    tried = list(zip(ridges, values, strict=False))
-    return Verdict(ridges[best], best, tried, *_validation(judged, without, counts), near)
+    near = [x.reshape(len(x), -1, len(b)).sum(2) for x, b in zip(state.latest, blocks, strict=True)]
+    start = np.asarray(sum(near) / folds.count, np.float32)
+    tried = [(r, *_mean_gain(x, without)) for r, x in zip(ridges, state.squares, strict=False)]
+    return Verdict(ridges[best], best, tried, *_validation(judged, without, counts), start)
 
 
 def _iterations(
@@ -188,83 +207,102 @@ def _iterations(
 
 
 def _squares(data: Data, folds: Folds, found: Sequence[Floats] | None) -> tuple[Array, Array]:
-    """Squared errors of displayed values, and how many: by fold, view and group `(F, V, G)`.
+    """Errors of displayed values, and how many: by fold, view, light and group `(F, V, L, G)`.
 
-    With each fold's coefficients, or without a field.
+    With each fold's coefficients, in blocks, or without a field. They are squares, of which the
+    noise of rendered pictures is no part: products of two halves' errors.
     """
-    squares, counts = np.zeros((2, folds.count, len(data.views), len(GROUPS)))
-    for fold in range(folds.count):
-        fine = None if found is None else np.asarray(data.nested @ found[fold])
-        for i, view in enumerate(data.views):
-            at = None if fine is None else data.pixel_field(i, fine)
-            for part in range(folds.of_lights):
+    shape = folds.count, len(folds.views), len(folds.lights), len(GROUPS)
+    squares, counts = np.zeros((2, *shape))
+    fine = [] if found is None else [np.asarray(data.nested @ x) for x in found]
+    for i, (view, _) in enumerate(data.judges):
+        fields = [data.judging(i, block) for block in fine]
+        for light, part in enumerate(folds.lights):
+            used, halves = view.valid[light], view.halves[:, light]
+            true = srgb(view.captured[light] * data.scale)
+            lit = [field.lit(halves, [view.lights[light]] * 2) for field in fields]
+            split = [x.reshape(*halves.shape, -1) for x in lit]
+            shown = np.concatenate(split, axis=-1) if lit else halves[..., None]
+            for fold in range(folds.count):
                 group = folds.group(fold, i, part)
                 if group is None:
                     continue
-                lights = folds.lights_of(part)
-                shown, used = view.rendered[lights], view.valid[lights]
-                if at is not None:
-                    shown = at.lit(shown, [view.lights[k] for k in lights])
-                off = srgb(shown * data.scale) - srgb(view.captured[lights] * data.scale)
-                squares[fold, i, group] += float((off[used] ** 2).sum(dtype=np.float64))
-                counts[fold, i, group] += 3 * int(used.sum())
+                one, other = srgb(shown[..., fold if lit else 0] * data.scale) - true
+                squares[fold, i, light, group] = float((one * other)[used].sum())
+                counts[fold, i, light, group] = 3 * int(used.sum())
     return squares, counts
 
 
-def _objective(squares: Array, without: Array) -> float:
-    """The mean over groups of the logarithm of the error relative to that without a field."""
-    pairs = zip(squares.sum((0, 1)), without.sum((0, 1)), strict=True)
-    logs = [np.log(max(a, 1e-12) / b) for a, b in pairs if b > 0]
-    return float(np.mean(logs)) if logs else 0.0
+def _gains(squares: Array, without: Array) -> Array:
+    """How much smaller sums of squares are than those `without`, of any one shape, in dB."""
+    ratio = np.maximum(without, 1e-30) / np.maximum(squares, 1e-30)
+    return np.asarray(10 * np.log10(np.clip(ratio, 1e-10, 1e10)))
+
+
+def _mean_gain(squares: Array, without: Array) -> tuple[float, float]:
+    """The mean of the groups' gains in dB, and its standard error; both are `(F, V, L, G)`."""
+    there = without.sum((0, 1, 2)) > 0
+    if not there.any():
+        return 0.0, np.inf
+    a, b = squares[..., there], without[..., there]
+    mean = float(_gains(a.sum((0, 1, 2)), b.sum((0, 1, 2))).mean())
+    return mean, float(_spread(a, b, lambda x, y: _gains(x, y).mean(axis=-1)))
+
+
+def _spread(squares: Array, without: Array, of: Callable[[Array, Array], Array]) -> Array:
+    """The standard error of `of` the sums `(..., G)` of squares and of those without.
+
+    By leaving out one view in turn, and one light in turn: the two add up, as views and lights are
+    both drawn from all that there might be. Infinite where there is one view and one light.
+    """
+    total: Any = np.inf if max(without.shape[1:3]) < 2 else 0.0
+    for others in ((0, 2), (0, 1)):
+        a, b = squares.sum(others), without.sum(others)
+        if len(a) > 1:
+            each = of(a.sum(0) - a, b.sum(0) - b)
+            total = total + (len(a) - 1) * np.var(each, axis=0)
+    return np.asarray(np.sqrt(total))
+
+
+def _chosen(candidates: Array) -> int:
+    """Of errors `(R, F, V, L, G)` under fits from the strongest ridge on, the one to be used.
+
+    The strongest over which the best does not gain more than the standard error of that gain.
+    """
+    best = int(np.argmax([_mean_gain(x, candidates[0])[0] for x in candidates]))
+    for k in range(best):
+        gain, spread = _mean_gain(candidates[best], candidates[k])
+        if gain <= spread:
+            return k
+    return best
 
 
 def _elsewhere(squares: Array, without: Array, fold: int) -> Array:
-    """A fold's squares `(V, G)` at the ridge that the others prefer, which may be no field."""
+    """A fold's errors `(V, L, G)` at the ridge that the others choose, which may be no field."""
     others = np.arange(len(without)) != fold
     if not others.any():
         others[:] = True
-    candidates = [*squares, without]
-    values = [_objective(s[others], without[others]) for s in candidates]
-    return np.asarray(candidates[int(np.argmin(values))][fold])
+    candidates = np.concatenate([without[None], squares])
+    return np.asarray(candidates[_chosen(candidates[:, others])][fold])
 
 
 def _validation(
     squares: Array, without: Array, counts: Array
 ) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
-    """PSNR by group with the standard error of its gain; the mean gain with its standard error.
-
-    The errors are those of leaving out one view in turn, or one part of the lights of one view.
-    """
-    axis = 0 if counts.shape[1] > 1 else 1
-    a, b, n = (x.sum(axis) for x in (squares, without, counts))  # (V or F, G)
-    there = n.sum(0) > 0
-    units = np.flatnonzero(n.sum(1))
-    rest = [np.delete(units, k) for k in range(len(units))] if len(units) > 1 else []
-
-    def gains(used: Ints) -> Array:
-        ratio = b[used][:, there].sum(0) / np.maximum(a[used][:, there].sum(0), 1e-30)
-        return 10 * np.log10(np.clip(ratio, 1e-10, 1e10))
-
-    def spread(values: list[Array]) -> Array:
-        return np.sqrt((len(values) - 1) * np.var(values, axis=0)) if values else np.inf + there
-
-    each = spread([gains(used) for used in rest])
+    """PSNR by group with the standard error of its gain; the mean gain with its standard error."""
+    a, b, n = (x.sum((0, 1, 2)) for x in (squares, without, counts))
+    each = _spread(squares, without, _gains)
     found = {}
-    for k, group in enumerate(np.flatnonzero(there)):
-        with_it, without_it = (
-            float(-10 * np.log10(max(x[:, group].sum() / n[:, group].sum(), 1e-10))) for x in (a, b)
-        )
-        row = {"without": without_it, "with": with_it, "spread": float(each[k])}
-        found[GROUPS[group]] = row
-    if not found:
-        return {}, (0.0, np.inf)
-    total = spread([gains(used).mean(keepdims=True) for used in rest])
-    return found, (float(gains(units).mean()), float(total[0]))
+    for k in np.flatnonzero(b > 0):
+        with_it, without_it = (float(-10 * np.log10(max(x[k] / n[k], 1e-10))) for x in (a, b))
+        spread = float(np.broadcast_to(each, a.shape)[k])
+        found[GROUPS[k]] = {"without": without_it, "with": with_it, "spread": spread}
+    return found, _mean_gain(squares, without)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The left-out squares of the ridges done `(R, F, V, G)`, and each fold's latest solution."""
+    """The left-out squares of the ridges done `(R, F, V, L, G)`, each block's latest solution."""
 
     squares: Array
     latest: list[Floats]
@@ -275,8 +313,8 @@ class _State:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")
-        arrays: dict[str, Any] = {"squares": self.squares, "latest": np.stack(self.latest)}
-        np.savez(part, fingerprint=np.array(fingerprint), **arrays)
+        latest: dict[str, Any] = {f"block_{k}": x for k, x in enumerate(self.latest)}
+        np.savez(part, fingerprint=np.array(fingerprint), squares=self.squares, **latest)
         part.replace(path)
 
     @classmethod
@@ -287,4 +325,5 @@ class _State:
         with np.load(path) as data:
             if str(data["fingerprint"]) != fingerprint:
                 return cls(none, [])
-            return cls(data["squares"], list(data["latest"]))
+            blocks = sum(name.startswith("block_") for name in data.files)
+            return cls(data["squares"], [data[f"block_{k}"] for k in range(blocks)])

@@ -131,7 +131,7 @@ def fit_field_validated(
             "rendered": model.has(FIELD_FILE),
             "field": request.field,
             "ridge": found.ridge,
-            "ridges": found.errors,
+            "ridges": found.tried,
             "clamped": found.clamped,
             "lights": len(used),
         }

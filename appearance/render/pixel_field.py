@@ -28,7 +28,8 @@ class PixelField:
       `alone`, that without the path tracer's
 
     `points (P, 3)` in metres are what near lights are seen from. Pixels whose points are 0 are off
-    the hair, and have coefficients of 0.
+    the hair, and have coefficients of 0. Coefficients `(P, n, 3 · F)` are those of F fields, each
+    channel's side by side; `lit` shows all of them.
     """
 
     coefficients: Floats
@@ -43,20 +44,21 @@ class PixelField:
 
     def lit(self, radiance: Floats, lights: Sequence[Light]) -> Floats:
         """`radiance (L, P, 3)` under each of `lights` alone, as the field has it."""
-        out = np.empty_like(radiance)
+        fields = self.coefficients.shape[2] // 3
+        out = np.repeat(radiance, fields, axis=-1)
         for i, light in enumerate(lights):
             answer = self.answer(light)
             if not self.additive:
-                out[i] = radiance[i] * np.maximum(1 + answer, 0)
+                out[i] *= np.maximum(1 + answer, 0)
                 continue
-            lit = answer * self.irradiance(light)
-            out[i] = np.maximum(lit if self.alone else radiance[i] + lit, 0)
+            lit = answer * np.repeat(self.irradiance(light), fields, axis=-1)
+            out[i] = np.maximum(lit if self.alone else out[i] + lit, 0)
         return out
 
     def answer(self, light: Light) -> Floats:
         """a `(P, 3)` under one light."""
         y = harmonics(light.position - self.points, self.degree)
-        return np.asarray(np.einsum("pn,pnc->pc", y, self.coefficients))
+        return np.asarray(np.matmul(y[:, None], self.coefficients)[:, 0])
 
     def irradiance(self, light: Light) -> Floats:
         """W/m² across the light's direction, at the points `(P, 3)`."""

@@ -64,7 +64,11 @@ def planted(small):
                 )
             shown = rendered[key]
             frames = field.at(hits).lit(shown, lights)
-            out.append(Pictures(hits, lights, shown, frames, np.ones(shown.shape[:2], bool)))
+            out.append(
+                Pictures(
+                    hits, lights, shown[None].repeat(2, 0), frames, np.ones(shown.shape[:2], bool)
+                )
+            )
         return out
 
     return SimpleNamespace(

@@ -44,7 +44,7 @@ from benchmarks.subjects import Subject, simulated
 from reconstruction import Light, Progress, Strands, silent
 from reconstruction.arrays import AnyFloats, Array, Floats
 
-STAGE = SmallStage(size=24, cameras=8, lights=18, spp=48, max_depth=6, truth=(12, 48, 48))
+STAGE = SmallStage(size=24, cameras=8, lights=18, spp=144, max_depth=6, truth=(12, 48, 48))
 COARSE = (4, 8, 8)
 """Cells of the emulated inverse rendering's colours."""
 DIRECT = 8
@@ -87,17 +87,7 @@ class Frames:
         """What a fit sees."""
         lights = len(self.pictures[0].lights)
         kept = [i for i in range(lights) if i not in self.held_lights]
-        return [
-            replace(
-                p,
-                lights=tuple(p.lights[i] for i in kept),
-                rendered=p.rendered[kept],
-                captured=p.captured[kept],
-                valid=p.valid[kept],
-            )
-            for k, p in enumerate(self.pictures)
-            if k not in self.held_views
-        ]
+        return [p.under(kept) for k, p in enumerate(self.pictures) if k not in self.held_views]
 
     def psnr(self, pictures: Mapping[int, Pair]) -> dict[str, float]:
         """PSNR without noise by group of `GROUPS`: products of errors of independent halves.
@@ -179,9 +169,9 @@ def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
         true.append(halves[0])
         rendered.append(halves[1])
         hits = find_hits(mapped, camera, pixels, HitOptions(16, seed))
-        captured, shown_there = (np.float32(0.5) * (a + b) for a, b in halves)
+        captured = np.float32(0.5) * (halves[0][0] + halves[0][1])
         valid = np.ones(captured.shape[:2], bool)
-        pictures.append(Pictures(hits, lights, shown_there, captured, valid))
+        pictures.append(Pictures(hits, lights, np.stack(halves[1]), captured, valid))
     held_lights = tuple(range(1, len(lights), 3))
     kept = [i for i in range(len(lights)) if i not in held_lights]
     seen = [p.captured[kept] for k, p in enumerate(pictures) if k not in held]
@@ -330,9 +320,10 @@ def run_bench(
     rig: SmallStage = STAGE,
     *,
     seed: int = 0,
+    fields: Mapping[str, FieldOptions] = FIELDS,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The table for `subjects`, a seed each, and the solvers on the last; into `out`."""
+    """The table of `fields`, a seed for each of `subjects`, and the solvers on the last."""
     result: dict[str, Any] = {"rig": asdict(rig), "seeds": []}
     for k, subject in enumerate(subjects):
         progress(f"seed {seed + k}: frames", k / len(subjects))
@@ -340,7 +331,7 @@ def run_bench(
         frames = frames_of(subject, rig, seed + k)
         made = time.process_time() - begun
         result["seeds"].append(
-            {"frames_cpu_seconds": made, "rows": rows_of(frames, FIELDS, progress)}
+            {"frames_cpu_seconds": made, "rows": rows_of(frames, fields, progress)}
         )
         if k == len(subjects) - 1:
             training = frames.training()
@@ -386,14 +377,18 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     rig = SIZES["quick"] if args.quick else STAGE
     count = 1 if args.quick else args.seeds
     subjects = [simulated(args.rig, args.subject, args.head, args.seed + k) for k in range(count)]
-    return run_bench(args.out, subjects, rig, seed=args.seed, progress=progress)
+    fields = {name: FIELDS[name] for name in args.only or FIELDS}
+    return run_bench(args.out, subjects, rig, seed=args.seed, fields=fields, progress=progress)
 
 
 SEEDS = option("--seeds", "of the table", type=int, default=3)
+ONLY = option(
+    "--only", "of the fields, by name: all unless given", nargs="+", choices=tuple(FIELDS)
+)
 COST = option(
     "--cost",
     "only what a whole fit to synthetic pictures takes: hair pixels a view, views, lights",
     type=int,
     nargs=3,
 )
-BENCHMARK = Benchmark(_bench, (*SUBJECT, SEEDS, COST))
+BENCHMARK = Benchmark(_bench, (*SUBJECT, SEEDS, ONLY, COST))

@@ -40,7 +40,7 @@ def curves(
     grams = [Gram.of(s, options.degree) for s in samples]
     reducing = time.process_time() - begun
     seen = [
-        Seen(ViewBasis.of(p.hits, grids[-1], places, options.degree, in_strands=True), g)
+        Seen(ViewBasis.of(p.hits, grids[-1], places, options.degree, in_strands=True), [g])
         for p, g in zip(views, grams, strict=True)
     ]
     system = LeastSquares(seen, nested(grids, places), options.degree, 0.03)
@@ -126,9 +126,9 @@ def cost(size: tuple[int, int, int], folder: Path, seed: int, progress: Progress
         "parts": parts,
         "peak_gb": _peak(),
         "peak_gb_before": before,
-        "predicted_gb": memory_needed([pixels] * count, many, request),
+        "predicted_gb": memory_needed([pixels] * count, many, STRANDS, request),
         "gain": found.gain,
-        "tried": len(found.errors),
+        "tried": len(found.tried),
     }
 
 
@@ -163,15 +163,16 @@ def _view(
     table["tangent"] = (along / np.linalg.norm(along, axis=1, keepdims=True))[strand]
     index = np.arange(pixels)
     size_of = (len(lights), pixels, 3)
-    rendered = np.lib.format.open_memmap(
-        folder / f"{camera.name}.npy", mode="w+", dtype=np.float32, shape=size_of
+    halves = np.lib.format.open_memmap(
+        folder / f"{camera.name}.npy", mode="w+", dtype=np.float32, shape=(2, *size_of)
     )
     captured = np.empty(size_of, np.float32)
     factor = 1 + 0.3 * np.sin(7 * roots[strand[:, 0], :1] + np.arange(3))
     for i in range(len(lights)):
-        rendered[i] = rng.uniform(0.05, 0.6, (pixels, 3))
-        captured[i] = rendered[i] * factor * (1 + 0.03 * rng.normal(size=(pixels, 3)))
-    rendered.flush()
+        rendered = rng.uniform(0.05, 0.6, (pixels, 3))
+        halves[:, i] = rendered * (1 + 0.03 * rng.normal(size=(2, pixels, 3)))
+        captured[i] = rendered * factor * (1 + 0.03 * rng.normal(size=(pixels, 3)))
+    halves.flush()
     return Pictures(
-        Hits(camera, index, table), lights, rendered, captured, np.ones(size_of[:2], bool)
+        Hits(camera, index, table), lights, halves, captured, np.ones(size_of[:2], bool)
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from benchmarks.fields.modulation import FIELDS, SIZES, frames_of, rows_of
 from benchmarks.fields.solvers import curves
@@ -29,5 +31,5 @@ def test_rows_are_of_pictures_that_no_fit_saw(small):
     assert set(rows["three nearest lights"]) == {GROUPS[0]}
     found = curves(training, frames.places, frames.scale, quick=True)
     above = [p["above"] for p in found["conjugate gradients"]]
-    assert above == sorted(above, reverse=True)
+    assert all(b <= a + 1e-6 for a, b in itertools.pairwise(above))
     assert above[-1] < found["Adam, rate 0.01"][-1]["above"]
