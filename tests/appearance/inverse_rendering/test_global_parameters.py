@@ -37,7 +37,7 @@ def solve(problem: FitProblem, hair: HairAppearance, names=COLOUR, effort: Effor
     ids=["near", "far"],
 )
 def test_all_are_found_together(plain, tufted, start):
-    _, _, maps, _, left_open = solve(plain, start)
+    _, _, maps, _, left_open = solve(plain, start, effort=replace(EFFORT, pixels=200))
     truth = tufted.truth
     assert maps.beta_m == pytest.approx(truth.beta_m, rel=0.08)
     assert maps.beta_n == pytest.approx(truth.beta_n, rel=0.4)
@@ -53,7 +53,7 @@ def test_all_are_found_together(plain, tufted, start):
 def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
     problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
-    quiet = replace(EFFORT, pixels=100, spp=128)
+    quiet = replace(EFFORT, pixels=100, spp=256)
     _, _, maps, _, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3), effort=quiet)
     assert maps.beta_m == pytest.approx(beta_m, rel=0.2)
     assert maps.beta_n == pytest.approx(beta_n, rel=0.3)
