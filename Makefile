@@ -34,10 +34,10 @@ test-all: setup test-peers  ## Run the slow tests too (under 60 minutes)
 run-tests:
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(or $(WHICH),not slow)'
 
-test-peers:  ## Install the small programs that tests talk to, where that needs no password
-	@command -v mbpoll >/dev/null \
-	  || { { [ "$$(id -u)" = 0 ] || sudo -n true; } && deploy/install-debian-package.sh mbpoll; } 2>/dev/null \
-	  || echo "no mbpoll here: the tests that need it are skipped"
+test-peers:  ## Install the programs that tests talk to, where that needs no password
+	@for program in mbpoll chromium; do command -v $$program >/dev/null \
+	  || { { [ "$$(id -u)" = 0 ] || sudo -n true; } && deploy/install-debian-package.sh $$program; } 2>/dev/null \
+	  || echo "no $$program here: the tests that need it are skipped"; done
 
 bench: setup  ## Run every benchmark
 	$(BIN)/hairstage bench all

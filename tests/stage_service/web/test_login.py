@@ -1,0 +1,27 @@
+"""Logging in from a browser, and the page that comes then: the one test of pages that is not slow."""
+
+from browsing import Pages, says
+from serving import serving
+
+from stage_service.api.gate import Access
+from stage_service.records.tokens import Tokens
+
+
+def test_whoever_is_not_logged_in_is_asked_to(simulated, browser, tmp_path):
+    access = Access(Tokens(tmp_path / "none", "the key"))
+    with serving(simulated()[0], tmp_path / "root", access, all_read=False) as http:
+        pages = Pages(browser, str(http.base_url).rstrip("/"))
+        page = pages.open()
+        page.wait_for_selector("[name=token]:focus")
+        page.keyboard.type("another")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("form .bad:not(:empty)")
+        page.fill("[name=token]", "the key")
+        page.keyboard.press("Enter")
+        says(page, "Dark, verified")
+        stored = page.evaluate("JSON.stringify({...localStorage, ...sessionStorage})")
+        assert "the key" not in stored
+        page.context.clear_cookies()
+        page.reload()
+        page.wait_for_selector("[name=token]:focus")
+        pages.close()
