@@ -1,4 +1,4 @@
-"""Logging in from a browser, and the page that comes then: the one test of pages that is not slow."""
+"""Logging in from a browser: the one test of pages that is not slow."""
 
 from browsing import Pages, says
 from serving import serving
