@@ -43,8 +43,8 @@ STOP_WITHIN_S = 30.0
 """A capture that is stopped at once is out of its last device call within this time."""
 TIDY_S = 1.0
 """How long a blackout, once it is dark, waits for the capture's folder to be finished."""
-ANSWER_S = 5.0
-"""A blackout is answered within this time, or three times the slowest timeout_s of the devices."""
+GIVEN_UP_S = 5.0
+"""A blackout is over within this time, or three times the slowest timeout_s of the devices."""
 TOLD_S = 1.0
 """What has not been read back dark by then is told as unknown, before the blackout is answered."""
 UNREAD = "a blackout is under way: not everything has said yet that it is dark"
@@ -381,7 +381,7 @@ class CaptureManager:
         try:
             with suppress(RuntimeError):  # no thread can be had: the answer tells
                 late.start()
-            within_s = max(ANSWER_S, 3 * devices.slowest_s)
+            within_s = max(GIVEN_UP_S, 3 * devices.slowest_s)
             try:
                 if run is not None:
                     result = run.sequencer.darken(within_s)

@@ -16,11 +16,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stage_service.captures import control
 from stage_service.config import RigFile, load_rig_file
 
 LAMPS, CAMERAS, ROWS = 200, 3, 12
 WIDTH, HEIGHT = 8, 6
 FULL_SCALE, BLACK, GAIN = 4095, 64, 10000.0
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A blackout's answer is waited for however busy the machine is."""
+    monkeypatch.setattr(control, "ANSWER_S", 60.0)
 
 
 class World:

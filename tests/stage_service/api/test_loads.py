@@ -20,8 +20,8 @@ from serving import Client, serving
 from waiting import until
 
 from reconstruction import CaptureWriter, Step
+from stage_service.captures import control, status_index
 from stage_service.captures import manager as manager_module
-from stage_service.captures import status_index
 from stage_service.captures.catalogue import Catalogue
 from stage_service.devices.lights.modbus import ModbusLightBank
 
@@ -144,9 +144,32 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
         assert http.get("/health").json()["status"] == "ok"
 
 
+def test_devices_that_hang_keep_nobody_waiting_who_asked_for_darkness(
+    rig_file, world, tmp_path, monkeypatch
+):
+    """The answer is "unknown, unsafe"; what it comes to in the end is told, and recorded."""
+    with serving(rig_file, tmp_path) as http:
+        monkeypatch.setattr(control, "ANSWER_S", 0.0)
+        with stuck(monkeypatch, ModbusLightBank, "off") as waiting:
+            for _ in range(3 * control.MOST_BLACKOUTS):
+                answer = http.post("/devices/blackout").json()
+                assert (answer["safe"], answer["state"]) == (False, "unknown, unsafe")
+                assert "tried on" in answer["detail"]
+            assert 0 < waiting() <= control.MOST_BLACKOUTS
+            assert http.get("/health").json()["lamps"] == "unknown, unsafe"
+        until(lambda: http.get("/health").json()["lamps"] == "dark")
+        ended = [
+            e.data["state"] for e in http.service.events.after(0, 99) if e.kind == "stage.blackout"
+        ]
+        assert ended[-1] == "dark"
+        assert "dark" in [
+            a["result"] for a in http.get("/audit").json() if a["action"] == "blackout"
+        ]
+
+
 def test_projectors_go_dark_while_the_run_waits_for_a_lamp(rig_file, world, tmp_path, monkeypatch):
     """Not one deadline after another: that of the lamp first, then that of the blackout."""
-    monkeypatch.setattr(manager_module, "ANSWER_S", 3600.0)
+    monkeypatch.setattr(manager_module, "GIVEN_UP_S", 3600.0)
     with serving(rig_file, tmp_path) as http:
         with stuck(monkeypatch, ModbusLightBank, "select") as waiting:
             http.post("/captures", json=LONG)
