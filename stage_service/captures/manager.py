@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import secrets
 import shutil
 import threading
 import time
@@ -134,7 +133,7 @@ class CaptureManager:
         resolved.check_flashing(armed_by)
         resolved.check_room(self.folder)
         now = datetime.now(UTC)
-        capture_id = f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
+        capture_id = f"{now:%Y%m%d-%H%M%S}-{now.microsecond // 16:04x}"  # sorted by time
         description = {
             "steps": list(resolved.steps),
             "plan": plan.model_dump(mode="json"),
