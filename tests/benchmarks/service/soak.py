@@ -18,6 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from benchmarks.acquisition.rates import simulated
 from benchmarks.command import Benchmark, option
 from benchmarks.results import markdown, save
@@ -36,8 +38,8 @@ WAITING = 3
 """Captures that the queue is kept filled with."""
 PAIRS = 10
 """Captures with a console beside ones without."""
-KILL_EVERY = 7
-"""Of so many captures one meets a SIGKILL of the service."""
+KILL_EVERY = 60
+"""Of so many captures one meets a SIGKILL: a service lives for minutes, and a leak shows."""
 
 
 def run(
@@ -114,14 +116,27 @@ def _shoot(
         going = live.ask("GET", "/health")["capture"]
         if going and going not in seen:
             seen.add(going)
-            result["captures"].append({"id": going, **live.size()})
+            result["captures"].append({"id": going, "life": live.kills, **live.size()})
             if len(seen) % KILL_EVERY == 0:
                 time.sleep(rng.uniform(0.0, 1.0))
                 live.kill()
                 live.begin()
         time.sleep(0.1)
     _empty(live)
-    result.update(_judge(live), kills=live.kills)
+    result.update(_judge(live), kills=live.kills, growth=_growth(result["captures"]))
+
+
+def _growth(captures: list[dict[str, Any]]) -> dict[str, float]:
+    """Bytes and descriptors that the service gains a capture, over the second halves of its longer
+    lives: the medians of straight lines' slopes. What is loaded once comes in the first halves."""
+    slopes: dict[str, list[float]] = {"rss_bytes": [], "descriptors": []}
+    for _, life in itertools.groupby(captures, key=lambda c: c["life"]):
+        rows = list(life)
+        rows = rows[len(rows) // 2 :]
+        if len(rows) >= KILL_EVERY // 3:
+            for name, found in slopes.items():
+                found.append(float(np.polyfit(range(len(rows)), [r[name] for r in rows], 1)[0]))
+    return {name: statistics.median(found) for name, found in slopes.items() if found}
 
 
 def _finish(live: Live) -> None:
