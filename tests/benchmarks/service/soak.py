@@ -1,7 +1,7 @@
-"""A service that shoots captures back to back and is killed now and then; then load x fault.
+"""A service that shoots captures back to back, a job for each, and SIGKILLs; then load x fault.
 
 Leaves `soak.json`: memory and descriptors of the service at each capture's end, what became of each
-capture, whether every frame reads back; and, of each fault under each load, how long a blackout
+capture and job, whether every frame reads back; of each fault under each load, how long a blackout
 took, the frames that were lost, and whether the capture was finished, as a table in `loads.md` too;
 and what an open console costs a capture.
 """
@@ -12,11 +12,14 @@ import argparse
 import itertools
 import random
 import statistics
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -40,6 +43,10 @@ PAIRS = 10
 """Captures with a console beside ones without."""
 KILL_EVERY = 60
 """Of so many captures one meets a SIGKILL: a service lives for minutes, and a leak shows."""
+KILL_WORKER_EVERY = 20
+"""Of so many captures one meets a worker's SIGKILL."""
+JOB_WORKER = Path(__file__).parents[2] / "stage_service/jobs/job_worker.py"
+"""Its steps take 50 ms and tell who does them: what is tried is the queue."""
 
 
 def run(
@@ -53,7 +60,8 @@ def run(
         with Children(folder / "logs") as children:
             if minutes > 0:
                 live = Live(rig, children, folder / "root")
-                _shoot(live, minutes, random.Random(seed), result, progress)
+                with _Worker(live.root) as worker:
+                    _shoot(live, worker, minutes, random.Random(seed), result, progress)
                 live.end()
                 save(out / "soak.json", result)
             result["console"] = _watched(rig, children, folder, 1 if quick else PAIRS, progress)
@@ -101,12 +109,46 @@ def _seconds(live: Live, capture: str) -> float:
     return float(live.ask("GET", f"/captures/{capture}")["seconds"])
 
 
+class _Worker:
+    """One worker of `root`, begun again where it was killed."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self.kills = 0
+        self._child = self._begin()
+
+    def _begin(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, str(JOB_WORKER), str(self._root), "light"]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL)
+
+    def kill(self) -> None:
+        """SIGKILL, and begin the next."""
+        self._child.kill()
+        self._child.wait()
+        self.kills += 1
+        self._child = self._begin()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._child.kill()
+        self._child.wait()
+
+
 def _shoot(
-    live: Live, minutes: float, rng: random.Random, result: dict[str, Any], progress: Progress
+    live: Live,
+    worker: _Worker,
+    minutes: float,
+    rng: random.Random,
+    result: dict[str, Any],
+    progress: Progress,
 ) -> None:
-    begun, seen = time.monotonic(), set[str]()
+    begun, seen, before = time.monotonic(), set[str](), None
     while time.monotonic() - begun < 60 * minutes:
-        progress(f"{len(seen)} captures, {live.kills} kills", 0.5)
+        spent = (time.monotonic() - begun) / (60 * minutes)
+        told = f"{live.kills} kills of the service, {worker.kills} of workers"
+        progress(f"{len(seen)} captures, {told}", 0.5 * spent)
         queue = live.ask("GET", "/queue")
         if queue["held"]:
             _finish(live)
@@ -117,13 +159,21 @@ def _shoot(
         if going and going not in seen:
             seen.add(going)
             result["captures"].append({"id": going, "life": live.kills, **live.size()})
+            if before and live.ask("GET", f"/captures/{before}")["outcome"] == "completed":
+                job = {"capture": before, "pipeline": {"name": "reconstruct"}}
+                live.ask("POST", "/jobs", job)
+            before = going
+            if len(seen) % KILL_WORKER_EVERY == 0:
+                time.sleep(rng.uniform(0.0, 1.0))
+                worker.kill()
             if len(seen) % KILL_EVERY == 0:
                 time.sleep(rng.uniform(0.0, 1.0))
                 live.kill()
                 live.begin()
         time.sleep(0.1)
     _empty(live)
-    result.update(_judge(live), kills=live.kills, growth=_growth(result["captures"]))
+    kills = {"kills": live.kills, "worker_kills": worker.kills}
+    result.update(_judge(live), jobs=_jobs(live), growth=_growth(result["captures"]), **kills)
 
 
 def _growth(captures: list[dict[str, Any]]) -> dict[str, float]:
@@ -137,6 +187,31 @@ def _growth(captures: list[dict[str, Any]]) -> dict[str, float]:
             for name, found in slopes.items():
                 found.append(float(np.polyfit(range(len(rows)), [r[name] for r in rows], 1)[0]))
     return {name: statistics.median(found) for name, found in slopes.items() if found}
+
+
+def _jobs(live: Live) -> dict[str, int]:
+    """How many jobs came to which outcome, once all are done, and how many steps were done twice:
+    each has two, and one is done again where its worker was killed in it."""
+    outcomes: dict[str, int] = {}
+    again = 0
+    for job in _paged(live, "jobs"):
+        while job["state"] != "done":
+            time.sleep(0.5)
+            job = live.ask("GET", f"/jobs/{job['id']}")
+        outcomes[job["outcome"]] = outcomes.get(job["outcome"], 0) + 1
+        lines = (Path(job["model"]) / "log.txt").read_text().splitlines()
+        again += sum(line.startswith("begins") for line in lines) - 2
+    return {**outcomes, "steps_again": again}
+
+
+def _paged(live: Live, kind: str) -> Iterator[dict[str, Any]]:
+    """All captures or jobs."""
+    page = 1000
+    for offset in itertools.count(0, page):
+        found = live.ask("GET", f"/{kind}?limit={page}&offset={offset}")
+        yield from found
+        if len(found) < page:
+            break
 
 
 def _finish(live: Live) -> None:
@@ -162,15 +237,10 @@ def _judge(live: Live) -> dict[str, Any]:
     """Every capture read again: outcomes, frames, and what is wrong."""
     outcomes: dict[str, int] = {}
     frames, wrong = 0, []
-    page = 1000
-    for offset in itertools.count(0, page):
-        captures = live.ask("GET", f"/captures?limit={page}&offset={offset}")
-        for capture in captures:
-            outcomes[capture["outcome"]] = outcomes.get(capture["outcome"], 0) + 1
-            frames += capture["frames_written"]
-            wrong += [f"{capture['id']}: {problem}" for problem in verify(capture["path"])]
-        if len(captures) < page:
-            break
+    for capture in _paged(live, "captures"):
+        outcomes[capture["outcome"]] = outcomes.get(capture["outcome"], 0) + 1
+        frames += capture["frames_written"]
+        wrong += [f"{capture['id']}: {problem}" for problem in verify(capture["path"])]
     return {"outcomes": outcomes, "frames": frames, "wrong": wrong, "at_the_end": live.size()}
 
 

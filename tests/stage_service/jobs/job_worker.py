@@ -67,5 +67,5 @@ if __name__ == "__main__":
     worker.LOOK_S = worker.RETRY_S = 0.2
     steps.STEPS.update(reconstruct=first, evaluate=slow, results=last, fit=bad, assess=last)
     if "light" in sys.argv:
-        steps.STEPS.update(fit=light, assess=light)
+        steps.STEPS.update(reconstruct=light, evaluate=light, fit=light, assess=light)
     run_worker(Path(sys.argv[1]), gpu="gpu" in sys.argv, ready=lambda name: print(name, flush=True))
