@@ -59,18 +59,19 @@ class MeasureOptions:
     """How tangents are measured.
 
     The `bank` answers to pictures under groups of neighbouring lights. Scores of a point's
-    directions are averaged over up to `neighbours` within `radius`. Points closer than `thin` are
-    merged first. `tolerance` is how far behind a camera's own depth a point may lie and still count
-    as seen. The scores of the reflection under single lights count `reflection_weight` times those
-    of the texture.
+    directions are averaged over up to `neighbours` within `radius`; where reflections under single
+    lights are read too, which tell more, within `reflection_radius`, theirs `reflection_weight`
+    times those of the texture. Points closer than `thin` are merged first. `tolerance` is how far
+    behind a camera's own depth a point may lie and still count as seen.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)
     texture_scale: Length = 5.0
     radius: Length = 10e-3
+    reflection_radius: Length = 4e-3
     neighbours: Count = 48
     thin: Length = 2e-3
-    reflection_weight: Factor = 6.0
+    reflection_weight: Factor = 12.0
     tolerance: Length = 4e-3
 
 

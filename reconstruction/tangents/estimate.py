@@ -25,10 +25,16 @@ from reconstruction.tangents.line_evidence import (
     pool,
     seen_by,
 )
-from reconstruction.tangents.reflection import FEWEST_LIGHTS, Answers, reflection_scores
+from reconstruction.tangents.reflection import (
+    FEWEST_LIGHTS,
+    Answers,
+    observed,
+    reflection_scores,
+)
 
 CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
+ROUNDS = 2  # of reading reflections: the second with a table that the first one's directions fill
 LIGHT_GROUPS = 24  # of neighbouring lights; the texture of each shows different fibres
 
 
@@ -155,9 +161,7 @@ def measure_tangents(
     scores = np.zeros((len(points), CANDIDATES), np.float32)
     for k, evidence in enumerate(evidences):
         scores += line_scores(evidence, points, candidates, seen[:, k])
-    average = pool(points, options.radius, options.neighbours)
-    scores = average @ scores
-    tangents = decide(scores, candidates)
+    tangents = decide(pool(points, options.radius, options.neighbours) @ scores, candidates)
     if len(lights) < FEWEST_LIGHTS:
         stage.leave_out(
             "directions from reflection",
@@ -166,9 +170,12 @@ def measure_tangents(
         )
     else:
         progress("reflection", 0.0)
-        more, table = reflection_scores(pictures, lights, points, seen, candidates, tangents)
-        texture_only = tangents
-        tangents = decide(scores + options.reflection_weight * (average @ more), candidates)
+        seen_so = observed(pictures, lights, points, seen)
+        near = pool(points, options.reflection_radius, options.neighbours)
+        texture_only, scores = tangents, near @ scores
+        for _ in range(ROUNDS):
+            more, table = reflection_scores(seen_so, points, candidates, tangents)
+            tangents = decide(scores + options.reflection_weight * (near @ more), candidates)
         turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)
         stage.figures["lobe_contrast"] = table.contrast
         stage.figures["turned_by_reflection_deg"] = float(np.median(np.degrees(np.arccos(turned))))

@@ -209,29 +209,30 @@ class Reflection:
         return out
 
 
-def reflection_scores(
-    pictures: Sequence[Answers],
-    lights: Sequence[Light],
-    points: Array,
-    seen: Bools,
-    candidates: Array,
-    first: Tangents,
-) -> tuple[Floats, Reflection]:
-    """Scores `(N, D)` of the candidates at all points, and the table that they were read with.
+def observed(
+    pictures: Sequence[Answers], lights: Sequence[Light], points: Array, seen: Bools
+) -> list[Observations]:
+    """What each of C cameras saw at `points (N, 3)` under the L lights; `seen (N, C)` says where.
 
-    `pictures` are C cameras' answers to the L lights;
-    `seen (N, C)` says which camera sees which of `points (N, 3)`, `candidates (D, 3)` are unit
-    directions. `first` are the N points' tangents from texture: the most confident ones fill the
-    table.
+    Normals are those of the points' surface.
     """
     centers = np.stack([p.camera.center for p in pictures])
     away = seen @ centers - seen.sum(axis=1, keepdims=True) * points
     normals = surface_normals(points, away)
-    trusted = first.confidence >= np.quantile(first.confidence, 1 - _TRUSTED)
-    observations = [
+    return [
         observe(answers, lights, points, normals, seen[:, k]) for k, answers in enumerate(pictures)
     ]
-    table = Reflection.learn(observations, first.directions, trusted)
+
+
+def reflection_scores(
+    observations: Sequence[Observations], points: Array, candidates: Array, known: Tangents
+) -> tuple[Floats, Reflection]:
+    """Scores `(N, D)` of unit directions `candidates (D, 3)`, and the table they were read with.
+
+    `known` are tangents of the `points (N, 3)`: the most confident ones fill the table.
+    """
+    trusted = known.confidence >= np.quantile(known.confidence, 1 - _TRUSTED)
+    table = Reflection.learn(observations, known.directions, trusted)
     scores = np.zeros((len(points), len(candidates)), np.float32)
     for o in observations:
         scores[o.index] += table.scores(o, points, candidates)
