@@ -25,6 +25,7 @@ MODULES = {
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "captures": "benchmarks.acquisition.listing",
     "console": "benchmarks.service.watched",
+    "exports": "benchmarks.exports.blender",
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
     "gradients": "benchmarks.renderers.gradients",

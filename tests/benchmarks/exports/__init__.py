@@ -1,0 +1,1 @@
+"""Exports as another program finds them: Blender."""
