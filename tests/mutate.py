@@ -23,6 +23,7 @@ from typing import Any
 import camera_writers as writers
 import cv2
 import numpy as np
+from dng_writer import write_dng
 
 from appearance.render.environment_maps import load_environment
 from reconstruction import (
@@ -148,6 +149,13 @@ def _picture(name: str, kind: type[np.integer[Any]]) -> Callable[..., Any]:
     return make
 
 
+def _raw(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
+    file = folder / "frame.dng"
+    values = np.random.default_rng(0).integers(1 << 16, size=(24, 32), dtype=np.uint16)
+    write_dng(file, values)
+    return file, lambda path: read_picture(path, Sensor(), (32, 24))
+
+
 def _cameras(write: Callable[..., None], name: str, part: str = "") -> Callable[..., Any]:
     def make(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
         write(folder / name, _rig().cameras)
@@ -241,6 +249,7 @@ FORMATS = {
     "tiff": _picture("frame.tif", np.uint16),
     "jpeg": _picture("frame.jpg", np.uint8),
     "avif": _picture("frame.avif", np.uint8),
+    "raw": _raw,
     "colmap": _cameras(writers.write_colmap_text, "sparse", "images.txt"),
     "colmap_lenses": _cameras(writers.write_colmap_text, "sparse", "cameras.txt"),
     "colmap_binary": _cameras(writers.write_colmap_binary, "sparse", "images.bin"),

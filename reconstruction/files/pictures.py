@@ -28,6 +28,12 @@ Size = tuple[int, int]
 
 RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"}
 FORMATS = {".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".avif"} | RAW
+MOSAICS = {
+    "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
+    "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
+    "GRBG": cv2.COLOR_BayerGRBG2RGB_EA,
+    "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
+}
 LOSSY = {".jpg", ".jpeg"}
 FULL = 0.99
 """Of the way from black to white from which on a channel of whole numbers counts as saturated:
@@ -213,27 +219,25 @@ def _raw(path: Path, sensor: Sensor) -> Picture:
             blacks, white = list(raw.black_level_per_channel), float(raw.white_level)
     except Exception as error:
         raise PictureError(_broken(path, error)) from error
-    if pattern is None or pattern.shape != (2, 2) or values.ndim != 2:
+    bayer = ""
+    if pattern is not None and pattern.shape == (2, 2) and values.ndim == 2:
+        bayer = "".join(colours[i] for i in pattern.ravel())
+    if bayer not in MOSAICS:
         raise PictureError(f"{path}: no Bayer mosaic: develop it to a linear 16-bit TIFF")
-    bayer = "".join(colours[i] for i in pattern.ravel())
     black = float(np.mean(blacks)) if sensor.black is None else sensor.black
-    return _mosaic(values, bayer, black, sensor.white or white)
+    white = sensor.white or white
+    if not black < white:
+        raise PictureError(f"{path}: black {black:g} must be below white {white:g}")
+    return _mosaic(values, bayer, black, white)
 
 
 def _mosaic(values: NDArray[Any], bayer: str, black: float, white: float) -> Picture:
     """Linear light of a mosaic `(H, W)`, interpolated along edges; saturated is what drew on it."""
-    # OpenCV names a mosaic by the second row's second and third pixel, and for BGR.
-    codes = {
-        "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
-        "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
-        "GRBG": cv2.COLOR_BayerGRBG2RGB_EA,
-        "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
-    }
     full = black + FULL * (white - black)
     saturated = cv2.dilate((values >= full).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     deep = values.astype(np.uint16)
     shift = max(0, 15 - int(deep.max(initial=1)).bit_length())  # finer than one count between them
-    image = cv2.demosaicing(deep << shift, codes[bayer]).astype(np.float32) / (1 << shift)
+    image = cv2.demosaicing(deep << shift, MOSAICS[bayer]).astype(np.float32) / (1 << shift)
     light = (image - np.float32(black)) / np.float32(white - black)
     return Picture(light, saturated, FULL, 1 / (white - black))
 

@@ -6,6 +6,7 @@ import { button, bytes, clock, h, keyed, number, say, words } from "./dom.js";
 import { S, events, load } from "./state.js";
 
 const TOLD = ["capture.state", "stage.lamps", "stage.lease", "stage.blackout", "fresh", "queue.held"];
+const LIT = ["lights", "projectors"]; // what can be left on
 
 export function open(view) {
   const health = h("dl.facts");
@@ -22,21 +23,30 @@ export function open(view) {
     h("section", h("h2", "Who did what"), h(".wide", { tabindex: "0", role: "region", "aria-label": "audit log" }, h("table", h("thead", h("tr", ["when", "who", "what", "on", "came to", "because"].map((x) => h("th", x)))), rows))),
   );
 
+  let all = []; // the devices, as they were seen last
   async function askAll() {
     const found = await attempt(() => get("/devices"));
     if (!found) return;
     const { cameras = {}, safety, age_s: seen, projector_power: power = {}, ...single } = found;
     say(age, seen === null ? "not asked yet" : `asked ${number(Math.round(seen))} s ago`);
-    const all = [...Object.entries(single), ...Object.entries(cameras).map(([k, v]) => [`camera ${k}`, v]), ...Object.entries(power).map(([k, v]) => [`power of ${k}`, v])];
-    keyed(devices, all.filter(([, v]) => v && typeof v === "object"), ([k]) => k, () => {
+    all = [...Object.entries(single), ...Object.entries(cameras).map(([k, v]) => [`camera ${k}`, v]), ...Object.entries(power).map(([k, v]) => [`power of ${k}`, v])].filter(([, v]) => v && typeof v === "object");
+    tellDevices();
+  }
+
+  // A link that answers does not make its lamps dark.
+  const doubtful = (kind) => LIT.includes(kind) && (S.health?.latch || S.health?.lamps === "unknown, unsafe");
+
+  function tellDevices() {
+    keyed(devices, all, ([k]) => k, () => {
       const name = h("h3");
       const state = h("p");
       const figures = h("dl.facts");
       const element = h("article.device", name, state, figures);
       return { element, tell([kind, d]) {
-        element.className = `device ${d.state === "unreachable" ? "unreachable" : d.state === "ok" ? "" : "asked"}`;
+        const bad = d.state === "unreachable" || doubtful(kind);
+        element.className = `device ${bad ? "unreachable" : d.state === "ok" ? "" : "asked"}`;
         say(name, kind);
-        say(state, h(d.state === "unreachable" ? "b.bad" : "span", d.state), d.error ? ` ${d.error}` : "");
+        say(state, h(bad ? "b.bad" : "span", doubtful(kind) ? `${d.state === "ok" ? "answers" : d.state}, but unsafe` : d.state), d.error ? ` ${d.error}` : "");
         const told = { ...d, ...d.since_start };
         say(figures, ...Object.entries(told).filter(([k]) => !["name", "state", "error", "since_start"].includes(k)).map(([k, v]) => h("div", h("dt", words(k)), h("dd", Array.isArray(v) ? v.map((x) => (typeof x === "object" ? JSON.stringify(x) : x)).join(", ") : String(v)))));
       } };
@@ -58,6 +68,7 @@ export function open(view) {
   function update() {
     const x = S.health;
     if (!x) return;
+    tellDevices();
     const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait", "Lamps": x.problems.includes(x.lamps_detail) ? x.lamps : `${x.lamps}: ${x.lamps_detail}`, "Root folder": x.root };
     say(health, ...Object.entries(facts).map(([k, v]) => h(v.length > 40 ? "div.long" : "div", h("dt", k), h("dd", v))));
     say(problems, ...x.problems.map((text) => h("li", text)));

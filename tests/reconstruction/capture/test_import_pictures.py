@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from dng_writer import BLACK, BLUE, GREEN, RED, WHITE, write_dng
 
 from reconstruction import Capture, import_folder, verify
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
+from reconstruction.files.pictures import PictureError, Sensor, read_picture
 from reconstruction.images.silhouettes import silhouette
 
 SIZE = 24  # pixels on a side
@@ -294,9 +296,10 @@ def test_a_broken_picture_says_what_to_do(folder, tmp_path, suffix, break_it, sa
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
     old, new = folder / "images/right/1.png", folder / f"images/right/1.{suffix}"
     if suffix == "dng":
-        if break_it in (cut_off, is_smaller):
-            pytest.skip("nothing here writes RAW files")
-        old.rename(new)
+        if break_it is is_smaller:
+            pytest.skip("LibRaw opens none that small")
+        old.unlink()
+        write_dng(new, np.full((SIZE, SIZE), 1000, np.uint16))
     else:
         kind = np.uint8 if suffix == "jpg" else np.uint16
         old.unlink()
@@ -313,6 +316,32 @@ def test_a_broken_picture_says_what_to_do(folder, tmp_path, suffix, break_it, sa
         import_folder(folder, tmp_path / "out")
     assert f"1.{suffix}" in str(problem.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_raw_file_is_light_between_its_black_and_white(tmp_path):
+    values = np.empty((24, 32), np.uint16)
+    light = {(0, 0): 0.25, (0, 1): 0.5, (1, 0): 0.5, (1, 1): 0.75}  # red, green, green, blue
+    for (y, x), share in light.items():
+        values[y::2, x::2] = round(BLACK + share * (WHITE - BLACK))
+    write_dng(tmp_path / "flat.dng", values)
+    picture = read_picture(tmp_path / "flat.dng", Sensor(), (32, 24))
+    np.testing.assert_allclose(
+        picture.light, np.broadcast_to([0.25, 0.5, 0.75], (24, 32, 3)), atol=1e-4
+    )
+    assert not picture.saturated.any()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "says"),
+    [
+        ({"mosaic": (RED, GREEN, RED, BLUE)}, "no Bayer mosaic: develop it"),
+        ({"black": WHITE}, "black 65535 must be below white 65535"),
+    ],
+)
+def test_a_raw_file_of_a_sensor_that_is_not_known_is_refused(tmp_path, sensor, says):
+    write_dng(tmp_path / "odd.dng", np.full((24, 32), 1000, np.uint16), **sensor)
+    with pytest.raises(PictureError, match=says):
+        read_picture(tmp_path / "odd.dng", Sensor(), (32, 24))
 
 
 def test_two_files_for_one_frame(folder, tmp_path):

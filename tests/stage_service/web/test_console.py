@@ -145,6 +145,10 @@ def test_a_lamp_that_stays_lit_cannot_be_missed(console):
     assert r > 40 > max(g, b)
     assert page.query_selector("text=Dark, verified") is None
     says(page, "UNSAFE")
+    page.click("nav >> text=Stage")
+    card = page.wait_for_selector(".device:has(h3:text-is('lights'))")
+    assert "answers, but unsafe" in card.text_content()
+    assert "unreachable" in card.get_attribute("class"), "it is marked as what needs somebody"
 
 
 def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
