@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.arrays import Array, Bools, Ints
+from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -28,8 +28,9 @@ from reconstruction.tangents.line_evidence import (
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
     Answers,
-    observed,
+    observe,
     reflection_scores,
+    surface_normals,
 )
 
 CANDIDATES = 500  # directions that are scored at each point
@@ -133,36 +134,33 @@ def measure_tangents(
     lights = [capture.rig.light(n) for n in names]
     group = light_groups(lights, LIGHT_GROUPS)
     cameras = [c for c in masked.cameras if masked.masks[c.name].hair.any()]
-    evidences, pictures, left_out = [], [], Saturation()
-    for done, camera in enumerate(cameras):
-        progress("texture", done / len(cameras))
-        mask = masked.masks[camera.name].hair
-        answers = read_answers(capture, camera, names)
-        pictures.append(answers)
-        left_out.add(answers, mask)
-        details = [
-            texture(answers.olat[of].sum(axis=0), mask & whole, options.texture_scale)
-            for g in np.unique(group)
-            if (of := (group == g) & answers.shot).any()
-            and (whole := answers.known[of].all(axis=0)).any()
-        ] or [np.zeros(mask.shape, np.float32)]
-        support = line_support(responses(options.bank, np.stack(details)))
-        evidences.append(LineEvidence(camera, support, mask, depths[camera.name]))
-    points = thinned(
-        points if len(points) else np.concatenate([_lifted(e) for e in evidences]), options.thin
-    )
-    seen = np.stack([seen_by(e, points, options.tolerance) for e in evidences], axis=1)
-    points, seen = points[seen.any(axis=1)], seen[seen.any(axis=1)]
-    left_out.tell(stage)
-    stage.figures["lines"] = condition_lines(evidences, points, seen).figures()
+    shown = [np.where(masked.masks[c.name].hair, depths[c.name], 0.0) for c in cameras]
+    if not len(points):
+        lifted = [_lifted(*view) for view in zip(cameras, shown, strict=True)]
+        points = np.concatenate(lifted) if lifted else points
+    points, seen = _seen(thinned(points, options.thin), cameras, shown, options.tolerance)
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
+    reads = len(lights) >= FEWEST_LIGHTS
+    normals = _normals(points, cameras, seen) if reads else None
     candidates = half_sphere(CANDIDATES)
     scores = np.zeros((len(points), CANDIDATES), np.float32)
-    for k, evidence in enumerate(evidences):
-        scores += line_scores(evidence, points, candidates, seen[:, k])
+    evidences, observations, left_out = [], [], Saturation()
+    for k, camera in enumerate(cameras):  # one's frames at a time: they are what takes memory
+        progress("texture", k / len(cameras))
+        mask = masked.masks[camera.name].hair
+        answers = read_answers(capture, camera, names)
+        left_out.add(answers, mask)
+        support = line_support(responses(options.bank, _details(answers, mask, group, options)))
+        evidences.append(LineEvidence.of(camera, support, points, seen[:, k]))
+        scores[evidences[-1].index] += line_scores(evidences[-1], candidates)
+        if normals is not None:
+            observations.append(observe(answers, lights, points, normals, seen[:, k]))
+        del answers, support  # before the next one's are read
+    left_out.tell(stage)
+    stage.figures["lines"] = condition_lines(evidences, len(points)).figures()
     tangents = decide(pool(points, options.radius, options.neighbours) @ scores, candidates)
-    if len(lights) < FEWEST_LIGHTS:
+    if not reads:
         stage.leave_out(
             "directions from reflection",
             f"{len(lights)} lights, fewer than {FEWEST_LIGHTS}: highlights fall between them",
@@ -170,11 +168,10 @@ def measure_tangents(
         )
     else:
         progress("reflection", 0.0)
-        seen_so = observed(pictures, lights, points, seen)
         near = pool(points, options.reflection_radius, options.neighbours)
         texture_only, scores = tangents, near @ scores
         for _ in range(ROUNDS):
-            more, table = reflection_scores(seen_so, points, candidates, tangents)
+            more, table = reflection_scores(observations, points, candidates, tangents)
             tangents = decide(scores + options.reflection_weight * (near @ more), candidates)
         turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)
         stage.figures["lobe_contrast"] = table.contrast
@@ -194,12 +191,40 @@ def measure_tangents(
     return Measured(points, tangents.directions, tangents.confidence)
 
 
-def _lifted(evidence: LineEvidence) -> Array:
-    y, x = np.nonzero(evidence.mask & (evidence.depth > 0))
-    camera = evidence.camera
+def _details(answers: Answers, mask: Bools, group: Ints, options: MeasureOptions) -> Floats:
+    """Textures `(G, H, W)` of the hair under each group of lights that were shot, one at least."""
+    details = [
+        texture(answers.olat[of].sum(axis=0), mask & whole, options.texture_scale)
+        for g in np.unique(group)
+        if (of := (group == g) & answers.shot).any()
+        and (whole := answers.known[of].all(axis=0)).any()
+    ]
+    return np.stack(details or [np.zeros(mask.shape, np.float32)])
+
+
+def _seen(
+    points: Array, cameras: Sequence[Camera], depths: Sequence[Array], tolerance: float
+) -> tuple[Array, Bools]:
+    """Those of `points (N, 3)` that some camera sees, and which do, `(M, C)`."""
+    seen = np.zeros((len(points), len(cameras)), bool)
+    for k, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
+        seen[:, k] = seen_by(camera, depth, points, tolerance)
+    any_one = seen.any(axis=1)
+    return points[any_one], seen[any_one]
+
+
+def _normals(points: Array, cameras: Sequence[Camera], seen: Bools) -> Array:
+    """Those of the points' surface `(N, 3)`, facing the cameras; `seen (N, C)` by which."""
+    centers = np.stack([camera.center for camera in cameras])
+    return surface_normals(points, seen @ centers - seen.sum(axis=1, keepdims=True) * points)
+
+
+def _lifted(camera: Camera, depth: Array) -> Array:
+    """The points `(P, 3)` that a `depth (H, W)` tells of, in the world's coordinates."""
+    y, x = np.nonzero(depth > 0)
     rays = camera.rays(np.stack([x, y], axis=1))
     along = rays @ camera.R[2]
-    return camera.center + rays * (evidence.depth[y, x] / along)[:, None]
+    return camera.center + rays * (depth[y, x] / along)[:, None]
 
 
 def thinned(points: Array, spacing: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,17 +33,25 @@ def half_sphere(count: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LineEvidence:
-    """What one camera's texture says: `support (K, H, W)` for lines at k · 180°/K in the image.
+    """What one camera's texture says at the P points that it sees.
 
-    Positive support speaks for an angle, negative against it; its mean over the angles is 0, so
-    that a pixel without texture says nothing. `mask (H, W)` are the pixels that may be asked,
-    `depth (H, W)` (metres along z, 0 unknown) what they see.
+    `index (P,)` into the points, `pixels (P, 2)` where they lie in the image, `support (P, K)` for
+    lines at k · 180°/K there. Positive support speaks for an angle, negative against it; its mean
+    over the angles is 0, so that a pixel without texture says nothing.
     """
 
     camera: Camera
+    index: Ints
+    pixels: Array
     support: Floats
-    mask: Bools
-    depth: Array
+
+    @classmethod
+    def of(cls, camera: Camera, support: Floats, points: AnyFloats, seen: Bools) -> LineEvidence:
+        """Of an image of `support (K, H, W)`, at those of `points (N, 3)` that are `seen (N,)`."""
+        index = np.flatnonzero(seen)
+        pixels, _ = camera.project(points[index])
+        x, y = np.rint(pixels).astype(int).T
+        return cls(camera, index, pixels, support[:, y, x].T)
 
 
 def line_support(responses: AnyFloats) -> Floats:
@@ -56,11 +64,12 @@ def line_support(responses: AnyFloats) -> Floats:
     return np.asarray((responses - mean) / (mean + floor), np.float32)
 
 
-def seen_by(evidence: LineEvidence, points: AnyFloats, tolerance: float) -> Bools:
-    """Points `(N,)` that project onto the mask at no more than `tolerance` behind its depth."""
-    on, x, y, depth = evidence.camera.pixels_of(points)
-    there = evidence.depth[y, x]
-    return np.asarray(on & evidence.mask[y, x] & (there > 0) & (depth <= there + tolerance))
+def seen_by(camera: Camera, depth: AnyFloats, points: AnyFloats, tolerance: float) -> Bools:
+    """Points `(N,)` that project to where `depth (H, W)` is known (not 0), at no more than
+    `tolerance` behind it; metres along the camera's z."""
+    on, x, y, far = camera.pixels_of(points)
+    there = depth[y, x]
+    return np.asarray(on & (there > 0) & (far <= there + tolerance))
 
 
 def finer(support: AnyFloats) -> Floats:
@@ -77,24 +86,15 @@ def finer(support: AnyFloats) -> Floats:
     return np.asarray(FINER * many, np.float32)
 
 
-def line_scores(
-    evidence: LineEvidence, points: AnyFloats, candidates: Array, seen: Bools
-) -> Floats:
-    """Support `(N, D)` that a camera's texture gives each of `candidates (D, 3)` at the points.
+def line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
+    """Support `(P, D)` that a camera's texture gives each of `candidates (D, 3)` at its P points.
 
     A candidate is looked up at the angle of its projection and weighted by the squared sine of
     its angle to the viewing ray: a line along the ray is a dot that no texture speaks about.
     Between the bank's angles support runs as its Fourier series does.
-    Points that are not `seen (N,)` get 0.
     """
     camera = evidence.camera
-    out = np.zeros((len(points), len(candidates)), np.float32)
-    which = np.flatnonzero(seen)
-    if not len(which):
-        return out
-    pixels, _ = camera.project(points[which])
-    x, y = np.rint(pixels).astype(int).T
-    rays = camera.rays(pixels)
+    rays = camera.rays(evidence.pixels)
     # The projection of direction t at a pixel: the image velocity of X + s t, up to its length.
     local_ray = rays @ camera.R.T
     slope = local_ray[:, :2] / local_ray[:, 2:]
@@ -102,12 +102,11 @@ def line_scores(
     flow = t[None, :, :2] - slope[:, :, None].transpose(0, 2, 1).astype(np.float32) * t[None, :, 2:]
     u = camera.K[0, 0] * flow[..., 0] + camera.K[0, 1] * flow[..., 1]
     v = camera.K[1, 1] * flow[..., 1]
-    support = finer(evidence.support[:, y, x].T)
+    support = finer(evidence.support)
     count = support.shape[1]
     bins = np.rint(np.arctan2(v, u) * (count / np.pi)).astype(np.int64) % count
     sine2 = 1 - (rays.astype(np.float32) @ candidates.T.astype(np.float32)) ** 2
-    out[which] = sine2 * np.take_along_axis(support, bins, axis=1)
-    return out
+    return np.asarray(sine2 * np.take_along_axis(support, bins, axis=1), np.float32)
 
 
 def pool(points: AnyFloats, radius: float, most: int = 24) -> sparse.csr_array:
@@ -211,29 +210,20 @@ class LineConditioning:
 
 
 def condition_lines(
-    evidences: Sequence[LineEvidence],
-    points: AnyFloats,
-    seen: Bools,
-    *,
-    least_confidence: float = 0.1,
+    evidences: Iterable[LineEvidence], count: int, *, least_confidence: float = 0.1
 ) -> LineConditioning:
-    """Conditioning of the lines at `points (N, 3)`; `seen (N, V)` says which view sees which.
+    """Conditioning of the lines at `count` points.
 
     A view's line is the mean of its support over doubled angles, and its weight that mean's length:
     0 where all angles answer alike, near 1 for a single one. Views below `least_confidence` do not
     count.
     """
-    if seen.shape != (len(points), len(evidences)):
-        raise ValueError(f"seen must be {(len(points), len(evidences))}, got {seen.shape}")
-    moments = np.zeros((len(points), 3, 3))
-    views = np.zeros(len(points), np.int64)
-    for evidence, mine in zip(evidences, seen.T, strict=True):
-        which = np.flatnonzero(mine)
-        camera, count = evidence.camera, len(evidence.support)
-        pixels, _ = camera.project(points[which])
-        x, y = np.rint(pixels).astype(int).T
-        phase = np.exp(2j * np.pi * np.arange(count) / count)
-        mean = phase @ evidence.support[:, y, x] / count
+    moments = np.zeros((count, 3, 3))
+    views = np.zeros(count, np.int64)
+    for evidence in evidences:
+        camera, pixels, which = evidence.camera, evidence.pixels, evidence.index
+        bins = evidence.support.shape[1]
+        mean = evidence.support @ np.exp(2j * np.pi * np.arange(bins) / bins) / bins
         along = 0.5 * np.angle(mean)
         ahead = camera.rays(pixels + np.stack([np.cos(along), np.sin(along)], axis=1))
         normal = np.cross(camera.rays(pixels), ahead)
@@ -243,7 +233,7 @@ def condition_lines(
         moments[which] += weight[:, None, None] * normal[:, :, None] * normal[:, None, :]
         views[which] += weight > 0
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(moments), 0))
-    none = np.zeros(len(points))
+    none = np.zeros(count)
     spread = np.divide(values[:, 1], values[:, 2], out=none.copy(), where=views > 1)
     # what rounding leaves of parallel planes says nothing about where they meet
     misfit = np.divide(values[:, 0], values[:, 1], out=none, where=spread > 1e-6)

@@ -209,21 +209,6 @@ class Reflection:
         return out
 
 
-def observed(
-    pictures: Sequence[Answers], lights: Sequence[Light], points: Array, seen: Bools
-) -> list[Observations]:
-    """What each of C cameras saw at `points (N, 3)` under the L lights; `seen (N, C)` says where.
-
-    Normals are those of the points' surface.
-    """
-    centers = np.stack([p.camera.center for p in pictures])
-    away = seen @ centers - seen.sum(axis=1, keepdims=True) * points
-    normals = surface_normals(points, away)
-    return [
-        observe(answers, lights, points, normals, seen[:, k]) for k, answers in enumerate(pictures)
-    ]
-
-
 def reflection_scores(
     observations: Sequence[Observations], points: Array, candidates: Array, known: Tangents
 ) -> tuple[Floats, Reflection]:

@@ -22,7 +22,6 @@ from reconstruction.tangents.reflection import (
     Answers,
     Reflection,
     observe,
-    observed,
     reflection_scores,
     surface_normals,
 )
@@ -40,12 +39,11 @@ def image_angle(c: Camera, point: np.ndarray, direction: np.ndarray) -> float:
 
 
 def evidence_of(c: Camera, direction: np.ndarray) -> LineEvidence:
-    """Support that peaks at the angle at which `direction` at the origin appears."""
+    """At the origin: support that peaks at the angle at which `direction` appears there."""
     angles = np.arange(BINS) * np.pi / BINS
     peak = np.cos(angles - image_angle(c, np.zeros(3), direction)) ** 40
     support = np.broadcast_to((peak - peak.mean())[:, None, None], (BINS, 64, 64))
-    depth = np.full((64, 64), np.linalg.norm(c.center))
-    return LineEvidence(c, support.astype(np.float32), np.ones((64, 64), bool), depth)
+    return LineEvidence.of(c, support.astype(np.float32), np.zeros((1, 3)), np.array([True]))
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -64,11 +62,11 @@ def test_half_sphere_is_even() -> None:
 @pytest.mark.parametrize("direction", [(0.2, 0.3, 0.9), (0.6, 0.6, -0.3), (-0.5, 0.2, 0.8)])
 def test_cameras_fix_a_direction(direction: tuple[float, float, float]) -> None:
     t = np.array(direction) / np.linalg.norm(direction)
-    candidates, point = half_sphere(2000), np.zeros((1, 3))
+    candidates = half_sphere(2000)
     scores = np.zeros((1, 2000), np.float32)
     for position in ((1.0, -0.3, 0.1), (0.3, -1.0, 0.3), (0.7, -0.7, 0.6)):
         e = evidence_of(camera(position), t)
-        scores += line_scores(e, point, candidates, np.array([True]))
+        scores += line_scores(e, candidates)
     found = decide(scores, candidates)
     assert degrees_between(found.directions[0], t) < 6  # the support is 13 degrees wide
     assert found.confidence[0] > 0.5
@@ -90,23 +88,21 @@ def test_one_camera_leaves_a_plane() -> None:
     candidates = half_sphere(1000)
     t = np.array([0.0, 0.0, 1.0])
     e = evidence_of(camera((0.0, -1.0, 0.0)), t)
-    one = decide(line_scores(e, np.zeros((1, 3)), candidates, np.array([True])), candidates)
+    one = decide(line_scores(e, candidates), candidates)
     # In the plane of line and ray only the weight differs, the squared sine to the ray along y.
     plane = np.array([t, [0, 0.6, 0.8], [0, -0.6, 0.8], [1, 0, 0]])
-    score = line_scores(e, np.zeros((1, 3)), plane, np.array([True]))[0]
+    score = line_scores(e, plane)[0]
     assert score[1:3] == pytest.approx(0.64 * score[0], rel=1e-4)
     assert score[3] < 0
     two = evidence_of(camera((1.0, 0.0, 0.0)), t)
-    both = line_scores(e, np.zeros((1, 3)), candidates, np.array([True])) + line_scores(
-        two, np.zeros((1, 3)), candidates, np.array([True])
-    )
+    both = line_scores(e, candidates) + line_scores(two, candidates)
     assert decide(both, candidates).confidence[0] > one.confidence[0]
 
 
 def test_a_line_along_the_ray_is_not_spoken_about() -> None:
     c = camera((0.0, -1.0, 0.0))
     e = evidence_of(c, np.array([0.0, 0.0, 1.0]))
-    along = line_scores(e, np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.array([True]))
+    along = line_scores(e, np.array([[0.0, 1.0, 0.0]]))
     assert abs(along[0, 0]) < 1e-6
 
 
@@ -119,9 +115,12 @@ def test_no_texture_gives_no_confidence() -> None:
 
 def test_points_behind_the_seen_surface_are_not_seen() -> None:
     c = camera((0.0, -1.0, 0.0))
-    e = evidence_of(c, np.array([0.0, 0.0, 1.0]))
+    depth = np.full((64, 64), np.linalg.norm(c.center))
+    depth[:, 48:] = 0  # nothing is known there
     points = np.array([[0, 0, 0], [0, 0.003, 0], [0, 0.02, 0], [5.0, 0, 0], [0, -3.0, 0]])
-    assert seen_by(e, points, 4e-3).tolist() == [True, True, False, False, False]
+    assert seen_by(c, depth, points, 4e-3).tolist() == [True, True, False, False, False]
+    pixels = np.array([[47.0, 30.0], [49.0, 30.0]])
+    assert seen_by(c, depth, c.center + c.rays(pixels), 4e-3).tolist() == [True, False]
 
 
 def test_pooling_averages_over_near_points_only() -> None:
@@ -168,8 +167,9 @@ def turning_patch(full: float = np.inf, missing: int = 0):
         known = ~clipped
         known[:missing] = False
         pictures.append(Answers(c, image, known))
-    seen = np.ones((len(points), 2), bool)
-    return points, truth, observed(pictures, lights, points, seen)
+    every = np.ones(len(points), bool)
+    normals = surface_normals(points, np.mean([c.center for c in cameras], axis=0) - points)
+    return points, truth, [observe(p, lights, points, normals, every) for p in pictures]
 
 
 @pytest.mark.parametrize(("full", "missing"), [(np.inf, 0), (0.5, 0), (np.inf, 10)])
