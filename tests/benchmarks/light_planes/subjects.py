@@ -42,6 +42,7 @@ OPTIONS = ReconstructOptions(
         bank=LogGaborBank(wavelength=4.0, count=24, spread=1.5),
         texture_scale=3.0,
         radius=3e-3,
+        reflection_radius=3e-3,
         neighbours=32,
         thin=1.25e-3,
         reflection_weight=1.5,
