@@ -172,8 +172,8 @@ def cross_validated(
     for k, ridge in enumerate(ridges):
         if k < len(state.squares):
             continue
-        gains = [_mean_gain(x, without)[0] for x in state.squares]
-        if gains and k - 1 - int(np.argmax(gains)) >= _PATIENCE:
+        found_gains = [_mean_gain(x, without)[0] for x in state.squares]
+        if found_gains and k - 1 - int(np.argmax(found_gains)) >= _PATIENCE:
             break
         share = 1 / len(ridges)
         systems = [replace(system, ridge=ridge) for system in systems]
@@ -233,7 +233,7 @@ def _squares(data: Data, folds: Folds, found: Sequence[Floats] | None) -> tuple[
     return squares, counts
 
 
-def _gains(squares: Array, without: Array) -> Array:
+def gains(squares: Array, without: Array) -> Array:
     """How much smaller sums of squares are than those `without`, of any one shape, in dB."""
     ratio = np.maximum(without, 1e-30) / np.maximum(squares, 1e-30)
     return np.asarray(10 * np.log10(np.clip(ratio, 1e-10, 1e10)))
@@ -245,11 +245,11 @@ def _mean_gain(squares: Array, without: Array) -> tuple[float, float]:
     if not there.any():
         return 0.0, np.inf
     a, b = squares[..., there], without[..., there]
-    mean = float(_gains(a.sum((0, 1, 2)), b.sum((0, 1, 2))).mean())
-    return mean, float(_spread(a, b, lambda x, y: _gains(x, y).mean(axis=-1)))
+    mean = float(gains(a.sum((0, 1, 2)), b.sum((0, 1, 2))).mean())
+    return mean, float(spread_of(a, b, lambda x, y: gains(x, y).mean(axis=-1)))
 
 
-def _spread(squares: Array, without: Array, of: Callable[[Array, Array], Array]) -> Array:
+def spread_of(squares: Array, without: Array, of: Callable[[Array, Array], Array]) -> Array:
     """The standard error of `of` the sums `(..., G)` of squares and of those without.
 
     By leaving out one view in turn, and one light in turn: the two add up, as views and lights are
@@ -291,7 +291,7 @@ def _validation(
 ) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
     """PSNR by group with the standard error of its gain; the mean gain with its standard error."""
     a, b, n = (x.sum((0, 1, 2)) for x in (squares, without, counts))
-    each = _spread(squares, without, _gains)
+    each = spread_of(squares, without, gains)
     found = {}
     for k in np.flatnonzero(b > 0):
         with_it, without_it = (float(-10 * np.log10(max(x[k] / n[k], 1e-10))) for x in (a, b))

@@ -19,6 +19,7 @@ from appearance.render.mixed import Environment
 from appearance.render.olat import render_olat, render_olat_parts, spread_out
 from appearance.render.smoothed import (
     DIRECT,
+    environment_parts,
     environment_smoothed,
     mean_factor,
     olat_smoothed,
@@ -26,7 +27,6 @@ from appearance.render.smoothed import (
     without_rare,
 )
 from appearance.render.tracing import Sampling
-from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light, Progress, Strands, silent
 from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.files.durable import writing
@@ -37,6 +37,10 @@ _LAG = 1.5
 """Radians that a tip is behind its root in a sway."""
 _ACROSS = 12.0
 """Radians a metre that roots are behind each other."""
+OVER_FRAMES = 1.5
+"""Frames that the indirect light of moving hair is averaged over."""
+MOVING_DIRECT = 24
+"""Times the paths of all light that moving hair's direct light takes."""
 CELLS = 10, 24
 """Rows and columns of the panels that a turning map becomes."""
 _FAR = 100.0
@@ -87,12 +91,28 @@ def moving(
 ) -> Floats:
     """Radiance `(T, H, W, 3)` of the model in each of `poses`, under the same lights and maps.
 
-    Its field moves with the strands. Raises `ValueError` for poses of another topology.
+    Its field moves with the strands. Under maps, indirect light is averaged over `OVER_FRAMES`
+    frames, each of random numbers of its own, and direct light takes `MOVING_DIRECT` times the
+    paths: else noise changes more from frame to frame than the hair does. Raises `ValueError` for
+    poses of another topology.
     """
-    out = []
+    out, parts = [], []
     for k, pose in enumerate(poses):
         progress(f"frame {k + 1} of {len(poses)}", k / len(poses))
-        out.append(_picture(fitted.scene(pose), camera, *lit, sampling))
+        scene, own = fitted.scene(pose), replace(sampling, seed=sampling.seed * len(poses) + k)
+        out.append(np.zeros((camera.height, camera.width, 3), np.float32))
+        for light in lit[0]:
+            out[-1] += olat_smoothed(scene, camera, [light], sampling)[0]
+        parts.append(
+            [environment_parts(scene, camera, x.envmap, own, MOVING_DIRECT) for x in lit[1]]
+        )
+    for of_map in zip(*parts, strict=True):
+        share = {kind: np.stack([x.share[kind] for x in of_map]) for kind in of_map[0].share}
+        smooth = smoothed(
+            np.stack([x.indirect for x in of_map]), share, of_map[0].sigma, OVER_FRAMES
+        )
+        for frame, part, indirect in zip(out, of_map, smooth, strict=True):
+            frame += part.shown(indirect)
     return np.stack(out)
 
 
@@ -235,18 +255,3 @@ def write_animation(path: Path, frames: Floats, seconds: float = SECONDS) -> Non
         if not done:
             raise OSError(f"{path} cannot be written")
         part.write_bytes(data.tobytes())
-
-
-def _picture(
-    scene: HairScene,
-    camera: Camera,
-    lights: Sequence[Light],
-    maps: Sequence[Environment],
-    sampling: Sampling,
-) -> Floats:
-    total = np.zeros((camera.height, camera.width, 3), np.float32)
-    for light in lights:
-        total += olat_smoothed(scene, camera, [light], sampling)[0]
-    for each in maps:
-        total += environment_smoothed(scene, camera, each.envmap, sampling)
-    return total

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from benchmarks.fields.modulation import FIELDS, SIZES, frames_of, rows_of
+from benchmarks.fields.frames import frames_of
+from benchmarks.fields.modulation import FIELDS, SIZES, rows_of
 from benchmarks.fields.solvers import curves
 from benchmarks.subjects import Subject
 
