@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import httpx
 from postgresql import Missing, running
 from standing import PLACES
 
@@ -98,12 +99,25 @@ def _finish(live: Live, capture: str, path: str) -> tuple[int, int, str]:
     for _ in range(3):
         if status["outcome"] == "completed":
             break
-        live.ask("POST", "/devices/blackout")
-        live.ask("POST", f"/captures/{capture}/resume", {})
+        _resume(live, capture)
         status = live.until_done(capture)
     now, wrong = _sums(here), verify(here)
     ended = status["outcome"] if not wrong else f"{status['outcome']}, but {wrong[0]}"
     return sum(now.get(key) != sum_ for key, sum_ in kept.items()), len(kept), ended
+
+
+def _resume(live: Live, capture: str) -> None:
+    """Let it go on, once all is dark: a blackout that was answered late still goes on, and latches
+    again, or refuses captures, until it is over."""
+    deadline = time.monotonic() + HURRY_S
+    while True:
+        if live.ask("POST", "/devices/blackout")["state"] == "dark":
+            answer = live.http.request("POST", f"/captures/{capture}/resume", json={})
+            if answer.status_code != httpx.codes.CONFLICT:
+                answer.raise_for_status()
+                return
+        assert time.monotonic() < deadline, f"{capture} was never let go on"
+        time.sleep(0.5)
 
 
 def _sums(path: Path) -> dict[tuple[int, str], str | None]:
