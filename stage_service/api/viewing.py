@@ -150,8 +150,9 @@ def get_few(model: OnModel, body: Light) -> list[dict[str, Any]]:
 
 @reading.post("/{name}/indirect", **BYTES)
 def post_indirect(model: OnModel, body: Light) -> Response:
-    """Light between fibres under these lights: RGBA radiance (float32) of cells of the box of the
-    strands, x fastest. Paths are traced when it is first asked for, which takes seconds."""
+    """Light between fibres under these lights: of each cell of the box of the strands, x fastest, 9
+    coefficients (RGB, float32) of harmonics over the direction in which it leaves. Paths are traced
+    when it is first asked for, which takes many seconds."""
     return _bytes(model.lighting.indirect(dict(body.weights)))
 
 

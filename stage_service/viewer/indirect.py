@@ -1,17 +1,16 @@
-"""Light between fibres, and on from the skin, traced beforehand: a grid for the shader."""
+"""Light between fibres, and on from the skin, traced beforehand: a grid for the page to look up."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import csr_matrix
 
 from appearance import HairScene
 from appearance.render.coverage import covered_pixels
@@ -24,15 +23,22 @@ from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.options import Count, options
 
-DEGREE = 3
-"""Of the harmonics over the light's direction."""
+DEGREE = 2
+"""Of the harmonics over the direction that light leaves in."""
 _RIDGE = 0.03
 _FIELD_DEG = 30.0
-_REACHES = ((1.6, 1.0), (4.0, 1e-2), (8.0, 1e-4))
+_REACHES = ((0.8, 1.0), (1.6, 0.05), (4.0, 1e-3), (8.0, 1e-5))
 """Cells that values are averaged over, and how much each mean weighs: the wider ones only count
-where nothing was seen nearer."""
+where little was seen nearer."""
+_BRIGHTEST = 10.0
+"""Times the mean of pixels about it, beyond which one has seen a rare bright path."""
+_ABOUT = ((2.0, 1.0), (6.0, 1e-2))
+_ALIKE, _OWN = 0.6, 0.03
+"""Radians over which lights make much the same of hair, and the share that each has of its own."""
 _RAYS = 4
 """A pixel, for the mean place of what it sees."""
+_ROWS = 512
+"""Cells that are averaged at a time."""
 
 
 @options
@@ -41,31 +47,43 @@ class BakeOptions:
     pixel of at most `max_depth` vertices; a grid of `cells` a side."""
 
     size: Count = 40
-    views: Count = 12
-    lights: Annotated[int, Field(ge=count_of(DEGREE))] = 32
-    spp: Count = 32
+    views: Count = 48
+    lights: Count = 64
+    spp: Count = 24
     max_depth: Count = 24
     cells: Count = 24
 
 
 @dataclass(frozen=True, eq=False)
 class IndirectLight:
-    """`values (n, n, n, 16, 3)`, z, y, x, harmonic, colour; radiance that leaves a place towards
-    the eye for a light of irradiance 1 at the origin, in the mean over the sides it is seen from.
+    """`values (M, L, 9, 3)`, cell, light, harmonic over the direction in which light leaves,
+    colour: radiance for each of the lights in `directions (L, 3)`, of irradiance 1 at the origin.
 
-    The cells' middles go from `low (3,)` to `high (3,)`, metres.
+    `cells (n, n, n)`, z, y, x, says which of the M each has: its own, or its nearest's where
+    nothing was seen. Their middles go from `low (3,)` to `high (3,)`, metres.
     """
 
     low: Array
     high: Array
+    directions: Array
+    cells: Ints
     values: NDArray[np.float16]
 
     def lit(self, directions: Array, irradiance: Array) -> Floats:
-        """Radiance `(n, n, n, 3)` for lights in `directions (L, 3)` of any length, whose
-        `irradiance (L, 3)` at the origin is that of a surface turned to them."""
-        shape = np.einsum("lk,lc->kc", harmonics(directions, DEGREE), irradiance)
-        values = self.values.astype(np.float32)
-        return np.maximum(np.einsum("zyxkc,kc->zyxc", values, shape.astype(np.float32)), 0)
+        """Coefficients `(n, n, n, 9, 3)` of the radiance for lights in `directions (Q, 3)` of any
+        length, whose `irradiance (Q, 3)` at the origin is that of a surface turned to them."""
+        shares = between_lights(self.directions, directions).T @ irradiance
+        found = np.einsum("mlkc,lc->mkc", self.values, shares.astype(np.float32))
+        return np.asarray(found[self.cells], np.float32)
+
+
+def between_lights(known: Array, wanted: Array) -> Array:
+    """What each light of `known (L, 3)` tells of those of `wanted (Q, 3)`: weights `(Q, L)`, whose
+    sum is 1. Kriging about the mean with a covariance of exp((cos - 1) / 0.6²)."""
+    u, v = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (known, wanted))
+    alike = np.exp((u @ u.T - 1) / _ALIKE**2) + _OWN * np.eye(len(u))
+    weights = np.linalg.solve(alike, np.exp((u @ v.T - 1) / _ALIKE**2)).T
+    return np.asarray(weights + (1 - weights.sum(axis=1, keepdims=True)) / len(u))
 
 
 def bake(
@@ -74,44 +92,96 @@ def bake(
     """Trace what light does after its first hit, and average it over cells of `box` (low, high).
 
     Each pixel's radiance under each light, less the direct, is put at the mean place of what it
-    sees, as coefficients of harmonics over the light's direction (least squares). Cells that
-    nothing was seen in have their neighbours' mean.
+    sees; a cell's coefficients are those of least squares over the directions it was seen from.
     """
     low, high = box
     chosen = _spread(lights, options.lights)
     way = np.array([x.position for x in chosen])
     power = np.array([x.intensity_towards(np.zeros(3)) / (x.position @ x.position) for x in chosen])
-    basis = harmonics(way, DEGREE).astype(float)
-    ridge = _RIDGE * len(way) * np.diag(degrees(DEGREE) ** 2) / (4 * np.pi)
-    solve = np.linalg.solve(basis.T @ basis + ridge, basis.T)
-    n, terms = options.cells, basis.shape[1]
-    total, weight = np.zeros((n**3, terms * 3)), np.zeros(n**3)
-    for k, camera in enumerate(_cameras(low, high, options)):
-        pixels = covered_pixels(scene, camera)
-        if not len(pixels):
-            continue
-        places, share = mean_places(scene, camera, pixels, k)
-        seen = share > 0.3
-        pixels, places, share = pixels[seen], places[seen], share[seen]
-        how = {"spp": options.spp, "max_depth": options.max_depth, "seed": k}
-        indirect = render_olat_parts(scene, camera, chosen, pixels, **how)[1]
-        found = np.einsum("kl,lpc->pkc", solve, indirect / power[:, None, :])
-        cell = (places - low) / (high - low) * (n - 1)
-        for at, part in _corners(cell, n):
-            # not divided by the share: what is seen half weighs half
-            np.add.at(total, at, part[:, None] * found.reshape(len(found), -1))
-            np.add.at(weight, at, part * share)
-    if not weight.any():
-        return IndirectLight(low, high, np.zeros((n, n, n, terms, 3), np.float16))
-    grid, amount = total.reshape(n, n, n, -1), weight.reshape(n, n, n, 1)
-    top, bottom = np.zeros_like(grid), np.zeros_like(amount)
-    for sigma, much in _REACHES:
-        top += much * gaussian_filter(grid, (sigma,) * 3 + (0,))
-        bottom += much * gaussian_filter(amount, (sigma,) * 3 + (0,))
-    mean = total.sum(axis=0) / weight.sum()
-    tiny = 1e-9 * weight.max()
-    values = (top + tiny * mean) / (bottom + tiny)
-    return IndirectLight(low, high, values.reshape(n, n, n, terms, 3).astype(np.float16))
+    n = options.cells
+    seen = [
+        _seen(scene, camera, chosen, options, k)
+        for k, camera in enumerate(_cameras(low, high, options))
+    ]
+    places, towards, share, radiance = (np.concatenate(x) for x in zip(*seen, strict=True))
+    if not len(places):
+        none = np.zeros((1, len(chosen), count_of(DEGREE), 3), np.float16)
+        return IndirectLight(low, high, way, np.zeros((n, n, n), int), none)
+    radiance /= power.astype(np.float32)
+    corners = _corners((places - low) / (high - low) * (n - 1), n)
+    kept, row = np.unique(np.concatenate([at for at, _ in corners]), return_inverse=True)
+    part = np.concatenate([x for _, x in corners]).astype(np.float32)
+    rays = np.tile(np.arange(len(places)), len(corners))
+    put = csr_matrix((part, (row, rays)), (len(kept), len(places)))
+    radiance = _without_rare(put, kept, n, share, radiance)
+    values = _fitted(put, kept, n, harmonics(towards, DEGREE), share, radiance)
+    known = np.zeros(n**3, bool)
+    known[kept] = True
+    nearest = distance_transform_edt(
+        ~known.reshape(n, n, n), return_distances=False, return_indices=True
+    )
+    cells = np.searchsorted(kept, np.ravel_multi_index(tuple(nearest), (n, n, n)))
+    return IndirectLight(low, high, way, cells, values.astype(np.float16))
+
+
+def _seen(
+    scene: HairScene, camera: Camera, lights: list[Light], options: BakeOptions, seed: int
+) -> tuple[Array, Array, Array, Floats]:
+    """Of the pixels that see the subject: the mean place `(P, 3)`, the direction from there to the
+    camera, the share of the pixel, and its indirect radiance `(P, L, 3)` under each light."""
+    pixels = covered_pixels(scene, camera)
+    if not len(pixels):
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, len(lights), 3), "f4")
+    places, share = mean_places(scene, camera, pixels, seed)
+    much = share > 0.3
+    pixels, places, share = pixels[much], places[much], share[much]
+    how = {"spp": options.spp, "max_depth": options.max_depth, "seed": seed}
+    indirect = render_olat_parts(scene, camera, lights, pixels, **how)[1]
+    return places, camera.center - places, share, indirect.transpose(1, 0, 2)
+
+
+def _without_rare(put: csr_matrix, kept: Ints, n: int, share: Array, radiance: Floats) -> Floats:
+    """`radiance (P, L, 3)` with no more of the single bright paths than cells about it bear out:
+    one of them would be a spot of a centimetre."""
+    flat = radiance.reshape(len(radiance), -1)
+    sums = np.concatenate([put @ share[:, None].astype(np.float32), put @ flat], axis=1)
+    means = _averaged(sums, kept, n, _ABOUT)
+    about = put.T @ (means[:, 1:] / np.maximum(means[:, :1], 1e-9))
+    return np.minimum(flat, _BRIGHTEST * about).reshape(radiance.shape)
+
+
+def _fitted(
+    put: csr_matrix, kept: Ints, n: int, basis: Floats, share: Array, radiance: Floats
+) -> Floats:
+    """Coefficients `(M, L, k, 3)` of least squares about each of the `kept` cells.
+
+    `put (M, P)` says where the rays are. What is seen half weighs half, for `radiance (P, L, 3)`
+    is that of whole pixels.
+    """
+    terms = basis.shape[1]
+    square = basis[:, :, None] * basis[:, None, :] * share[:, None, None].astype(np.float32)
+    flat = radiance.reshape(len(basis), -1)
+    sums = [put @ square.reshape(len(basis), -1)]
+    sums += [put @ (basis[:, k, None] * flat) for k in range(terms)]
+    means = _averaged(np.concatenate(sums, axis=1), kept, n, _REACHES)
+    left = means[:, : terms**2].reshape(-1, terms, terms)
+    right = means[:, terms**2 :].reshape(len(left), terms, -1)
+    ridge = _RIDGE * np.diag(degrees(DEGREE) ** 2) + 1e-6 * np.eye(terms)
+    size = np.trace(left, axis1=1, axis2=2)[:, None, None] / terms
+    found = np.linalg.solve(left + size * ridge, right)
+    return np.asarray(found.reshape(len(found), terms, -1, 3).transpose(0, 2, 1, 3), np.float32)
+
+
+def _averaged(sums: Floats, kept: Ints, n: int, reaches: tuple[tuple[float, float], ...]) -> Floats:
+    """Sums `(M, C)` of the `kept` cells, averaged over their neighbours."""
+    at = np.stack(np.unravel_index(kept, (n, n, n)), axis=-1).astype(np.float32)
+    out = np.empty_like(sums)
+    for first in range(0, len(at), _ROWS):
+        rows = slice(first, first + _ROWS)
+        apart = ((at[rows, None] - at[None]) ** 2).sum(axis=-1)
+        near = sum(much / s**3 * np.exp(-apart / (2 * s * s)) for s, much in reaches)
+        out[rows] = near @ sums
+    return out
 
 
 def _spread(lights: Sequence[Light], count: int) -> list[Light]:

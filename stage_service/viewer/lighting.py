@@ -129,15 +129,16 @@ class Lighting:
         return bake(self._scene, self._box, self.lights, BakeOptions())
 
     def indirect(self, weights: dict[int, list[float]]) -> bytes:
-        """What lights (number: RGB) make of light between fibres: radiance `(n, n, n, 4)`, float32,
-        z, y, x; the last is not used. The first call traces paths for seconds."""
+        """What lights (number: RGB) make of light between fibres: coefficients `(n, n, n, 9, 3)`,
+        float32, z, y, x, of harmonics of degree 2 over the direction in which it leaves; colour.
+        The first call traces paths for many seconds."""
         full = self._full(weights)
         with self._baking:
             baked = self._indirect
         places = np.array([x.position for x in self.lights])
         power = np.array([x.intensity_towards(np.zeros(3)) for x in self.lights])
         lit = baked.lit(places, full * power / (places**2).sum(axis=1, keepdims=True))
-        return np.pad(lit, ((0, 0),) * 3 + ((0, 1),)).astype("<f4").tobytes()
+        return lit.astype("<f4").tobytes()
 
     def seen(self, number: int) -> bytes:
         """Whether light `number` reaches each point `(S, n)`, then each vertex of the head: uint8.

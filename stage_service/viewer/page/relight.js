@@ -7,6 +7,16 @@ import * as net from "./net.js";
 import { dot, sub, unit } from "./space.js";
 
 const NEAREST = 3;
+const TERMS = 9;
+
+// Real spherical harmonics of degree 2, in the order of appearance/render/harmonics.py.
+function harmonics(x, y, z, out) {
+  const r = 1 / Math.max(Math.sqrt(x * x + y * y + z * z), 1e-9);
+  x *= r; y *= r; z *= r;
+  out[0] = 0.2820948; out[1] = 0.4886025 * y; out[2] = 0.4886025 * z; out[3] = 0.4886025 * x;
+  out[4] = 1.0925484 * x * y; out[5] = 1.0925484 * y * z; out[6] = 0.3153916 * (3 * z * z - 1);
+  out[7] = 1.0925484 * x * z; out[8] = 0.5462742 * (x * x - y * y);
+}
 
 export class Relight {
   static async begin(viewer) {
@@ -30,28 +40,54 @@ export class Relight {
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, wide, high);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, wide, high, gl.RGBA, gl.FLOAT, values);
     });
-    this.between = this.cells(new Float32Array(4), 1);
+    this.between(new Float32Array(TERMS * 3));
     picture.setLighting(this);
   }
 
-  cells(values, side) {
-    const { gl } = this.viewer;
-    return texture(gl, gl.TEXTURE_3D, gl.LINEAR, () => {
-      gl.texStorage3D(gl.TEXTURE_3D, 1, gl.RGBA16F, side, side, side);
-      gl.texSubImage3D(
-        gl.TEXTURE_3D, 0, 0, 0, 0, side, side, side, gl.RGBA, gl.FLOAT, values);
-    });
+  // Light between fibres: of each cell coefficients of harmonics over the direction that it leaves in.
+  between(coefficients) {
+    const { gl } = this.viewer, side = Math.round(Math.cbrt(coefficients.length / TERMS / 3));
+    if (this.cells) gl.deleteTexture(this.cells.texture);
+    this.cells = texture(gl, gl.TEXTURE_3D, gl.LINEAR,
+      () => gl.texStorage3D(gl.TEXTURE_3D, 1, gl.RGBA16F, side, side, side));
+    this.grid = { coefficients, side, towards: null };
   }
 
-  // Light between fibres: the server traces it once, which takes a while; the rest does not wait.
+  // What of it leaves for `eye`, for the shader to look up.
+  facing(eye) {
+    const { side, towards } = this.grid, { gl } = this.viewer;
+    if (towards && towards.every((x, i) => x === eye[i])) return;
+    this.grid.towards = [...eye];
+    gl.bindTexture(gl.TEXTURE_3D, this.cells.texture);
+    gl.texSubImage3D(
+      gl.TEXTURE_3D, 0, 0, 0, 0, side, side, side, gl.RGBA, gl.FLOAT, this.leaving(eye));
+  }
+
+  leaving(eye) {  // in every frame that turns: nothing is allocated for a cell
+    const { coefficients, side } = this.grid, [low, high] = this.told.material.cells;
+    const out = new Float32Array(4 * side ** 3), terms = new Float64Array(TERMS);
+    const steps = low.map((x, i) => (high[i] - x) / Math.max(side - 1, 1));
+    for (let cell = 0; cell < side ** 3; cell++) {
+      const i = cell % side, j = Math.floor(cell / side) % side, k = Math.floor(cell / side ** 2);
+      harmonics(eye[0] - low[0] - steps[0] * i, eye[1] - low[1] - steps[1] * j,
+        eye[2] - low[2] - steps[2] * k, terms);
+      for (let c = 0; c < 3; c++) {
+        let sum = 0;
+        for (let t = 0; t < TERMS; t++) sum += terms[t] * coefficients[3 * (TERMS * cell + t) + c];
+        out[4 * cell + c] = Math.max(sum, 0);
+      }
+    }
+    return out;
+  }
+
+  // The server traces it once, which takes a while; the rest does not wait.
   async indirect(body) {
     const { viewer } = this, asked = this.asked = {};
     if (!this.baked) viewer.status("tracing light between the fibres: once, and it takes a while");
     const values = new Float32Array(await net.bytes("/indirect", body));
     this.baked = true;
     if (asked !== this.asked) return;
-    viewer.gl.deleteTexture(this.between.texture);
-    this.between = this.cells(values, Math.round(Math.cbrt(values.length / 4)));
+    this.between(values);
     viewer.status("");
     viewer.draw();
   }
@@ -72,7 +108,7 @@ export class Relight {
       uTable: this.table, uVariance: material.variances, uTilt: material.tilt,
       uEta: material.eta, uLogistic: material.logistic_scale, uAbsorption: material.absorption,
       uGrid: [material.cosines, material.turns], uSkin: material.skin,
-      uIndirect: this.between, uAmbient: this.ambient,
+      uIndirect: this.cells, uAmbient: this.ambient,
       uCells: material.cells[0], uSpan: sub(material.cells[1], material.cells[0]),
     };
   }
@@ -202,7 +238,7 @@ export class Relight {
       })));
       const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and what leaves " +
         "later) with shadows; light between fibres, times “indirect”, is path-traced once and kept " +
-        "coarsely: some millimetres, the same to every side."];
+        "coarsely: a centimetre or so, and smooth in direction."];
       if (!told.material.one_material) notes.push("One material is shown: the mean of its map.");
       if (told.material.field) notes.push("The model's field is not shown.");
       notes.push("Of an environment the eight strongest lights are shaded.");

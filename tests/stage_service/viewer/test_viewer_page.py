@@ -15,6 +15,7 @@ import pytest
 from appearance import Exposure, HairAppearance, render_olat
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
+from appearance.render.harmonics import harmonics
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Camera, Model, Strands
 
@@ -154,6 +155,19 @@ def test_direct_light_is_that_of_the_path_tracer(seen, model, viewing, allowed):
         )
         found = np.array(seen.page.evaluate(AT_REST), np.float32).reshape(96, 96, 4)[::-1, :, :3]
         np.testing.assert_allclose(found.sum(axis=(0, 1)), picture.sum(axis=(0, 1)), rtol=allowed)
+    # what of the server's grid leaves for the eye
+    seen.page.wait_for_function("viewer.relight.grid.side > 1", timeout=PATIENCE_MS)
+    seen.page.evaluate("viewer.relight.traced")
+    terms = np.frombuffer(lighting.indirect({numbers[-1]: [1, 1, 1]}), "<f4")
+    low, high = (np.array(x) for x in lighting.about()["material"]["cells"])
+    side = round((terms.size / 27) ** (1 / 3))
+    z, y, x = np.moveaxis(np.indices((side,) * 3) / (side - 1), 0, 0)
+    towards = harmonics(eye - (low + np.stack([x, y, z], -1) * (high - low)), 2)
+    leaves = np.einsum("zyxkc,zyxk->zyxc", terms.reshape(side, side, side, 9, 3), towards)
+    told = seen.page.evaluate("Array.from(viewer.relight.leaving(viewer.orbit.pinhole(9, 9).eye))")
+    folded = np.array(told).reshape(side, side, side, 4)[..., :3]
+    assert leaves.max() > 0
+    np.testing.assert_allclose(folded, np.maximum(leaves, 0), atol=1e-4 * leaves.max())
     assert seen.complaints == []
 
 
