@@ -122,3 +122,17 @@ def test_a_stage_knows_its_peak_memory_and_gives_it_to_the_stage_around_it() -> 
         pytest.skip("this system does not tell a process its peak memory")
     assert inner > small + 0.2
     assert outer >= inner
+
+
+def test_a_stage_within_another_is_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven seconds of triangulation and three of motion are ten of the clock's."""
+    clock = iter([0.0, 1.0, 4.0, 10.0])
+    monkeypatch.setattr("reconstruction.report.report.time.perf_counter", lambda: next(clock))
+    report = Report([Stage("motion", 99.0), Stage("masks", 5.0)])
+    with report.stage("triangulation"), report.stage("motion"):
+        pass
+    assert {s.name: s.seconds for s in report.stages} == {
+        "masks": 5.0,
+        "triangulation": 7.0,
+        "motion": 3.0,
+    }
