@@ -25,19 +25,27 @@ HURRY_S = 300.0
 
 
 class Live:
-    """One service, begun again where it was killed; `command` runs `hairstage`, or it does."""
+    """One service, begun again where it was killed; `command` runs `hairstage`, or it does.
+
+    `more`: arguments of `hairstage serve`, at every start.
+    """
 
     def __init__(
-        self, rig: RigFile, children: Children, root: Path, command: Sequence[str] = ()
+        self,
+        rig: RigFile,
+        children: Children,
+        root: Path,
+        command: Sequence[str] = (),
+        more: Sequence[str] = (),
     ) -> None:
-        self.rig, self.root, self._children = rig, root, children
+        self.rig, self.root, self._children, self._more = rig, root, children, more
         self.kills = 0
         self.begin(command)
 
     def words(self, root: Path) -> list[str]:
         """The arguments of `hairstage` that serve this stage."""
         devices = self.rig.path.parent / "devices.toml"
-        words = ("serve", "--json", "--port", "0", "--rig", self.rig.path)
+        words = ("serve", "--json", "--port", "0", "--rig", self.rig.path, *self._more)
         return [str(word) for word in (*words, "--root", root, "--devices", devices)]
 
     def begin(self, command: Sequence[str] = ()) -> None:
