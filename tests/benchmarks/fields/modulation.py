@@ -43,7 +43,12 @@ from reconstruction.arrays import Array
 
 STAGE = SmallStage(size=24, cameras=8, lights=18, spp=576, max_depth=6, truth=(12, 48, 48))
 BRIGHTEST = "maps, brightest"
-BASELINE: dict[str, Any] = {"degree": 3, "iterations": 12, "folds": 2, "ridges": (0.01, 0.1, 1.0)}
+BASELINE: dict[str, Any] = {
+    "degree": 3,
+    "iterations": 12,
+    "folds": 2,
+    "ridges": (0.01, 0.1, 1.0),
+}
 """Sixteen times the coefficients of degree 1 take few ridges and folds, or an hour."""
 FIELDS = {
     "GaussianHair's: dual harmonics of the whole picture, degree 3": FieldOptions(
