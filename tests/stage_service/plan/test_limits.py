@@ -82,8 +82,10 @@ class Clock:
 
 
 @pytest.fixture
-def limited() -> Any:
-    """Makes a wrapper over a new bank: (bank, wrapper, clock); closes it afterwards."""
+def limited(monkeypatch) -> Any:
+    """Makes a wrapper over a new bank: (bank, wrapper, clock); closes it afterwards. Its thread
+    does not run: it waits by the machine's clock, and would come between on a busy machine."""
+    monkeypatch.setattr(LimitedLightBank, "_watch", lambda _: None)
     made = []
 
     def make(**limits: Any) -> tuple[Bank, LimitedLightBank, Clock]:
