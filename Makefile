@@ -19,8 +19,8 @@ $(BIN)/.installed: pyproject.toml
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
-setup: $(BIN)/.installed  ## Make .venv, install everything, find or install libLLVM >= 16
-	@deploy/ensure-llvm.sh
+setup: $(BIN)/.installed  ## Make .venv, install everything, find or install libLLVM >= 16 and libatomic
+	@deploy/ensure-libraries.sh
 
 demo: setup  ## Capture, reconstruct, fit and relight; SUBJECT=strands HEAD=mesh OUT=folder
 	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD))

@@ -1,10 +1,15 @@
-"""Finds libLLVM and names it to Dr.Jit, which loads it as it is imported: import this before."""
+"""Finds libLLVM and names it to Dr.Jit, which loads it as it is imported: import this before.
+
+The import raises `BackendError` where libatomic is missing, without which Mitsuba's wheel cannot
+be imported.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import re
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -58,3 +63,9 @@ def _loads(path: str) -> bool:
 
 with suppress(BackendError):  # whoever asks for a back end that needs it is told
     os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
+
+if sys.platform == "linux" and not _loads("libatomic.so.1"):
+    raise BackendError(
+        "hairstage needs libatomic.so.1, which Mitsuba's libraries load: "
+        "run 'apt-get install libatomic1'"
+    )

@@ -53,6 +53,28 @@ def test_the_message_comes_before_the_crash(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+_WITHOUT_LIBATOMIC = """
+import ctypes, sys
+load = ctypes.CDLL
+def without(name, *more, **options):
+    if "libatomic" in str(name):
+        raise OSError(name)
+    return load(name, *more, **options)
+ctypes.CDLL = without
+from stage_service.cli import main
+sys.exit(main(["render", sys.argv[1]]))
+"""
+
+
+def test_a_missing_libatomic_is_a_sentence(tmp_path):
+    """Mitsuba's wheel needs it and says nothing of it; a fresh Debian has none."""
+    command = [sys.executable, "-c", _WITHOUT_LIBATOMIC, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "apt-get install libatomic1" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("package", ["appearance", "reconstruction.light_codes.search"])
 def test_the_library_is_chosen_before_dr_jit_loads_one(package):
     code = f"import sys, {package}; print(*sys.modules)"
