@@ -59,6 +59,9 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
             "'make bench', or 'hairstage bench NAME' of an editable installation, in a checkout",
             FAILED,
         )
-    path = os.pathsep.join([str(tests), *filter(None, [os.environ.get("PYTHONPATH")])])
+    # tests/ has folders of the packages' names: the packages come first, wherever this is run.
+    path = os.pathsep.join(
+        [str(tests.parent), str(tests), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
     command = [sys.executable, "-m", "benchmarks", args.name, *args.arguments]
     return subprocess.run(tied(command), env={**os.environ, "PYTHONPATH": path}).returncode
