@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.arrays import Array, Bools
-from reconstruction.capture.folder import Capture, read_mask
+from reconstruction.capture.folder import Capture
 from reconstruction.files.durable import PART, write_json, writing
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
@@ -183,18 +183,18 @@ class Model:
         an empty one. Raises `CaptureError` for a mask of another size, `ModelError` where there is
         no hair mask at all.
         """
-        size, name = capture.rig.camera(camera), f"masks/{camera}_{kind}.png"
-        shape = (size.height, size.width)
+        name = f"masks/{camera}_{kind}.png"
         if not self.has(name):
             if kind == "skin":
-                return np.zeros(shape, bool)
+                size = capture.rig.camera(camera)
+                return np.zeros((size.height, size.width), bool)
             user = capture.mask(camera)
             if user is not None:
                 return user
-        return read_mask(self._needed(name, _RECONSTRUCT), shape)
+        return capture.read_mask(self._needed(name, _RECONSTRUCT), camera)
 
     def write_mask(self, camera: str, kind: MaskKind, mask: Bools) -> None:
-        """Write a mask `(H, W)`, in the pixels of the capture's frames."""
+        """Write a mask `(H, W)`, in the pixels of the frames on disk."""
         self.write_png(f"masks/{camera}_{kind}.png", mask.astype(np.uint8) * 255)
 
     def write_png(self, name: str, image: NDArray[np.uint8]) -> None:

@@ -106,6 +106,11 @@ def reconstruct(
     return stages.report
 
 
+def method_for(capture: Capture) -> Method:
+    """What `auto` takes: planes of light where there are a sweep and single lights."""
+    return "light_planes" if capture.of_kind("scanline") and capture.olat_lights() else "hull"
+
+
 def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
     """The capture as if it had never had these cameras."""
     for name in cameras:
@@ -173,7 +178,7 @@ class _Stages:
         """The method for what the capture holds; the stage `method` says what and which."""
         with self.report.stage("method") as stage:
             sweep, lights = bool(capture.of_kind("scanline")), len(capture.olat_lights())
-            method: Method = "light_planes" if sweep and lights else "hull"
+            method = method_for(capture)
             holds = f"{'a' if sweep else 'no'} sweep, {lights} single lights, "
             holds += f"{'no' if head is None else 'a'} head"
             stage.figures.update(method=method, capture_holds=holds)

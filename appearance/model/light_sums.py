@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from appearance.render.environment_maps import check_environment
 from reconstruction import Camera, Capture, Light
 from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.geometry.blocks import block_means
 
 MEMORY = 1 << 30
 """Bytes that one camera's frames may take; larger ones are reduced by whole factors."""
@@ -35,7 +36,7 @@ class LightSums:
         height, width = at.height // self.reduced, at.width // self.reduced
         self.responses = np.empty((len(self.names), height, width, 3), np.float32)
         for i, name in enumerate(self.names):
-            self.responses[i] = _reduced(capture.light(name, camera)[0], self.reduced)
+            self.responses[i] = block_means(capture.light(name, camera)[0], self.reduced)
 
     def __call__(self, weights: Mapping[str, ArrayLike]) -> Floats:
         """Radiance `(H, W, 3)` under lights by name, each at its `weights`: one number or three.
@@ -49,14 +50,6 @@ class LightSums:
         for name, weight in weights.items():
             out += self.responses[self.names.index(name)] * np.asarray(weight, np.float32)
         return out
-
-
-def _reduced(image: Floats, by: int) -> Floats:
-    if by == 1:
-        return image
-    height, width = (n // by * by for n in image.shape[:2])
-    blocks = image[:height, :width].reshape(height // by, by, width // by, by, 3)
-    return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
 
 
 def weights_of_environment(

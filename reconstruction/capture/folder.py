@@ -28,6 +28,7 @@ import numpy as np
 from reconstruction.arrays import Bools, Floats
 from reconstruction.containment import NotContained, inside, plain_file
 from reconstruction.files.exr import read_exr
+from reconstruction.geometry.blocks import block_any, block_means, unblocked
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig
@@ -127,7 +128,9 @@ class Capture:
             if isinstance(error, CaptureError):
                 raise
             raise CaptureError(str(error)) from error
+        self._shot = {c.name: c for c in self.rig.cameras}
         self._lenses: dict[str, Lens] = {}
+        self._by = 1
 
     def view(
         self,
@@ -135,13 +138,16 @@ class Capture:
         cameras: Iterable[str] | None = None,
         lights: Iterable[str] | None = None,
         undistorted: bool | None = None,
+        reduced: int | None = None,
     ) -> Capture:
         """The capture as if it had only these `cameras` and `lights`, and with pinholes if asked.
 
         Both in the rig's order; None keeps those that this view has. `lights` are those that are
         shot one at a time; the rig keeps its lights. `undistorted` resamples frames and masks of
-        lenses that bend lines as they are read; False takes them as shot. The view reads the same
-        folder; this one stays as it is. Raises `CaptureError` for names that are not there.
+        lenses that bend lines as they are read; False takes them as shot. `reduced` by n, pixels
+        are the means over n × n of those on disk; 1 takes them as shot. The view reads the same
+        folder; this one stays as it is. Raises `CaptureError` for names that are not there, and
+        where pictures are too small to be reduced so.
         """
         out = copy.copy(self)
         out.__dict__.pop("_of_light", None)
@@ -149,12 +155,17 @@ class Capture:
         if cameras is not None:
             names = self._known("camera", cameras, [c.name for c in chosen])
             chosen = [c for c in chosen if c.name in names]
-        if undistorted is not None:
-            chosen = [self._lenses[c.name].as_shot if c.name in self._lenses else c for c in chosen]
-            out._lenses = {}
-            if undistorted:
-                out._lenses = {c.name: Lens.of(c) for c in chosen if c.distorted}
-                chosen = [out._lenses[c.name].undistorted if c.distorted else c for c in chosen]
+        if undistorted is not None or reduced is not None:
+            out._by = reduced or self._by
+            try:
+                chosen = [self._shot[c.name].reduced(out._by) for c in chosen]
+            except ValueError as error:
+                raise CaptureError(f"{self.path}: {error}") from error
+            straight = bool(self._lenses) if undistorted is None else undistorted
+            out._lenses = {c.name: Lens.of(c) for c in chosen if straight and c.distorted}
+            chosen = [
+                out._lenses[c.name].undistorted if c.name in out._lenses else c for c in chosen
+            ]
         out.rig = replace(self.rig, cameras=tuple(chosen))
         if lights is not None:
             names = self._known("light", lights, self.olat_lights())
@@ -175,11 +186,23 @@ class Capture:
     def mask_as_shot(self, camera: str, mask: Bools) -> Bools:
         """A mask `(H, W)` in the pixels of this view, in those of the frames on disk."""
         lens = self._lenses.get(camera)
-        return mask if lens is None else lens.distort_mask(mask)
+        mask = mask if lens is None else lens.distort_mask(mask)
+        shot = self._shot[camera]
+        return mask if self._by == 1 else unblocked(mask, self._by, shot.height, shot.width)
 
-    def mask_in_view(self, camera: str, mask: Bools) -> Bools:
-        """A mask `(H, W)` in the pixels of the frames on disk, in those of this view."""
-        lens = self._lenses.get(camera)
+    def read_mask(self, path: Path, camera: str) -> Bools:
+        """A mask `(H, W)` from a picture as large as the frames on disk, in this view's pixels.
+
+        Half grey and above, and at least half of what a pixel stands for. Raises `CaptureError`.
+        """
+        shot, lens = self._shot[camera], self._lenses.get(camera)
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None or image.shape != (shot.height, shot.width):
+            found = None if image is None else image.shape
+            raise CaptureError(
+                f"{path}: expected a {shot.height, shot.width} grey PNG, got {found}"
+            )
+        mask = np.asarray(block_means(image >= 128, self._by) >= 0.5)
         return mask if lens is None else lens.undistort_mask(mask)
 
     def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:
@@ -214,6 +237,7 @@ class Capture:
         Noise may push dark pixels below zero. Raises `MissingFrame`.
         """
         image, lens = self._read(step, camera)[0], self._lenses.get(camera)
+        image = block_means(image, self._by)
         return image if lens is None else lens.undistort(image)
 
     def response(self, step: Step, camera: str) -> Floats:
@@ -232,6 +256,8 @@ class Capture:
         saturated = np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))
         image = image if step.level in (0, 1) else image / np.float32(step.level)
         lens = self._lenses.get(camera)
+        if self._by > 1:
+            image, saturated = block_means(image, self._by), block_any(saturated, self._by)
         if lens is None:
             return image, saturated
         return lens.undistort(image), lens.undistort_any(saturated)
@@ -355,17 +381,13 @@ class Capture:
         path = self._own(f"{folder}/{camera}.png")
         if not path.is_file():
             return None
-        return self.mask_in_view(camera, read_mask(path, self._shape_as_shot(camera)))
+        return self.read_mask(path, camera)
 
     @cached_property
     def head(self) -> Mesh | None:
         """The digitised head, or None when the capture has none."""
         path = self._own("head.obj")
         return read_obj(path) if path.is_file() else None
-
-    def _shape_as_shot(self, camera: str) -> tuple[int, int]:
-        lens = self._lenses.get(camera)
-        return self._shape(camera) if lens is None else (lens.as_shot.height, lens.as_shot.width)
 
     def _shape(self, camera: str) -> tuple[int, int]:
         c = self.rig.camera(camera)
@@ -388,12 +410,3 @@ def _steps(plan: dict[str, Any]) -> list[Any]:
     if not isinstance(steps, list):
         raise CaptureError(f"plan.json: the field 'steps' must be a list, got {steps!r}")
     return steps
-
-
-def read_mask(path: Path, shape: tuple[int, int]) -> Bools:
-    """A grey PNG as a mask `(H, W)` of `shape`: half grey and above. Raises `CaptureError`."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None or image.shape != shape:
-        found = None if image is None else image.shape
-        raise CaptureError(f"{path}: expected a {shape} grey PNG, got {found}")
-    return np.asarray(image >= 128)

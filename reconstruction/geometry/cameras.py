@@ -188,6 +188,25 @@ class Camera(Pinhole):
         """The same camera without its lens."""
         return replace(self, distortion=np.zeros(5))
 
+    def reduced(self, by: int) -> Camera:
+        """The camera whose pixels are the means over blocks of `by`² of this one's.
+
+        Rows and columns that fill no block are cut off. Raises `ValueError` where no pixel is left.
+        """
+        if by == 1:
+            return self
+        if by < 1 or min(self.width, self.height) < by:
+            raise ValueError(
+                f"{self.name}: pictures of {self.width}x{self.height} pixels cannot be reduced by "
+                f"{by}"
+            )
+        K = self.K.copy()
+        K[:2] /= by
+        K[:2, 2] += 0.5 / by - 0.5
+        sigma = self.filter_sigma and np.sqrt(self.filter_sigma**2 + (by * by - 1) / 12) / by
+        width, height = self.width // by, self.height // by
+        return replace(self, width=width, height=height, K=K, filter_sigma=float(sigma))
+
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready description that `Rig.from_dict` reads back exactly."""
         out = super().to_dict()

@@ -135,7 +135,8 @@ def silhouette(capture: Capture, camera: str) -> Bools:
     if (told := capture.subject(camera)) is not None:
         return told
     if camera in capture.lenses:  # resampled, the faintest light spreads by a pixel
-        return capture.mask_in_view(camera, silhouette(capture.view(undistorted=False), camera))
+        bent = silhouette(capture.view(undistorted=False), camera)
+        return capture.lenses[camera].undistort_mask(bent)
     image = lit_image(capture, camera)
     positive = image[image > 0]
     bright = float(np.percentile(positive, 95)) if positive.size else 0.0

@@ -24,6 +24,7 @@ BENCHMARKS = {
     "gradients": "path replay beside finite differences",
     "importing": "strands of a capture written out as photographs, by damage",
     "interpolation": "captured frames interpolated on strands, standard and guided by a model",
+    "large": "captures of 1.3 and 20 megapixels: seconds and memory beside their estimate",
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, beside baselines",
     "masks": "automatic hair masks beside true ones, at several path counts",

@@ -29,14 +29,16 @@ class JobOptions(Strict):
     `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may observe:
     the images of these are what the result is judged on. `truth` is a strand file to evaluate
     against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
-    file, `studio` or `sky`. `reconstruct`, `fit`, `inverse_rendering`, `fields` and `assess` go to
-    the step of that name.
+    file, `studio` or `sky`. `reduced` by n, every step works on means over n × n pixels: large
+    pictures need a fraction of time and memory. `reconstruct`, `fit`, `inverse_rendering`, `fields`
+    and `assess` go to the step of that name.
     """
 
     method: Method = "light_planes"
     compress: bool = True
     held_out_cameras: Names = ()
     held_out_lights: Names = ()
+    reduced: int = Field(default=1, ge=1, le=64)
     environment: str = "studio"
     truth: str | None = None
     seed: int = Field(default=0, ge=0)

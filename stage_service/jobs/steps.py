@@ -28,13 +28,17 @@ class StepContext:
     progress: Progress
     previous: Mapping[str, Figures] = field(default_factory=dict)
 
+    def frames(self) -> Capture:
+        """The capture, its pictures as large as was asked for."""
+        return Capture(self.capture).view(reduced=self.options.reduced)
+
     def for_appearance(self) -> dict[str, Any]:
         """What fits and assessment of the appearance take alike."""
         from appearance import HeldOut
 
         asked = self.options
         return {
-            "capture": Capture(self.capture),
+            "capture": self.frames(),
             "model": self.model,
             "held_out": HeldOut(asked.held_out_cameras, asked.held_out_lights),
             "progress": self.progress,
@@ -57,7 +61,7 @@ def reconstruct(context: StepContext) -> Figures:
 
     asked = context.options
     options = replace(asked.reconstruct, held_out=asked.held_out_cameras, seed=asked.seed)
-    capture = Capture(context.capture)
+    capture = context.frames()
     left = [name for name in capture.olat_lights() if name not in asked.held_out_lights]
     capture = capture.view(lights=left)
     run(capture, context.model, method=asked.method, options=options, progress=context.progress)

@@ -31,6 +31,7 @@ MODULES = {
     "gradients": "benchmarks.renderers.gradients",
     "importing": "benchmarks.importing.damages",
     "interpolation": "benchmarks.fields.interpolation",
+    "large": "benchmarks.importing.large_sizes",
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from reconstruction import (
     reconstruct,
     write_obj,
 )
+from reconstruction.estimate import estimate
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.light_planes import PointCloud
 from reconstruction.reconstruct_options import MeasureOptions
@@ -110,7 +112,7 @@ def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera])
             assert image.shape == (96, 96)
 
 
-def runs_down(strands: Strands) -> None:
+def runs_down(strands: Strands, within_deg: float = 7) -> None:
     """Asserts that strands follow the meridians once they have risen from the scalp."""
     assert len(strands) > 300
     distance = np.linalg.norm(strands.roots, axis=1)
@@ -119,12 +121,45 @@ def runs_down(strands: Strands) -> None:
     outer = (radius > 0.098) & (np.abs(strands.points[:, 2]) < 0.07)
     along = (strands.tangents()[outer] * down(strands.points[outer])).sum(axis=1)
     turned = np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))
-    assert np.median(turned) < 7
+    assert np.median(turned) < within_deg
     assert (turned < 20).mean() > 0.8
 
 
 def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:
     runs_down(read_strands(model[0] / "strands.npz"))
+
+
+@pytest.mark.slow
+def test_half_as_many_pixels_a_side_give_the_same_strands(unswept: Capture, tmp_path: Path) -> None:
+    reconstruct(unswept.view(reduced=2), Model(tmp_path), options=QUICK)
+    runs_down(read_strands(tmp_path / "strands.npz"), within_deg=10)
+    image = cv2.imread(str(tmp_path / "masks" / "c72_hair.png"), 0)
+    assert image is not None
+    assert image.shape == (96, 96)  # masks are left in the pixels of the frames
+
+
+def test_an_estimate_tells_of_the_stages_that_take_time(
+    unswept: Capture, model: tuple[Path, Report]
+) -> None:
+    told = estimate(unswept, method="light_planes", options=QUICK)
+    taken = {s.name: s.seconds for s in model[1].stages}
+    for name, seconds in taken.items():
+        assert seconds < 0.05 * sum(taken.values()) or name in {s.name for s in told.stages}
+    assert {s.name for s in told.stages} <= set(taken)
+    assert told.frames == sum(
+        unswept.has(s, c.name) for s in unswept.steps for c in unswept.rig.cameras
+    )
+    assert all(s.seconds >= 0 and 0 <= s.measured <= 1 and s.peak_gb > 0.1 for s in told.stages)
+
+
+def test_more_of_everything_is_estimated_to_take_more(unswept: Capture) -> None:
+    def cost(capture: Capture, **asked: Any) -> tuple[float, float]:
+        told = {s.name: s for s in estimate(capture, **asked).stages}
+        return told["orientation"].peak_gb, told["strands"].peak_gb
+
+    whole = cost(unswept)
+    assert all(np.array(whole) > cost(unswept.view(reduced=3)))
+    assert all(np.array(whole) > cost(unswept, options=ReconstructOptions(held_out=("c0", "c72"))))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_command,
-    add_held_out,
+    add_view,
     progress_bar,
     read_json,
 )
@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
         "(modulation), or light that is added (additive); none removes it",
     )
     fit.add_argument("--field-options", help="the field's options as JSON")
-    add_held_out(fit)
+    add_view(fit)
     fit.add_argument("--environment", default="studio", help="studio, sky, or an .hdr or .exr file")
     fit.add_argument("--seed", type=int, default=0)
 
@@ -66,6 +66,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     asked = {
         "held_out_cameras": args.hold_out_camera,
         "held_out_lights": args.hold_out_light,
+        "reduced": args.reduce,
         "environment": args.environment,
         "seed": args.seed,
         "inverse_rendering" if inverse else "fit": read_json(args.options),

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import os
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from reconstruction.methods import METHODS
 from stage_service.cli.support.commands import (
+    BadArgument,
     Commands,
     Output,
     add_command,
-    add_held_out,
+    add_view,
     progress_bar,
     read_json,
 )
+
+if TYPE_CHECKING:
+    from reconstruction import Capture
+    from reconstruction.estimate import Estimate
+    from stage_service.jobs.records import JobOptions
+
+MEMORY_SHARE = 0.8  # of this machine's that a reconstruction may take without a warning
 
 
 def add(commands: Commands) -> None:
@@ -21,9 +32,12 @@ def add(commands: Commands) -> None:
     reconstruct = add_command(commands, "reconstruct", run)
     reconstruct.add_argument("capture", type=Path)
     reconstruct.add_argument("--method", choices=METHODS, default="auto")
-    reconstruct.add_argument("--out", type=Path, required=True, help="model folder")
+    reconstruct.add_argument("--out", type=Path, help="model folder")
+    reconstruct.add_argument(
+        "--estimate", action="store_true", help="only tell what it would take on this machine"
+    )
     reconstruct.add_argument("--options", help="the method's options as JSON")
-    add_held_out(reconstruct)
+    add_view(reconstruct)
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
@@ -33,7 +47,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     a sweep, else the masks' hull, filled along what single lights show.
 
     Write MODEL/strands.npz, .hair and .usdc, MODEL/report.json, and a page on them,
-    MODEL/index.html.
+    MODEL/index.html. With --estimate, tell seconds, memory and disk instead, by stage: frames and
+    filters are tried for some seconds, the rest is a table scaled by this machine's speed.
     """
     from reconstruction import Capture, Model, parse_options
     from stage_service.jobs.records import JobOptions
@@ -44,10 +59,16 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "method": args.method,
         "held_out_cameras": args.hold_out_camera,
         "held_out_lights": args.hold_out_light,
+        "reduced": args.reduce,
         "reconstruct": read_json(args.options),
     }
-    options, model = parse_options(JobOptions, asked), Model(args.out)
-    Capture(args.capture)
+    options, capture = parse_options(JobOptions, asked), Capture(args.capture)
+    if args.estimate:
+        _estimate(capture, options, output)
+        return
+    if args.out is None:
+        raise BadArgument("--out MODEL says where the strands go; or ask for an --estimate")
+    model = Model(args.out)
     with progress_bar("reconstruct") as progress:
         reconstruct(StepContext(args.capture, model, options, progress))
     write_page(model)
@@ -65,3 +86,46 @@ def run(args: argparse.Namespace, output: Output) -> None:
         {**data, "method": method, "seconds": seconds},
         f"{len(strands)} strands in {model.file('strands.npz')} ({seconds:.0f} s)",
     )
+
+
+def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:
+    """Tell what reconstructing `capture` would take."""
+    from reconstruction.estimate import estimate
+
+    asked = replace(options.reconstruct, held_out=options.held_out_cameras, seed=options.seed)
+    left = [name for name in capture.olat_lights() if name not in options.held_out_lights]
+    capture, by = capture.view(lights=left), options.reduced
+    machine_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+
+    def tried(by: int) -> Estimate:
+        with progress_bar("estimate") as progress:
+            view = capture.view(reduced=by)
+            return estimate(view, method=options.method, options=asked, progress=progress)
+
+    found = tried(by)
+    lines = [f"{'stage':<14}{'seconds':>9}{'memory':>11}  measured here"]
+    lines += [
+        f"{s.name:<14}{s.seconds:9.0f}{s.peak_gb:8.1f} GB{s.measured:8.0%}" for s in found.stages
+    ]
+    lines.append(
+        f"{_duration(found.seconds)} in all, {found.peak_gb:.1f} GB of this machine's "
+        f"{machine_gb:.0f}; {found.frames:,} frames are read, the model takes {found.disk_gb:.1f} "
+        "GB of disk. A third more or less is usual, where nothing else runs."
+    )
+    data = {"reduced": by, "method": found.method, **asdict(found), "seconds": found.seconds}
+    if found.peak_gb > MEMORY_SHARE * machine_gb:
+        for by in (n for n in (2, 4, 8, 16) if n > options.reduced):
+            if (less := tried(by)).peak_gb < MEMORY_SHARE * machine_gb:
+                data["fits"] = {"reduced": by, "seconds": less.seconds, "peak_gb": less.peak_gb}
+                lines.append(
+                    f"That is more memory than there is: with --reduce {by} it takes "
+                    f"{_duration(less.seconds)} and {less.peak_gb:.1f} GB."
+                )
+                break
+    output.result({**data, "peak_gb": found.peak_gb, "machine_gb": machine_gb}, "\n".join(lines))
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

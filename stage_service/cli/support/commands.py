@@ -184,8 +184,8 @@ def _phrase(sentence: str) -> str:
     return text if text[1:2].isupper() else text[0].lower() + text[1:]
 
 
-def add_held_out(parser: argparse.ArgumentParser) -> None:
-    """Add `--hold-out-camera` and `--hold-out-light`."""
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """Add what of a capture is seen: `--hold-out-camera`, `--hold-out-light`, `--reduce`."""
     for kind in ("camera", "light"):
         parser.add_argument(
             f"--hold-out-{kind}",
@@ -194,6 +194,13 @@ def add_held_out(parser: argparse.ArgumentParser) -> None:
             metavar=kind.upper(),
             help=f"a {kind} to leave out, to judge the result on (repeat for more)",
         )
+    parser.add_argument(
+        "--reduce",
+        type=int,
+        default=1,
+        metavar="N",
+        help="work on means over N × N pixels: large pictures need a fraction of time and memory",
+    )
 
 
 def rig_path(text: str) -> Path:

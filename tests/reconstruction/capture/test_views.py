@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from reconstruction import Camera, Capture, CaptureError
+from reconstruction import Camera, Capture, CaptureError, Model
+from reconstruction.geometry.blocks import block_means
 from reconstruction.geometry.lens import Lens
 from reconstruction.images.silhouettes import silhouette
 from reconstruction.light_planes import solve_motion, triangulate
@@ -91,6 +93,16 @@ def test_frames_masks_and_saturation_are_straight(bent: Capture) -> None:
         assert np.array_equal(capture.saturated(step, device.name), full)
 
 
+def test_a_models_masks_follow_the_view(bent: Capture, tmp_path: Path) -> None:
+    model = Model(tmp_path).create()
+    shot = silhouette(bent, "left")
+    model.write_mask("left", "hair", shot)
+    for view in (bent.view(undistorted=True), bent.view(undistorted=True, reduced=2)):
+        mask = model.mask("left", "hair", view)
+        assert (mask ^ silhouette(view, "left")).sum() < 0.1 * mask.sum()
+        assert model.mask("left", "skin", view).shape == mask.shape
+
+
 def test_a_wave_of_eleven_pixels_is_resampled_to_two_hundredths() -> None:
     camera = Camera.look_at("c", 96, 80, (0, -1, 0), (0, 0, 0), 30.0)
     lens = replace(camera, distortion=[-0.4, 0.1, 0.005, 0.002])
@@ -107,6 +119,62 @@ def test_a_wave_of_eleven_pixels_is_resampled_to_two_hundredths() -> None:
     error = np.abs(way.undistort(wave(lens)) - wave(way.undistorted))
     assert np.percentile(error, 99) < 0.02
     assert error.max() < 0.04
+
+
+@pytest.mark.parametrize("lens", [[0.0], [-0.4, 0.1, 0.005, 0.002]])
+@pytest.mark.parametrize("by", [2, 3, 7])
+def test_block_means_are_what_the_reduced_camera_sees(lens: list[float], by: int) -> None:
+    camera = replace(
+        Camera.look_at("c", 97, 83, (0, -1, 0), (0, 0, 0), 30.0), distortion=lens, filter_sigma=0.5
+    )
+
+    def slope(device: Camera) -> np.ndarray:
+        x, y = np.meshgrid(np.arange(device.width), np.arange(device.height))
+        rays = device.rays(np.stack([x, y], axis=-1))
+        return np.stack([rays[..., 0] / rays[..., 1], rays[..., 2] / rays[..., 1]], axis=-1)
+
+    small = camera.reduced(by)
+    assert (small.width, small.height) == (97 // by, 83 // by)
+    seen = block_means(slope(camera), by)
+    assert np.abs(seen - slope(small)).max() < 0.02 * 2 * np.tan(np.radians(15)) / 97 * by
+    # a Gaussian of 0.5 pixels and a block of n pixels have the variance of both
+    assert small.filter_sigma * by == pytest.approx(np.sqrt(0.25 + (by**2 - 1) / 12))
+    assert camera.reduced(1) is camera
+
+
+def test_a_reduced_capture_has_its_points_in_the_same_place(bent: Capture, plain: Capture) -> None:
+    whole = triangulate(plain.view(undistorted=True))
+    for capture in (plain.view(reduced=2), bent.view(undistorted=True).view(reduced=2)):
+        cloud = triangulate(capture)
+        assert len(cloud) > 0.15 * len(whole)  # a quarter of the pixels
+        off = np.abs(np.linalg.norm(cloud.points, axis=1) - 0.1)
+        assert np.median(off) < 1e-3
+
+
+def test_masks_and_saturation_of_reduced_pictures(bent: Capture) -> None:
+    (bent.path / "masks").mkdir(exist_ok=True)
+    capture = bent.view(reduced=3)
+    step = next(s for s in bent.of_kind("scanline") if s.row == 20)
+    for device in capture.rig.cameras:
+        assert (device.width, device.height) == (26, 26)  # of 80
+        shot = silhouette(bent, device.name)
+        cv2.imwrite(str(bent.path / "masks" / f"{device.name}.png"), shot.astype(np.uint8) * 255)
+        for view in (capture, capture.view(undistorted=True)):
+            mask = view.mask(device.name)
+            assert mask is not None
+            assert mask.shape == silhouette(view, device.name).shape
+            again = view.mask_as_shot(device.name, mask)
+            assert again.shape == shot.shape
+            assert (again ^ shot)[:78, :78].sum() < 0.15 * shot.sum()  # blocks along an outline
+        response, full = capture.response_and_saturated(step, device.name)
+        whole, wholly = bent.response_and_saturated(step, device.name)
+        assert full.any() == wholly[:78, :78].any()
+        assert response.sum() * 9 == pytest.approx(whole[:78, :78].sum(), rel=1e-4)
+        assert np.array_equal(
+            capture.view(reduced=1).frame(step, device.name), bent.frame(step, device.name)
+        )
+    with pytest.raises(CaptureError, match="80x80 pixels cannot be reduced by 81"):
+        bent.view(reduced=81)
 
 
 def test_cameras_without_a_lens_are_read_as_they_are(plain: Capture) -> None:

@@ -18,7 +18,16 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction import CaptureWriter, Rig, Step, Strands, write_exr, write_strands
+from reconstruction import (
+    Camera,
+    CaptureWriter,
+    Light,
+    Rig,
+    Step,
+    Strands,
+    write_exr,
+    write_strands,
+)
 from stage_service.cli import build_parser, main
 from stage_service.cli.support.children import Children
 from stage_service.cli.support.commands import CommandError, rig_path, run_command
@@ -181,6 +190,37 @@ def test_verify_tells_sound_from_damaged(capsys, tmp_path):
     assert code == 1
     assert len(data["problems"]) == 1
     assert "00001/cam.exr" in data["problems"][0]
+
+
+def test_reconstruct_tells_what_it_would_take(capsys, tmp_path):
+    cameras = [
+        Camera.look_at(name, 40, 30, (x, -1, 0), (0, 0, 0), 20.0)
+        for name, x in (("left", -0.2), ("right", 0.2))
+    ]
+    lights = [Light(n, np.array([x, -1.0, 1]), np.ones(3)) for n, x in (("a", 0), ("b", 1))]
+    steps = [Step(k, "olat", 0.01, light=light.name) for k, light in enumerate(lights)]
+    writer = CaptureWriter.create(
+        tmp_path / "c", Rig("r", tuple(cameras), tuple(lights)), {"steps": steps}
+    )
+    for step in steps:
+        for camera in cameras:
+            writer.write_frame(step, camera.name, np.ones((30, 40, 3), np.float32))
+    writer.finish("completed")
+    before = sorted(tmp_path.rglob("*"))
+    code, data = run(capsys, "reconstruct", tmp_path / "c", "--estimate", "--reduce", "2")
+    assert code == 0
+    assert (data["reduced"], data["method"], data["frames"]) == (2, "hull", 4)
+    assert data["seconds"] == pytest.approx(sum(s["seconds"] for s in data["stages"]))
+    assert data["peak_gb"] == max(s["peak_gb"] for s in data["stages"])
+    assert main(["reconstruct", str(tmp_path / "c"), "--estimate"]) == 0
+    assert "orientation" in capsys.readouterr().out
+    assert sorted(tmp_path.rglob("*")) == before
+    code, data = run(capsys, "reconstruct", tmp_path / "c", "--estimate", "--reduce", "31")
+    assert code == 3
+    assert "40x30 pixels cannot be reduced by 31" in data["error"]["detail"]
+    code, data = run(capsys, "reconstruct", tmp_path / "c")
+    assert code == 3
+    assert "--out" in data["error"]["detail"]
 
 
 def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):

@@ -1,0 +1,296 @@
+"""What `reconstruct` will cost, told from a short probe of this capture on this machine.
+
+What large captures spend their time on is run: frames are read, rows of a sweep searched, a filter
+bank applied, each a few times and multiplied. What follows from the hair alone (growth, refinement)
+is a table of seconds per unit, scaled by how fast this machine is at a known task.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from reconstruction.capture.folder import Capture, MissingFrame, Step, StepKind
+from reconstruction.geometry.cameras import Camera
+from reconstruction.images.orientation import responses
+from reconstruction.light_planes.peaks import find_peaks
+from reconstruction.methods import Method
+from reconstruction.pipeline import FINE_PIXEL, method_for
+from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
+from reconstruction.report.report import Progress, silent
+from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS
+from reconstruction.tangents.reflection import FEWEST_LIGHTS
+
+KNOWN_TASK = 0.0155
+"""Seconds that the known task takes on the machine of the table: a filter bank on 256² pixels."""
+
+SWEPT, UNSWEPT = 1.2, 6.0
+"""Cells of `MeasureOptions.thin` that a surface is deep: triangulated, and where hulls put it."""
+
+ROWS = 24  # of a sweep that the probe searches
+LOOKS = 96  # lights that hair is told from skin by: up to twice as many are read
+GB = 1e9
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """What a stage is expected to take: `seconds`, the process's `peak_gb` meanwhile.
+
+    Of the seconds the probe has measured the share `measured` here; the rest is the table's.
+    """
+
+    name: str
+    seconds: float
+    peak_gb: float
+    measured: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Of a whole reconstruction: `stages` in order, the `frames` read, the `disk_gb` written."""
+
+    method: Method
+    stages: tuple[StageCost, ...]
+    frames: int
+    disk_gb: float
+
+    @property
+    def seconds(self) -> float:
+        """Of all stages."""
+        return sum(s.seconds for s in self.stages)
+
+    @property
+    def peak_gb(self) -> float:
+        """Of the stage that takes most."""
+        return max(s.peak_gb for s in self.stages)
+
+
+def estimate(
+    capture: Capture,
+    *,
+    method: Method = "auto",
+    options: ReconstructOptions = ReconstructOptions(),
+    progress: Progress = silent,
+) -> Estimate:
+    """What `reconstruct(capture, model, method=method, options=options)` will take on this machine.
+
+    `hairstage bench large` shows how far off it is. Where other work keeps the machine busy it
+    takes longer. Raises `CaptureError` where a frame that the probe reads cannot be read.
+    """
+    capture = capture.view(undistorted=True)
+    kept = [c.name for c in capture.rig.cameras if c.name not in options.held_out]
+    probe = _Probe(capture.view(cameras=kept), options, progress)
+    if method == "auto":
+        method = method_for(capture)
+    stages = list(probe.stages(method))
+    progress("probed", 1.0)
+    frames = sum(r.file is not None for r in capture.records.values())
+    each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
+    return Estimate(method, tuple(stages), frames, 0.01 + each * probe.points)
+
+
+@dataclass(frozen=True, eq=False)
+class _Probe:
+    """Measures what a capture costs; all sizes are those of the pictures as they are worked on."""
+
+    capture: Capture
+    options: ReconstructOptions
+    progress: Progress
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        return self.capture.rig.cameras
+
+    @cached_property
+    def pixels(self) -> float:
+        """Of one camera, the mean."""
+        return float(np.mean([c.width * c.height for c in self.cameras]))
+
+    @cached_property
+    def lights(self) -> int:
+        return len(self.capture.olat_lights())
+
+    @cached_property
+    def slowness(self) -> float:
+        """How many times as long as the table's machine this one takes."""
+        image = np.random.default_rng(0).random((256, 256), np.float32)
+        bank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)
+        responses(bank, image)  # makes its filters
+        return _seconds(lambda: responses(bank, image), 3) / KNOWN_TASK
+
+    def frames(self, *kinds: StepKind) -> int:
+        """How many frames of these kinds there are, of all cameras."""
+        steps = [s for k in kinds for s in self.capture.of_kind(k)]
+        return sum(self.capture.has(s, c.name) for s in steps for c in self.cameras)
+
+    def a_frame(self, kind: StepKind, number: int = 0) -> tuple[Step, str]:
+        """One of that kind, of the cameras in turn. Raises `MissingFrame`."""
+        steps, names = self.capture.of_kind(kind), [c.name for c in self.cameras]
+        for k in range(len(steps)):
+            step = steps[(k + (2 * number + 1) * len(steps) // 8) % len(steps)]
+            for name in names[number % len(names) :] + names[: number % len(names)]:
+                if self.capture.has(step, name):
+                    return step, name
+        raise MissingFrame(f"{self.capture.path}: no frame of the kind {kind}")
+
+    def reading(self, kind: StepKind) -> float:
+        """Seconds that one frame of that kind takes to be read, after others of its camera."""
+        total = 0.0
+        for number in range(2):
+            _, camera = self.a_frame(kind, number)
+            view = replace(self, capture=self.capture.view(cameras=[camera]))
+            first, then = view.a_frame(kind, number), view.a_frame(kind, number + 2)
+            self.capture.frame(*first)
+            total += _seconds(partial(self.capture.frame, *then))
+        return total / 2
+
+    @cached_property
+    def read(self) -> float:
+        """Seconds that a frame under a single light takes to be read, 0 where there is none."""
+        self.progress("reading frames", 0.1)
+        return self.reading("olat") if self.frames("olat") else 0.0
+
+    @cached_property
+    def hair(self) -> float:
+        """Pixels of all cameras that show the subject or, where that is known, its hair."""
+        self.progress("looking for the subject", 0.0)
+        shares = []
+        for camera in self.cameras[:: max(1, len(self.cameras) // 4)]:
+            if (mask := self.capture.mask(camera.name)) is not None:
+                shares.append(mask.mean())
+                continue
+            view = replace(self, capture=self.capture.view(cameras=[camera.name]))
+            kinds: list[StepKind] = ["all_on", "olat", "tracking"]
+            kind = next((k for k in kinds if view.frames(k)), None)
+            if kind is None:
+                continue
+            some = {view.a_frame(kind, n) for n in range(4 if kind == "olat" else 1)}
+            image = np.sum([self.capture.frame(*f).mean(axis=-1) for f in some], axis=0)
+            shares.append((image > 0.05 * np.percentile(image, 99.5)).mean())
+        return float(np.mean(shares or [0.3])) * self.pixels * len(self.cameras)
+
+    @cached_property
+    def pixel(self) -> float:
+        """Metres that a pixel spans at the origin."""
+        return float(np.median([np.linalg.norm(c.center) / c.K[0, 0] for c in self.cameras]))
+
+    @cached_property
+    def points(self) -> float:
+        """Where directions are measured: one for two pixels, until the surface is full of them."""
+        sphere = 4 * self.hair / len(self.cameras) * self.pixel**2  # of as large an outline
+        deep = SWEPT if self.capture.of_kind("scanline") else UNSWEPT
+        most = deep * sphere / self.options.measure.thin**2
+        return most * (1 - float(np.exp(-0.7 * self.hair / most)))
+
+    def stages(self, method: Method) -> list[StageCost]:
+        """The stages of `method`, in order."""
+        slow, n, hair, lights = self.slowness, self.points, self.hair, self.lights
+        base = 0.3
+        out: list[StageCost] = []
+
+        def add(name: str, measured: float, table: float, gb: float) -> None:
+            seconds = measured + slow * table
+            share = measured / seconds if seconds > 0 else 0.0
+            out.append(StageCost(name, seconds, base + gb, share))
+
+        sweep = self.frames("scanline")
+        if sweep:
+            rows = sweep * self.row()
+            add("triangulation", rows, 4e-5 * hair, 150 * self.pixels / GB)
+            if tracking := self.frames("tracking"):
+                read = tracking * self.reading("tracking")
+                each = 0.02 + 6e-6 * min(hair / len(self.cameras), 12_000.0)
+                add("motion", read, tracking * each, 300 * self.pixels / GB)
+        looked = min(lights, 1.5 * LOOKS) * len(self.cameras)
+        lit = len(self.cameras) if self.frames("all_on") else self.frames("olat")
+        add(
+            "masks",
+            (looked + 2 * lit) * self.read,
+            looked * 1.7e-7 * self.pixels,
+            (8 * min(lights, 1.5 * LOOKS) + 150) * hair / len(self.cameras) / GB + 40 * hair / GB,
+        )
+        seen = method in ("photometric", "lmvs")
+        voxels = (2e-3 / self.options.grid) ** 3
+        if not seen:
+            add("envelope", 0.0, 3.0 * voxels, 0.3 * voxels)
+            if lights:
+                self._orientation(add)
+        if seen or method == "fused" or (method == "hull" and lights and self.pixel <= FINE_PIXEL):
+            self._line_stereo(add)
+        if not seen:
+            if sweep:
+                add("surface", 0.0, 8e-9 * n * n, 8e-6 * n)
+            add("field", 0.0, 2.9 * voxels, 0.5 * voxels)
+            add("strands", 0.0, 7.0 + 2e-4 * n, 0.6 + (2e-5 if sweep else 3.6e-5) * n)
+            if sweep:
+                add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.2 + 5e-5 * n)
+            if self.capture.head is not None:
+                add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n)
+        return out
+
+    def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
+        lights, n = self.lights, self.points
+        self.progress("filtering", 0.6)
+        groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
+        measured = self.frames("olat") * self.read + groups * self.filtering()
+        reads = lights if lights >= FEWEST_LIGHTS else 0
+        table = n * (2.2e-4 + 1.4e-6 * reads)
+        count = self.options.measure.bank.count
+        images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * count + 60)
+        scores, observed = 4 * CANDIDATES * n, 3 * n * reads * 24
+        add("orientation", measured, table, max(images + observed, 12 * scores + observed) / GB)
+
+    def _line_stereo(self, add: Callable[[str, float, float, float], None]) -> None:
+        cameras, lights, hair = len(self.cameras), self.lights, self.hair
+        measured = self.frames("olat") * self.read
+        gb = self.pixels * (18 * lights + 400) / GB
+        add("lightcodes", measured, 6e-7 * cameras * lights * self.pixels, gb)
+        near = min(self.options.light_codes.search.neighbours, max(cameras // 2, 1))
+        depths = 2.5e-4 / self.options.light_codes.search.step
+        add("depth", 0.0, 5e-6 * hair * near * depths, gb)
+        lines = min(0.5 * hair, 1.6e5)
+        add("connection", 0.0, 3.5e-9 * lines * lines + 5e-6 * hair, 1.0)
+
+    def row(self) -> float:
+        """Seconds that one row of a sweep takes in one camera."""
+        self.progress("searching rows", 0.3)
+        step, camera = self.a_frame("scanline")
+        sweep = [s for s in self.capture.of_kind("scanline") if s.projector == step.projector]
+        middle = next(i for i, s in enumerate(sweep) if s.index == step.index)
+        part = copy.copy(self.capture)
+        first = max(0, min(middle - ROWS // 2, len(sweep) - ROWS))
+        assert step.projector is not None
+        self.capture.frame(step, camera)
+        few, many = (
+            self._searched(part, sweep[first : first + count], camera, step.projector)
+            for count in (ROWS // 4, ROWS)
+        )
+        return max(many - few, 0.0) / (ROWS - ROWS // 4)
+
+    @staticmethod
+    def _searched(part: Capture, steps: list[Step], camera: str, projector: str) -> float:
+        part.steps = (*part.of_kind("dark"), *steps)
+        return _seconds(lambda: find_peaks(part, camera, projector))
+
+    def filtering(self) -> float:
+        """Seconds that the tangents' filter bank takes on one picture."""
+        step, camera = self.a_frame("olat")
+        image, bank = self.capture.frame(step, camera).mean(axis=-1), self.options.measure.bank
+        few = replace(bank, count=min(bank.count, 8))  # one of three: large pictures take minutes
+        _ = responses(few, image)
+        return _seconds(lambda: responses(few, image)) * bank.count / few.count
+
+
+def _seconds(task: Callable[[], object], times: int = 1) -> float:
+    """The least that `task` takes, of `times` runs."""
+    best = np.inf
+    for _ in range(times):
+        start = time.perf_counter()
+        task()
+        best = min(best, time.perf_counter() - start)
+    return float(best)
