@@ -111,6 +111,11 @@ class _Probe:
         """Of one camera, the mean."""
         return float(np.mean([c.width * c.height for c in self.cameras]))
 
+    @property
+    def shown(self) -> float:
+        """Pixels of all cameras together."""
+        return self.pixels * len(self.cameras)
+
     @cached_property
     def lights(self) -> int:
         return len(self.capture.olat_lights())
@@ -172,7 +177,7 @@ class _Probe:
             some = {view.a_frame(kind, n) for n in range(4 if kind == "olat" else 1)}
             image = np.sum([self.capture.frame(*f).mean(axis=-1) for f in some], axis=0)
             shares.append((image > 0.05 * np.percentile(image, 99.5)).mean())
-        return float(np.mean(shares or [0.3])) * self.pixels * len(self.cameras)
+        return float(np.mean(shares or [0.3])) * self.shown
 
     @cached_property
     def pixel(self) -> float:
@@ -212,7 +217,7 @@ class _Probe:
             "masks",
             (looked + 2 * lit) * self.read,
             looked * 1.7e-7 * self.pixels,
-            (8 * min(lights, 1.5 * LOOKS) + 150) * hair / len(self.cameras) / GB + 40 * hair / GB,
+            (8 * min(lights, 1.5 * LOOKS) * hair / len(self.cameras) + 32 * self.shown) / GB,
         )
         seen = method in ("photometric", "lmvs")
         voxels = (2e-3 / self.options.grid) ** 3
