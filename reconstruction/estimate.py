@@ -205,8 +205,11 @@ class _Probe:
 
         sweep = self.frames("scanline")
         if sweep:
-            rows = sweep * self.row()
-            add("triangulation", rows, 4e-5 * hair, 150 * self.pixels / GB)
+            rows, stripes = sweep * self.row(), hair * len(self.capture.rig.projectors)
+            add(
+                *("triangulation", rows, 3e-5 * stripes),
+                (150 * self.pixels + 560 * stripes) / GB,
+            )
             if tracking := self.frames("tracking"):
                 read = tracking * self.reading("tracking")
                 each = 0.02 + 6e-6 * min(hair / len(self.cameras), 12_000.0)
@@ -217,7 +220,7 @@ class _Probe:
             "masks",
             (looked + 2 * lit) * self.read,
             looked * 1.7e-7 * self.pixels,
-            (8 * min(lights, 1.5 * LOOKS) * hair / len(self.cameras) + 32 * self.shown) / GB,
+            (8 * min(lights, 1.5 * LOOKS) / len(self.cameras) + 40) * hair / GB,
         )
         seen = method in ("photometric", "lmvs")
         voxels = (2e-3 / self.options.grid) ** 3

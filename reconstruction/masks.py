@@ -196,7 +196,8 @@ class _View:
     """A camera's `subject`, and what is known of each of its pixels `(H, W)`.
 
     `outside` shows the subject off the head's outline, `standing` and `lying` have points off and
-    on the head. `looks` are those of `hair_features`, None where too few lights were shot.
+    on the head. `looks (4, P)` are those of `hair_features` at the subject's pixels, None where too
+    few lights were shot.
     """
 
     camera: Camera
@@ -211,6 +212,12 @@ class _View:
         """`looks` that are there."""
         assert self.looks is not None
         return self.looks
+
+    def image(self, values: Array) -> Array:
+        """`values (P,)` of the subject's pixels as an image `(H, W)`, 0 outside."""
+        out = np.zeros(self.subject.shape)
+        out[self.subject] = values
+        return out
 
     @classmethod
     def of(cls, capture: Capture, camera: Camera, subject: Bools, geometry: _Geometry) -> _View:
@@ -247,7 +254,7 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
     """
     if not views:
         return {}
-    pixels = np.concatenate([v.seen[:, v.subject].T for v in views])
+    pixels = np.concatenate([v.seen.T for v in views])
     hair = np.concatenate([(v.outside | v.standing)[v.subject] for v in views])
     if hair.any():
         classes: TwoClasses | None = two_classes(pixels, hair)
@@ -255,7 +262,7 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
         subjects = {v.camera.name: v.subject for v in views}
         glossy = {
             v.camera.name: np.stack(
-                [v.seen[0], line_strength(lit_image(capture, v.camera.name), v.subject)]
+                [v.image(v.seen[0]), line_strength(lit_image(capture, v.camera.name), v.subject)]
             )
             for v in views
         }
@@ -269,7 +276,7 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
     source: Source = "light and lines" if geometry.head is None else "geometry"
     if not classes.weights.any():
         source = "geometry alone"
-    scores = [classes.scores(v.seen) + v.standing for v in views]
+    scores = [v.image(classes.scores(v.seen)) + v.standing for v in views]
     places = [_positions(v.camera, v.subject, geometry) for v in views]
     common = _by_place(places, scores)
     out = {}

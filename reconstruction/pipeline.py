@@ -204,9 +204,12 @@ class _Stages:
         tell, asked = self.progress, self.options.motion
         peaks = sweep_peaks(capture, tell)
         if motion is None:
-            first = triangulate(capture, peaks=peaks, stage=Stage("first pass"))
+            first = triangulate(capture, peaks=peaks, stage=(told := Stage(stage.name)))
             with self.report.stage("motion") as solving:
                 motion = solve_motion(capture, first, options=asked, progress=tell, stage=solving)
+            if motion.still:
+                stage.take(told)
+                return first
         known = None if motion.still else motion
         return triangulate(capture, motion=known, peaks=peaks, progress=tell, stage=stage)
 

@@ -47,7 +47,7 @@ _LIKE_HAIR = 0.1  # the share of sure hair that is as little glossy as skin
 
 
 def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Array | None:
-    """How each pixel of `subject` answers single lights: `(4, H, W)`, 0 outside.
+    """How each of the P pixels of `subject (H, W)` answers single lights: `(4, P)`.
 
     The log of the gloss, see `matte_fit`; log ratios of red to green and of green to blue under all
     lights that do not saturate the pixel together; the log of the matte surface's albedo. Gloss and
@@ -77,11 +77,9 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     gloss, albedo = matte_fit(values, directions, noise, known)
     faint = max(1e-3 * float(np.median(colour)), 1e-12)
     logs = np.log(np.maximum(colour, faint))
-    out = np.zeros((4, *subject.shape))
-    out[0, subject] = np.log(gloss + _LEAST_GLOSS)
-    out[1, subject], out[2, subject] = logs[:, 0] - logs[:, 1], logs[:, 1] - logs[:, 2]
-    out[3, subject] = np.log(np.maximum(albedo, faint / len(names)))
-    return out
+    red_to_green, green_to_blue = logs[:, 0] - logs[:, 1], logs[:, 1] - logs[:, 2]
+    matte = np.log(np.maximum(albedo, faint / len(names)))
+    return np.stack([np.log(gloss + _LEAST_GLOSS), red_to_green, green_to_blue, matte])
 
 
 def matte_fit(

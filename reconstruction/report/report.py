@@ -108,6 +108,13 @@ class Stage:
         """Record a warning, on conditioning or on data that was not there."""
         self.warnings.append(message)
 
+    def take(self, other: Stage) -> None:
+        """Take over what another stage found and said."""
+        self.figures |= other.figures
+        self.series += other.series
+        self.left_out += other.left_out
+        self.warnings += other.warnings
+
 
 @dataclass
 class Report:
