@@ -7,7 +7,6 @@ is a table of seconds per unit, scaled by how fast this machine is at a known ta
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import numpy as np
 from reconstruction.capture.folder import Capture, MissingFrame, Step, StepKind
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.orientation import responses
-from reconstruction.light_planes.peaks import find_peaks
+from reconstruction.light_planes.peaks import PER_PIXEL, Scan
 from reconstruction.methods import Method
 from reconstruction.pipeline import FINE_PIXEL, method_for
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
@@ -29,10 +28,10 @@ from reconstruction.tangents.reflection import FEWEST_LIGHTS
 KNOWN_TASK = 0.0155
 """Seconds that the known task takes on the machine of the table: a filter bank on 256² pixels."""
 
-SWEPT, UNSWEPT = 1.2, 6.0
+SWEPT, UNSWEPT = 2.0, 6.0
 """Cells of `MeasureOptions.thin` that a surface is deep: triangulated, and where hulls put it."""
 
-ROWS = 24  # of a sweep that the probe searches
+ROWS = 12  # of a sweep that the probe searches, in each of three places
 LOOKS = 96  # lights that hair is told from skin by: up to twice as many are read
 GB = 1e9
 
@@ -195,7 +194,7 @@ class _Probe:
     def stages(self, method: Method) -> list[StageCost]:
         """The stages of `method`, in order."""
         slow, n, hair, lights = self.slowness, self.points, self.hair, self.lights
-        base = 0.3
+        base = 0.3  # that the process has, and what of a sweep's points it keeps
         out: list[StageCost] = []
 
         def add(name: str, measured: float, table: float, gb: float) -> None:
@@ -205,15 +204,13 @@ class _Probe:
 
         sweep = self.frames("scanline")
         if sweep:
-            rows, stripes = sweep * self.row(), hair * len(self.capture.rig.projectors)
-            add(
-                *("triangulation", rows, 3e-5 * stripes),
-                (150 * self.pixels + 560 * stripes) / GB,
-            )
+            rows, stripes = sweep * self.row(), 0.7 * hair * len(self.capture.rig.projectors)
+            add("triangulation", rows, 3e-5 * stripes, (150 * self.pixels + 565 * stripes) / GB)
             if tracking := self.frames("tracking"):
                 read = tracking * self.reading("tracking")
                 each = 0.02 + 6e-6 * min(hair / len(self.cameras), 12_000.0)
-                add("motion", read, tracking * each, 300 * self.pixels / GB)
+                add("motion", read, tracking * each, (300 * self.pixels + 560 * hair) / GB)
+            base += 560 * hair / GB
         looked = min(lights, 1.5 * LOOKS) * len(self.cameras)
         lit = len(self.cameras) if self.frames("all_on") else self.frames("olat")
         add(
@@ -236,7 +233,7 @@ class _Probe:
             add("field", 0.0, 2.9 * voxels, 0.5 * voxels)
             add("strands", 0.0, 7.0 + 2e-4 * n, 0.6 + (2e-5 if sweep else 3.6e-5) * n)
             if sweep:
-                add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.2 + 5e-5 * n)
+                add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.3 + 4e-5 * n)
             if self.capture.head is not None:
                 add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n)
         return out
@@ -250,7 +247,8 @@ class _Probe:
         table = n * (2.2e-4 + 1.4e-6 * reads)
         count = self.options.measure.bank.count
         images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * count + 60)
-        scores, observed = 4 * CANDIDATES * n, 3 * n * reads * 24
+        views = 0.7 + 0.3 * len(self.cameras)  # that see a point
+        scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
         add("orientation", measured, table, max(images + observed, 12 * scores + observed) / GB)
 
     def _line_stereo(self, add: Callable[[str, float, float, float], None]) -> None:
@@ -265,25 +263,21 @@ class _Probe:
         add("connection", 0.0, 3.5e-9 * lines * lines + 5e-6 * hair, 1.0)
 
     def row(self) -> float:
-        """Seconds that one row of a sweep takes in one camera."""
+        """Seconds that one row of a sweep takes in one camera: of some in three places."""
         self.progress("searching rows", 0.3)
         step, camera = self.a_frame("scanline")
-        sweep = [s for s in self.capture.of_kind("scanline") if s.projector == step.projector]
-        middle = next(i for i, s in enumerate(sweep) if s.index == step.index)
-        part = copy.copy(self.capture)
-        first = max(0, min(middle - ROWS // 2, len(sweep) - ROWS))
-        assert step.projector is not None
-        self.capture.frame(step, camera)
-        few, many = (
-            self._searched(part, sweep[first : first + count], camera, step.projector)
-            for count in (ROWS // 4, ROWS)
-        )
-        return max(many - few, 0.0) / (ROWS - ROWS // 4)
+        steps = [s for s in self.capture.of_kind("scanline") if s.projector == step.projector]
+        scan = Scan(self.capture, camera, {s.row: s for s in steps}, len(steps), PER_PIXEL)
+        rows = [s.row for s in steps if s.row is not None]
+        starts = np.linspace(0, max(len(rows) - ROWS, 0), 5)[1:-1].astype(int)
+        some = [rows[start : start + ROWS] for start in starts]
+        scan.push(rows[0])  # also reads the dark frame
 
-    @staticmethod
-    def _searched(part: Capture, steps: list[Step], camera: str, projector: str) -> float:
-        part.steps = (*part.of_kind("dark"), *steps)
-        return _seconds(lambda: find_peaks(part, camera, projector))
+        def searched() -> None:
+            for row in (row for part in some for row in part):
+                scan.push(row)
+
+        return _seconds(searched) / sum(map(len, some))
 
     def filtering(self) -> float:
         """Seconds that the tangents' filter bank takes on one picture."""

@@ -64,7 +64,7 @@ def find_peaks(capture: Capture, camera: str, projector: str) -> Peaks:
     device = capture.rig.projector(projector)
     capture.rig.camera(camera)
     sweep = {s.row: s for s in capture.of_kind("scanline") if s.projector == projector}
-    scan = _Scan(capture, camera, sweep, device.height, PER_PIXEL)
+    scan = Scan(capture, camera, sweep, device.height, PER_PIXEL)
     for row in range(-REACH, device.height + REACH):
         scan.push(row)
     noise = scan.noise()
@@ -164,7 +164,7 @@ class _Tally:
         return int(self._counts[(np.array(floor, np.float32).view(np.uint32) >> 16) + 1 :].sum())
 
 
-class _Scan:
+class Scan:
     """The running state of one sweep: a ring of frames and each pixel's strongest maxima."""
 
     def __init__(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -44,11 +44,13 @@ class PaintedCapture(Capture):
         head = make_subject("wavy", seed).head
         assert head is not None
         write_obj(folder / "head.obj", head)
+        strands = make_subject("wavy", seed).strands
+        for camera in rig.cameras:
+            _Seen.of(camera, strands, head).save(folder / f"{camera.name}.npz")
         return cls(folder)
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(path)
-        self._subject = make_subject("wavy", self.plan["seed"])
         self.records = {
             (s.index, c.name): FrameRecord(s.index, c.name, "painted")
             for s in self.steps
@@ -59,9 +61,7 @@ class PaintedCapture(Capture):
     def _read(self, step: Step, camera: str) -> tuple[Floats, dict[str, float | str]]:
         if camera not in self._seen:
             self._seen.clear()  # the pipeline goes camera by camera
-            assert self._subject.head is not None
-            strands, head = self._subject.strands, self._subject.head
-            self._seen[camera] = _Seen.of(self._shot[camera], strands, head)
+            self._seen[camera] = _Seen.load(self.path / f"{camera}.npz")
         seen = self._seen[camera]
         x, y = np.random.default_rng(step.index).integers(0, SHIFTS, 2)
         height, width = seen.shape
@@ -130,6 +130,17 @@ class _Seen:
         away = -(tangents * rays).sum(axis=1)
         found = [a.astype(np.float32) for a in (points, normals, tangents, colour, away)]
         return cls((camera.height, camera.width), y * camera.width + x, *found)
+
+    def save(self, file: Path) -> None:
+        """Keep it: what a camera sees takes far longer to work out than a frame."""
+        np.savez(file, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, file: Path) -> _Seen:
+        """What was kept."""
+        with np.load(file) as data:
+            found = {f.name: data[f.name] for f in fields(cls)}
+        return cls(**(found | {"shape": tuple(found["shape"].tolist())}))
 
     def answers(self, position: Array, some: Ints | slice) -> Floats:
         """What `some` of the pixels answer to a light at `position (3,)`: `(Q, 3)`."""
