@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools
 from reconstruction.capture.folder import Capture
+from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, texture
 from reconstruction.images.silhouettes import background_noise
 from reconstruction.reconstruct_options import LogGaborBank
@@ -68,9 +69,9 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
         image = image / np.float32(max(intensity, 1e-12))
         colour += np.where(saturated[subject][:, None], 0, image[subject])
         known[:, k] = ~ndimage.maximum_filter(saturated & subject, 3)[subject]
-        grey = image.mean(axis=-1)
-        noise += background_noise(grey) ** 2 / 9
-        smooth = ndimage.uniform_filter(np.where(subject, grey, np.float32(0)), 3)
+        mean = grey(image)
+        noise += background_noise(mean) ** 2 / 9
+        smooth = ndimage.uniform_filter(np.where(subject, mean, np.float32(0)), 3)
         values[:, k] = smooth[subject] / near
     directions = np.stack([capture.rig.light(n).position for n in names])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

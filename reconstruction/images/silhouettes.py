@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Bools, Floats
 from reconstruction.capture.folder import Capture, Step
+from reconstruction.images.grey import grey
 
 NOISE_FACTOR = 5.0
 FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light, even without noise
@@ -98,7 +99,7 @@ def _half_sample_mode(values: AnyFloats) -> float:
 
 def lit_image(capture: Capture, camera: str) -> Floats:
     """`lit_rgb`'s mean over the channels `(H, W)`."""
-    return np.asarray(lit_rgb(capture, camera).mean(axis=-1))
+    return grey(lit_rgb(capture, camera))
 
 
 def lit_rgb(capture: Capture, camera: str) -> Floats:
@@ -122,7 +123,7 @@ def lit_rgb(capture: Capture, camera: str) -> Floats:
 
 def _blown(capture: Capture, camera: str, step: Step) -> bool:
     image, saturated = capture.response_and_saturated(step, camera)
-    lit = int((image.mean(axis=-1) > 0.1 * float(image.max(initial=0.0))).sum())
+    lit = int((grey(image) > 0.1 * float(image.max(initial=0.0))).sum())
     return int(saturated.sum()) > MOST_SATURATED * max(lit, 1)
 
 

@@ -13,6 +13,7 @@ from reconstruction.arrays import Bools, Floats
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
+from reconstruction.images.grey import grey
 from reconstruction.images.orientation import orientations
 from reconstruction.images.silhouettes import background_noise, dark_frame
 from reconstruction.light_codes.codes import CodeMap, along_lines, code_map
@@ -156,7 +157,7 @@ def _view(
                 f"{capture.path}: the light {name} sends nothing towards {at.tolist()}: check its "
                 "intensity and aim in rig.json"
             )
-        images[i] = (image.mean(axis=-1) - dark) / irradiance
+        images[i] = (grey(image) - dark) / irradiance
         noise = max(noise, background_noise(images[i]))
     found = orientations(images[shot], mask, bank, known=~clipped[shot])
     away = [np.linalg.norm(x.position - camera.center) for x in lights]

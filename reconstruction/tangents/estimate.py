@@ -11,6 +11,7 @@ from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
+from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, texture
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
@@ -85,7 +86,7 @@ def read_answers(capture: Capture, camera: Camera, lights: Sequence[str]) -> Ans
     for i, name in enumerate(lights):
         if capture.has_light(name, camera.name):
             image, saturated = capture.light(name, camera.name)
-            olat[i], known[i] = image.mean(axis=-1), ~saturated
+            olat[i], known[i] = grey(image), ~saturated
     return Answers(camera, olat, known)
 
 
