@@ -92,10 +92,11 @@ def test_what_is_written_reads_back_exactly(path):
     np.testing.assert_array_equal(capture.head.scalp, [True])
 
 
-def test_saturation_is_read_from_the_header(tmp_path):
+@pytest.mark.parametrize("channel", range(3))
+def test_saturation_is_read_from_the_header(tmp_path, channel):
     writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
     frame = np.full((6, 8, 3), 0.5, np.float32)
-    frame[2, 3, 1] = np.float32(0.1) * np.float32(40)
+    frame[2, 3, channel] = np.float32(0.1) * np.float32(40)
     writer.write_frame(STEPS[1], "cam_0", frame, full_scale=4.0)
     writer.write_frame(STEPS[1], "cam_1", frame)
     writer.close()
