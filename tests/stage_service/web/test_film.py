@@ -34,6 +34,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 SIZES = {"desk": (1280, 800), "tablet": (1024, 768), "upright": (768, 1024)}
 BRIGHTEST = 0.03
 """Of a white screen's light, what a view may give: a stage's own lamps are some 1,000 lux."""
+PATIENCE_MS = 600_000  # of a browser without a GPU, which lights thousands of strands
 PACED = {"rate_hz": 8, "projectors": [], "stepping": "software"}
 
 LOOKED_OVER = """() => {
@@ -62,6 +63,10 @@ LOOKED_OVER = """() => {
       say("cut off", x);
   return wrong;
 }"""
+AT_REST = """() => {
+  const { relight, picture } = viewer;
+  return relight.baked && !relight.under && picture.samples >= Math.max(8, picture.cycle());
+}"""
 SETTLED = "() => new Promise((on) => requestAnimationFrame(() => setTimeout(on, 60)))"
 
 
@@ -73,21 +78,23 @@ class Film:
         self.wrong: list[str] = []
         self._taken = 0
 
-    def take(self, page: Any, name: str, *, brightest: float = BRIGHTEST, axe: bool = True) -> None:
-        """A picture of it at each size; the page is left at the first one."""
+    def take(
+        self, page: Any, name: str, *, brightest: float = BRIGHTEST, drawn: str | None = None
+    ) -> None:
+        """A picture of it at each size, when `drawn` holds; the page is left at the first one."""
         self._taken += 1
         for size, (width, height) in SIZES.items():
             page.set_viewport_size({"width": width, "height": height})
-            page.evaluate(
-                "() => new Promise((on) => requestAnimationFrame(() => setTimeout(on, 60)))"
-            )
+            page.evaluate(SETTLED)
+            if drawn:
+                page.wait_for_function(drawn, timeout=PATIENCE_MS)
             picture = page.screenshot(
                 path=self.folder / f"{self._taken:02d}_{name}_{size}.png", animations="disabled"
             )
             told = [*page.evaluate(LOOKED_OVER)]
             if (light := luminance(picture)) > brightest:
                 told.append(f"{100 * light:.1f} % of a white screen's light")
-            if axe and size != "tablet":
+            if size != "tablet":
                 for found in self._axe.run(page).response["violations"]:
                     nodes = [node["html"][:90] for node in found["nodes"]]
                     told.append(f"axe {found['impact']} {found['id']} {len(nodes)}: {nodes[:3]}")
@@ -256,7 +263,22 @@ def test_a_capture_as_a_film(hold, console, film, demo, demo_rig):
             pause=0.5,
         )
         film.take(page, "viewer", brightest=1)
+        film_of_light(page, film)
     assert film.wrong == [], "\n".join(film.wrong)
+
+
+def film_of_light(page: Any, film: Film) -> None:
+    """The fitted model under light from either side and from all around, each at rest."""
+    page.wait_for_selector("#dome")
+    page.select_option("select >> nth=0", "lit")
+    dome = page.locator("#dome").bounding_box()
+    for name, across in (("left", 0.25), ("right", 0.75)):
+        page.locator("#dome").click(
+            position={"x": across * dome["width"], "y": 0.45 * dome["height"]}
+        )
+        film.take(page, f"viewer_lit_from_{name}", brightest=1, drawn=AT_REST)
+    page.click("button:text-is('studio')")
+    film.take(page, "viewer_lit_by_studio", brightest=1, drawn=AT_REST)
 
 
 def lease(page: Any) -> dict[str, str]:
