@@ -11,9 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.absorption import of_colour, of_melanin
+from appearance.bsdf.far_field import LEAST_BETA_N, FarField
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
 from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
+from appearance.scene.hair_appearance import HairAppearance
 from reconstruction.array_backend import for_kernels
 
 INFINITE = float("inf")
@@ -66,6 +68,22 @@ class HairParameters:
         self._constant = {name: _constant(self.values[name]) for name in tables}
         turn = self._constant.get("rotation", [])
         self._turns = turn is None or any(x[0] != 0 for x in turn)
+        self.__dict__.pop("far_field", None)
+
+    @cached_property
+    def far_field(self) -> FarField | None:
+        """The BSDF of a whole width; None where hair varies or its lobes are narrower than a node."""
+        varies = [
+            self._constant[name] is None if dr.is_tensor_v(value) else dr.width(value) > 1
+            for name, value in self.values.items()
+        ]
+        if self._turns or any(varies):
+            return None
+        fibre = self.fibre(StrandHit({}, None, None))
+        one = (fibre.beta_m, fibre.beta_n, fibre.eta)
+        r, g, b, *rest = (float(x[0]) for x in (*fibre.sigma_a, *one))
+        hair = HairAppearance((r, g, b), *rest)
+        return FarField(hair) if hair.beta_n >= LEAST_BETA_N else None
 
     def fibre(self, place: StrandHit) -> Fibre:
         """The fibre at a hit."""

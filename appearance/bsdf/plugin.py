@@ -76,6 +76,15 @@ def plugin() -> Any:
             value, pdf = evaluate(fibre, frame.enter(si.wi), frame.enter(wo))
             return dr.select(active, mi.Color3f(value), 0), dr.select(active, pdf, 0)
 
+        def eval_mean(self, si: Any, wo: Any, active: Any) -> Any:
+            """`eval` averaged over the fibre's width; `eval` itself where the hair varies."""
+            far_field = self.parameters.far_field
+            if far_field is None:
+                return self.eval(mi.BSDFContext(), si, wo, active)
+            fibre, frame = self._at(si, active)
+            value = far_field.evaluate(fibre, frame.enter(si.wi), frame.enter(wo), active)
+            return dr.select(active, value, 0)
+
         def to_string(self) -> str:
             return f"extended_hair[{', '.join(self.parameters.values)}]"
 

@@ -20,7 +20,7 @@ from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode, 
 from appearance.observations import Observed
 from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.render.kept_paths import KeptPaths, KeptSampling, WeightedPixels, keep_paths
-from appearance.render.olat import render_olat, render_olat_parts
+from appearance.render.olat import render_indirect, render_olat
 from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels
@@ -277,7 +277,7 @@ class FitProblem:
             "spp": max(_LEAST_SPP, effort.spp // 4),
             "max_depth": effort.max_depth,
         }
-        _, rest = render_olat_parts(scene, camera, lights, pixels, seed=seed, **spent)
+        rest = render_indirect(scene, camera, lights, pixels, seed=seed, **spent)
         return rest.astype(float) * self.scale
 
     def _whole(self, view: int) -> Patch:

@@ -16,7 +16,7 @@ from appearance.model.relight import three_quarter_view
 from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.mixed import Environment
-from appearance.render.olat import render_olat, render_olat_parts, spread_out
+from appearance.render.olat import render_indirect, render_olat, spread_out
 from appearance.render.smoothed import (
     DIRECT,
     environment_parts,
@@ -173,7 +173,7 @@ def turning_light(
         lit = (
             render_olat(scene, camera, panels, seed=4 * seed + 1, **first),
             render_olat(scene, camera, panels, seed=4 * seed + 2, **first),
-            render_olat_parts(scene, camera, panels, index[at], seed=4 * seed, **rest)[1],
+            render_indirect(scene, camera, panels, index[at], seed=4 * seed, **rest),
         )
         for part, each in zip(parts, lit, strict=True):
             part[:, at] = np.einsum("tlc,lpc->tpc", weights, each, optimize=True)

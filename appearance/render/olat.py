@@ -83,14 +83,14 @@ def render_olat(
     Raises `ValueError` for options out of range, `FloatingPointError` where light is not finite.
     """
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    (out,) = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed, 1)
+    out = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed)
     field = field_of(scene, camera, index)
     if field is not None:
         out = field.lit(out, lights)
     return out if pixels is not None else spread_out(out, index, camera)
 
 
-def render_olat_parts(
+def render_indirect(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
@@ -98,15 +98,15 @@ def render_olat_parts(
     *,
     seed: int = 0,
     **options: Any,
-) -> tuple[Floats, Floats]:
-    """`render_olat` of `pixels (P,)` in two parts, `(L, P, 3)` each, of the same paths.
+) -> Floats:
+    """What `render_olat` sees of light that has met more than one surface: `(L, P, 3)`.
 
-    The first is the light that reaches the first hit directly, the second what comes by way of
-    others. Both are those of the material alone, without the scene's field.
+    It is the material's alone, without the scene's field. Fibres behind the first answer by the
+    mean over their width, where a ray may meet them anywhere: a third of the variance on hair that
+    is the same everywhere. Other hair answers as it does in `render_olat`.
     """
-    index = pixel_indices(camera, pixels)
-    out = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed, 2)
-    return out[0], out[1]
+    view = _View(scene, camera, lights, pixel_indices(camera, pixels))
+    return _rendered(view, OlatOptions(**options), seed, indirect=True)
 
 
 def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
@@ -125,24 +125,24 @@ class _View(NamedTuple):
     pixels: Ints
 
 
-def _rendered(view: _View, options: OlatOptions, seed: int, films: int) -> Floats:
-    """`(films, L, P, 3)`: all light on one film, or direct and other light on two."""
+def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = False) -> Floats:
+    """`(L, P, 3)`: all light, or without that of the first vertices."""
     index, count, camera = view.pixels, len(view.lights), view.camera
-    out = np.zeros((films, count, len(index), 3), np.float32)
+    out = np.zeros((count, len(index), 3), np.float32)
     if out.size:
-        plan = replace(_plan(view, options, seed), films=films)
+        plan = _plan(view, options, seed, indirect)
         # the film, its copy and the mean; each tile is spread over the whole image
-        tiles = tile_count(index, films * 3 * 12 * count, options.memory)
+        tiles = tile_count(index, 3 * 12 * count, options.memory)
         for k in range(tiles):
             part = slice(k, None, tiles)
-            out[:, :, part] = plan.render(index[part], options.spp, (seed, k))
+            out[:, part] = plan.render(index[part], options.spp, (seed, k))
         # seen once in hundreds of renders, in two pixels, and never again with the same numbers
-        bad = np.flatnonzero(~np.isfinite(out).all(axis=(0, 1, 3)))
+        bad = np.flatnonzero(~np.isfinite(out).all(axis=(0, 2)))
         if len(bad):
             where = f"{camera.name}: light is not finite in pixels {index[bad][:10].tolist()}"
             _log.warning("%s, seed %d; they are rendered again", where, seed)
-            out[:, :, bad] = plan.render(index[bad], options.spp, (seed, tiles))
-            if not np.isfinite(out[:, :, bad]).all():
+            out[:, bad] = plan.render(index[bad], options.spp, (seed, tiles))
+            if not np.isfinite(out[:, bad]).all():
                 raise FloatingPointError(f"{where}, twice: look at the strands and lights there")
     return out
 
@@ -152,8 +152,8 @@ class _Plan:
     """What is rendered, and how paths and shadow rays are spent.
 
     `counts`: lights asked at the first and at later vertices. `dim (L,)`: contributions below this
-    radiance cast their shadow ray with a probability in proportion. Two `films` part the light of
-    the first vertex from that of later ones.
+    radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the light
+    of first vertices.
     """
 
     scene: HairScene
@@ -162,17 +162,17 @@ class _Plan:
     counts: tuple[int, int]
     limits: PathLimits
     dim: Floats
-    films: int = 1
+    indirect: bool
 
     def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> Floats:
-        """Mean over `spp` paths a pixel: `(films, L, P, 3)`."""
+        """Mean over `spp` paths a pixel: `(L, P, 3)`."""
         count, slots = len(self.lights), opaque_index(len(index))
-        film = dr.zeros(mi.Float, self.films * 3 * count * len(index))
-        surface = Surface(self.scene)
+        film = dr.zeros(mi.Float, 3 * count * len(index))
+        surface = Surface(self.scene, mean_width=self.indirect)
         bank, dim = PackedLights.of(self.lights), mi.Float(self.dim)
-        gather = _Gather(surface, film, slots, bank, dim, self.counts, self.films > 1)
+        gather = _Gather(surface, film, slots, bank, dim, self.counts, self.indirect)
         follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
-        image = np.array(film).reshape(self.films, count, 3, len(index)).transpose(0, 1, 3, 2)
+        image = np.array(film).reshape(count, 3, len(index)).transpose(0, 2, 1)
         return np.asarray(image / np.float32(spp), dtype=np.float32)
 
     def spread(self, index: Ints, spp: int, seed: int) -> Floats:
@@ -185,7 +185,7 @@ class _Plan:
         few = index[:: -(-len(index) // wanted)]
 
         def pilot(plan: _Plan, pixels: Ints, number: int) -> Floats:
-            brightest = plan.render(pixels, 1, (seed, _PILOT_STREAM + number))[0].max(-1)
+            brightest = plan.render(pixels, 1, (seed, _PILOT_STREAM + number)).max(-1)
             return np.minimum(brightest, np.quantile(brightest, _USUAL, axis=1, keepdims=True))
 
         # the mean of fewer still, with every shadow ray, is enough to spare most in the rest
@@ -194,13 +194,13 @@ class _Plan:
         return np.asarray(np.sqrt(((one - other) ** 2).mean(1) / 2), np.float32)
 
 
-def _plan(view: _View, options: OlatOptions, seed: int) -> _Plan:
+def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan:
     scene, camera, lights, index = view
     wanted = (options.first_lights, options.deep_lights)
     first, deep = (len(lights) if n is None else min(n, len(lights)) for n in wanted)
     depth = options.max_depth or bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    plan = _Plan(scene, camera, lights, (first, deep), PathLimits(depth), none)
+    plan = _Plan(scene, camera, lights, (first, deep), PathLimits(depth), none, indirect)
     if options.thrift > 0:
         spread = plan.spread(index, options.spp, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)
@@ -211,7 +211,7 @@ def _plan(view: _View, options: OlatOptions, seed: int) -> _Plan:
 class _Gather:
     """Light from the bank, or a systematic sample of it, at a path's vertex.
 
-    Where `parted`, the light of later vertices goes to a second film behind the first.
+    Where `indirect`, first vertices ask none.
     """
 
     surface: Surface
@@ -220,13 +220,12 @@ class _Gather:
     bank: PackedLights
     dim: Any
     counts: tuple[int, int]
-    parted: bool
+    indirect: bool
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        total, active = opaque_index(self.bank.count), paths.active
-        slot = paths.slot
-        if self.parted:
-            slot = slot + dr.select(paths.depth == 0, 0, 3 * total * self.slots)
+        total, active, slot = opaque_index(self.bank.count), paths.active, paths.slot
+        if self.indirect:
+            active = active & (paths.depth > 0)
         count = dr.select(paths.depth == 0, *(opaque_index(n) for n in self.counts))
         stride = mi.Float(total) / mi.Float(count)
         sampled = min(self.counts) < self.bank.count

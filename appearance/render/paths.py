@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -39,9 +39,13 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
 
 @dataclass(frozen=True)
 class Surface:
-    """How the surfaces of `scene` answer light; made once a kernel."""
+    """How the surfaces of `scene` answer light; made once a kernel.
+
+    With `mean_width` a fibre answers by the mean over its width, where its material allows it.
+    """
 
     scene: HairScene
+    mean_width: bool = field(default=False, kw_only=True)
 
     def interact(self, ray: Any, active: Any) -> Any:
         """The first `SurfaceInteraction3f` along `ray`.
@@ -74,7 +78,11 @@ class Surface:
         hair = self.is_hair(si)
         value = self._diffuse(hair) * self._cosine(si, wo, hair) * dr.inv_pi
         if self.scene.hair_bsdf is not None:
-            fibre = self.scene.hair_bsdf.eval(mi.BSDFContext(), si, wo, active & hair)
+            bsdf = self.scene.hair_bsdf
+            if self.mean_width and hasattr(bsdf, "eval_mean"):
+                fibre = bsdf.eval_mean(si, wo, active & hair)
+            else:
+                fibre = bsdf.eval(mi.BSDFContext(), si, wo, active & hair)
             value = dr.select(hair, fibre, value)
         return dr.select(active, value, 0)
 

@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.environment import direct_environment, render_environment
 from appearance.render.harmonics import projected
-from appearance.render.olat import render_olat, render_olat_parts, spread_out
+from appearance.render.olat import render_indirect, render_olat, spread_out
 from appearance.render.paths import pixel_indices
 from appearance.render.pixel_field import field_of
 from appearance.render.tracing import Sampling
@@ -62,14 +62,17 @@ def olat_smoothed(
     wanted = np.flatnonzero(sees) if pixels is None else pixel_indices(camera, pixels)
     sees[wanted] = True
     index = np.flatnonzero(sees)
-    first, rest = render_olat_parts(
-        scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed
+    rest = render_indirect(scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed)
+    out = render_olat(
+        scene,
+        camera,
+        lights,
+        spp=max(2 * spp, DIRECT),
+        max_depth=1,
+        seed=seed + (1 << 31),
+        pixels=index,
+        thrift=1.0,
     )
-    more = max(spp, DIRECT)
-    again = render_olat(
-        scene, camera, lights, spp=more, max_depth=1, seed=seed + (1 << 31), pixels=index
-    )
-    out = (spp * first + more * again) / np.float32(spp + more)
     for k in range(0, len(lights), _AT_A_TIME):
         part = slice(k, k + _AT_A_TIME)
         smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)

@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 from appearance import HairScene
 from appearance.render.coverage import covered_pixels
 from appearance.render.harmonics import count_of, degrees, harmonics
-from appearance.render.olat import render_olat_parts
+from appearance.render.olat import render_indirect
 from appearance.render.paths import wave
 from appearance.scene.hair_scene import SCALE
 from reconstruction import Camera, Light
@@ -136,7 +136,7 @@ def _seen(
     much = share > 0.3
     pixels, places, share = pixels[much], places[much], share[much]
     how = {"spp": options.spp, "max_depth": options.max_depth, "seed": seed}
-    indirect = render_olat_parts(scene, camera, lights, pixels, **how)[1]
+    indirect = render_indirect(scene, camera, lights, pixels, **how)
     return places, camera.center - places, share, indirect.transpose(1, 0, 2)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from appearance.bsdf import reference
-from appearance.bsdf.far_field import azimuthal_table
+from appearance.bsdf.far_field import FarField, azimuthal_table
 from appearance.bsdf.lobes import Fibre
+from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
 
 
@@ -37,3 +39,46 @@ def test_it_is_the_mean_of_the_near_field_over_the_width(beta_n):
             ]
             far = sum(m[p] * table[p, channel] for p in range(4))
             assert far == pytest.approx(near, rel=0.005)
+
+
+@pytest.mark.parametrize("beta_m", [0.05, 0.3, 1.0])
+def test_the_table_on_the_device_gives_the_mean_of_the_near_field(beta_m):
+    """Directions along the fibre, grazing, and onto the middle of TT among them."""
+    ensure_backend()
+    hair = HairAppearance((0.1, 0.3, 1.2), beta_m, 0.3, tilt_deg=2)
+    tilt = np.radians(hair.tilt_deg)
+    rng = np.random.default_rng(1)
+    theta_i, theta_o = rng.uniform(-1.5, 1.5, (2, 200))
+    theta_o[:100] = -theta_i[:100]
+    turn = rng.uniform(-np.pi, np.pi, 200)
+    turn[:3] = 0, np.pi, -np.pi
+    h = (np.arange(4_001) + 0.5) / 4_001 * 2 - 1
+    want = [
+        [
+            reference.evaluate(
+                Fibre(sigma, beta_m, hair.beta_n, hair.eta, tilt),
+                reference.direction(i, np.arcsin(h)),
+                reference.direction(o, np.arcsin(h) + t),
+            ).mean()
+            for sigma in hair.sigma_a
+        ]
+        for i, o, t in zip(theta_i, theta_o, turn, strict=True)
+    ]
+    wi, wo = (
+        mi.Vector3f(*np.array([reference.direction(x, y) for x, y in zip(*a, strict=True)]).T)
+        for a in ((theta_i, np.zeros(200)), (theta_o, turn))
+    )
+    fibre = Fibre(mi.Color3f(*hair.sigma_a), mi.Float(beta_m), mi.Float(0.3), hair.eta, tilt)
+    got = np.array(FarField(hair).evaluate(fibre, wi, wo, mi.Bool(True))).T
+    np.testing.assert_allclose(got, want, rtol=0.1, atol=2e-3)
+    assert got.mean() == pytest.approx(np.mean(want), rel=0.01)
+
+
+def test_directions_along_the_fibre_and_no_directions_are_finite_or_left_alone():
+    ensure_backend()
+    hair = HairAppearance((0, 0, 0), 0.001, 0.001)
+    fibre = Fibre(mi.Color3f(0), mi.Float(0.001), mi.Float(0.001), mi.Float(1.55), mi.Float(0.0))
+    along = mi.Vector3f([0, 0, 1, np.nan], [1, -1, 0, 0], [0, 0, 0, 0])
+    active = mi.Bool([True, True, True, False])
+    got = np.array(FarField(hair).evaluate(fibre, along, mi.Vector3f(0, 0.6, 0.8), active))
+    assert np.isfinite(got[:, :3]).all()

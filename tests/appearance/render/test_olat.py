@@ -9,7 +9,7 @@ from benchmarks.renderers.path_reference import PathReference
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.render import olat
 from appearance.render.coverage import covered_pixels
-from appearance.render.olat import render_olat_parts
+from appearance.render.olat import render_indirect
 from appearance.scene.hair_appearance import DiffuseHair
 from reconstruction import Camera, Light, Strands, read_exr
 
@@ -129,21 +129,38 @@ def test_radiance_is_linear_in_intensity(tufted):
     )
 
 
-def test_parts_are_the_direct_light_and_the_rest(small, tufted):
-    """The first is what paths of one vertex bring; a plane cannot see itself: it has no rest."""
+def test_indirect_light_is_what_direct_light_lacks(small, tufted):
+    """A plane cannot see itself: it has none."""
     scene, camera, lights = tufted
     pixels = covered_pixels(scene, camera)
-    first, rest = render_olat_parts(scene, camera, lights, pixels, spp=64, max_depth=4, seed=1)
     direct, whole = (
-        render_olat(scene, camera, lights, spp=64, max_depth=n, seed=2, pixels=pixels)
+        render_olat(scene, camera, lights, spp=256, max_depth=n, seed=2, pixels=pixels)
         for n in (1, 4)
     )
-    np.testing.assert_allclose(first.mean((1, 2)), direct.mean((1, 2)), rtol=0.03)
-    np.testing.assert_allclose((first + rest).mean((1, 2)), whole.mean((1, 2)), rtol=0.05)
+    indirect = render_indirect(scene, camera, lights, pixels, spp=64, max_depth=4, seed=1)
+    np.testing.assert_allclose((direct + indirect).mean((1, 2)), whole.mean((1, 2)), rtol=0.02)
     flat = build_scene(small.no_hair, small.plane(), hair=HAIR)
-    first, rest = render_olat_parts(flat, camera, lights, pixels, spp=4, max_depth=4)
-    assert first.any()
-    assert not rest.any()
+    assert not render_indirect(flat, camera, lights, pixels, spp=4, max_depth=4).any()
+
+
+def test_fibres_that_answer_by_their_width_scatter_less(tufted, monkeypatch):
+    """Beside fibres that answer where they are met: the same light, from a third of the paths."""
+    scene, camera, lights = tufted
+    pixels = covered_pixels(scene, camera)
+
+    def pictures():
+        return np.stack(
+            [
+                render_indirect(scene, camera, lights, pixels, spp=64, max_depth=6, seed=s)
+                for s in range(4)
+            ]
+        )
+
+    width = pictures()
+    monkeypatch.setattr(scene.hair_bsdf.parameters, "far_field", None)
+    point = pictures()
+    np.testing.assert_allclose(width.mean((0, 2)), point.mean((0, 2)), rtol=0.04)
+    assert width.var(axis=0, ddof=1).mean() < 0.6 * point.var(axis=0, ddof=1).mean()
 
 
 def test_same_seed_same_bytes(tufted):
@@ -164,7 +181,7 @@ def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
     def spoilt(plan, index, spp, seed):
         out = right(plan, index, spp, seed)
         if spp == 8 and times[0]:
-            out[:, 1, index == pixel] = np.nan
+            out[1, index == pixel] = np.nan
             times[0] -= 1
         return out
 

@@ -18,7 +18,7 @@ from appearance.bsdf.maps import HairMaps, MappedStrands, root_normals, scalp_co
 from appearance.bsdf.strand_coordinates import transported
 from appearance.observations import Observed
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat_parts, spread_out
+from appearance.render.olat import render_indirect, spread_out
 from appearance.render.smoothed import SIGMA, smoothed
 from benchmarks.subjects import Subject
 from reconstruction import Camera, Light, Strands
@@ -81,14 +81,14 @@ class SmallStage:
         spent: dict[str, Any] = {"spp": spp, "max_depth": self.max_depth, "seed": seed}
         if not self.clean_spp:
             return render_olat(scene, camera, lights, pixels=pixels, **spent)
-        direct, rest = render_olat_parts(scene, camera, lights, pixels, **spent)
-        spent |= {"max_depth": 1, "seed": seed + (1 << 31)}
-        direct += render_olat(scene, camera, lights, pixels=pixels, **spent)
+        rest = render_indirect(scene, camera, lights, pixels, **spent)
+        spent |= {"spp": 2 * spp, "max_depth": 1, "seed": seed + (1 << 31)}
+        direct = render_olat(scene, camera, lights, pixels=pixels, **spent)
         share = np.zeros((camera.height, camera.width), np.float32)
         share.reshape(-1)[pixels] = 1
         shares = {"hair": share, "head": np.zeros_like(share)}
         smooth = smoothed(spread_out(rest, pixels, camera), shares, SIGMA)
-        return np.asarray(0.5 * direct + smooth.reshape(len(lights), -1, 3)[:, pixels])
+        return np.asarray(direct + smooth.reshape(len(lights), -1, 3)[:, pixels])
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from appearance.fields.validation import GROUPS, gains, spread_of
 from appearance.metrics.scores import srgb
 from appearance.model.relight import environment_map
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat, render_olat_parts
+from appearance.render.olat import render_indirect, render_olat
 from appearance.render.smoothed import smoothed
 from benchmarks.appearance.known_subjects import SmallStage, bent, dome, dyed, ring
 from benchmarks.subjects import Subject
@@ -141,7 +141,7 @@ def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
             for half in (0, 1):
                 number = (seed << 10) + 100 * stream + 2 * k + half
                 every = np.arange(camera.width * camera.height)
-                _, rest = render_olat_parts(
+                rest = render_indirect(
                     where,
                     camera,
                     lights,

@@ -8,7 +8,7 @@ import pytest
 from appearance import build_scene
 from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.harmonics import harmonics
-from appearance.render.olat import render_olat_parts
+from appearance.render.olat import render_indirect
 from reconstruction import Camera, Light
 from reconstruction.geometry.lights import dome_positions
 from simulators.subject.subject import make_subject
@@ -34,8 +34,7 @@ def test_the_grid_knows_more_of_a_new_view_than_an_even_guess(lit):
     camera = Camera.look_at("new", 32, 32, [0.5, -0.8, 0.3], (low + high) / 2, 22)
     pixels, some = covered_pixels(scene, camera), LIGHTS[3::8]
     one, other = (
-        render_olat_parts(scene, camera, some, pixels, spp=64, max_depth=24, seed=s)[1]
-        for s in (8, 9)
+        render_indirect(scene, camera, some, pixels, spp=64, max_depth=24, seed=s) for s in (8, 9)
     )
     places, share = mean_places(scene, camera, pixels, 3)
     x, y, z = np.rint((places - low) / (high - low) * (LITTLE.cells - 1)).astype(int).T.clip(0, 11)
