@@ -22,12 +22,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats
 from reconstruction.containment import NotContained, inside, plain_file
 from reconstruction.files.exr import read_exr
+from reconstruction.files.masks import read_mask
 from reconstruction.geometry.blocks import block_any, block_means, unblocked
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
@@ -196,13 +196,11 @@ class Capture:
         Half grey and above, and at least half of what a pixel stands for. Raises `CaptureError`.
         """
         shot, lens = self._shot[camera], self._lenses.get(camera)
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None or image.shape != (shot.height, shot.width):
-            found = None if image is None else image.shape
-            raise CaptureError(
-                f"{path}: expected a {shot.height, shot.width} grey PNG, got {found}"
-            )
-        mask = np.asarray(block_means(image >= 128, self._by) >= 0.5)
+        try:
+            whole = read_mask(path, shot.width, shot.height)
+        except (OSError, ValueError) as error:
+            raise CaptureError(str(error)) from error
+        mask = np.asarray(block_means(whole, self._by) >= 0.5)
         return mask if lens is None else lens.undistort_mask(mask)
 
     def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:

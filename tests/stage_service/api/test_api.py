@@ -351,7 +351,7 @@ def test_files_of_a_request_are_checked_before_anything_is_lit(http, world, tmp_
         assert named in problem(refused, "bad-input")["detail"]
     cv2.imwrite(str(tmp_path / "cam_0.png"), np.zeros((4, 4), np.uint8))
     refused = http.post("/captures", json={"plan": SHORT, "masks": str(tmp_path)})
-    assert "expected 8x6, got 4x4" in problem(refused, "bad-input")["detail"]
+    assert "a PNG of 8x6 pixels, got 4x4" in problem(refused, "bad-input")["detail"]
     assert http.get("/captures").json() == []
     assert world.pulses == 0
 
