@@ -190,6 +190,11 @@ class Capture:
         shot = self._shot[camera]
         return mask if self._by == 1 else unblocked(mask, self._by, shot.height, shot.width)
 
+    def strangers(self) -> list[Path]:
+        """The files among the frames that no line of the journal names, as crashes leave them."""
+        known = {self.path / r.file for r in self.records.values() if r.file is not None}
+        return sorted(p for p in self.path.glob("frames/**/*") if p.is_file() and p not in known)
+
     def read_mask(self, path: Path, camera: str) -> Bools:
         """A mask `(H, W)` from a picture as large as the frames on disk, in this view's pixels.
 
