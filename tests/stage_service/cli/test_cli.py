@@ -120,7 +120,7 @@ def test_a_number_that_cannot_be_is_wrong_usage(capsys, words, why):
     assert why in capsys.readouterr().err
 
 
-def test_what_a_service_cannot_use_is_told_before_any_device_is_asked(capsys, tmp_path, monkeypatch):
+def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_path, monkeypatch):
     def never(*_: object, **_more: object) -> None:
         raise AssertionError("a service was made")
 
