@@ -333,6 +333,20 @@ def test_job_events_follow_the_queue(http, server, tmp_path):
     assert (event["kind"], event["data"]["state"]) == ("job.state", "queued")
 
 
+@pytest.mark.parametrize("text", ["", '{"job": "job-8"', "[]"])
+def test_progress_that_a_power_cut_left_ends_nothing(http, server, tmp_path, text):
+    """Neither the list of jobs nor the thread that tells of them."""
+    before, model = server.service.events.last, Model(tmp_path / "m").create()
+    model.file("progress.json").write_text(text)
+    for job, place in (("job-8", model), ("job-9", Model(tmp_path / "n"))):
+        server.service._queue.submit(PipelineRequest(name="fit"), tmp_path, place, job=job)
+        (event,) = read_events(http, 1, {"Last-Event-ID": str(before)})
+        assert (event["kind"], event["data"]["job"]) == ("job.state", job)
+        before = event["number"]
+    listed = {job["id"]: job["progress"] for job in http.get("/jobs").json()}
+    assert listed == {"job-8": None, "job-9": None}
+
+
 def test_a_stranger_host_name_is_refused(http):
     refused = http.get("/health", headers={"Host": "rebound.example"})
     assert refused.status_code == 421
