@@ -53,7 +53,7 @@ class Watching:
     ) -> None:
         self.root, self.captures, self.queue, self.follower = root, captures, queue, follower
         self._started = time.time()
-        unseen = {"free": None, "workers": [], "gone": None}
+        unseen: dict[str, Any] = {"free": None, "workers": [], "gone": None}
         self._disk = LastSeen(self._look, unseen, LONGEST_LOOK_S)
 
     def free_bytes(self) -> int | None:
