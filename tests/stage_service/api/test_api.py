@@ -397,6 +397,7 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
     [
         ({"heldout": []}, "heldout"),
         ({"seed": -1}, "seed"),
+        ({"seed": 2**32}, "seed"),
         ({"reconstruct": {"seed": 3}}, "reconstruct"),
         ({"reconstruct": {"roots": 10**15}}, "reconstruct.roots"),
         ({"reconstruct": {"measure": {"thinn": 1}}}, "reconstruct.measure.thinn"),
