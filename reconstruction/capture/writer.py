@@ -142,8 +142,9 @@ class CaptureWriter:
         journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
-        for left_over in capture.strangers():  # perhaps torn: their names were not yet in a line
-            left_over.unlink()
+        for left_over in capture.strangers():
+            if left_over.suffix == ".exr":  # perhaps torn: a name that is in no line yet
+                left_over.unlink()
         return cls(capture, journal)
 
     def missing(self) -> list[tuple[Step, str]]:

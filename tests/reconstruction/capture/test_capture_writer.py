@@ -402,9 +402,13 @@ def test_a_frame_that_a_power_cut_left_torn_is_none_of_the_capture(tmp_path):
     writer.close()
     torn = path / "frames/00001/cam_1.exr"
     torn.write_bytes(bytes(100))
+    note = path / "frames/00001/note.txt"
+    note.write_text("the user's own")
     assert not Capture(path).has(STEPS[1], "cam_1")
     again = CaptureWriter.reopen(path)
     assert not torn.exists()
+    assert note.read_text() == "the user's own"
+    note.unlink()
     write(again, *EVERY[3:])
     again.finish("completed")
     assert verify(path) == []
