@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture
 from reconstruction.files.durable import PART, write_json, writing
+from reconstruction.files.numpy_files import read_arrays
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.strands import Strands
@@ -204,9 +205,12 @@ class Model:
                 raise OSError(f"{self.file(name)}: OpenCV could not write it")
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]]:
-        """The arrays of an `.npz` file by name. Raises `ModelError` where it is not there."""
-        with np.load(self._needed(name, "hairstage fit CAPTURE"), allow_pickle=False) as data:
-            return dict(data)
+        """The arrays of an `.npz` file by name; `ModelError` where it is not there, or damaged."""
+        file = self._needed(name, "hairstage fit CAPTURE")
+        try:
+            return read_arrays(file)
+        except ValueError as error:
+            raise ModelError(f"{file}: {error}: run 'hairstage fit' again") from error
 
     def write_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write arrays as a compressed `.npz` file."""
@@ -217,7 +221,10 @@ class Model:
         """(u, v) of each strand's root on the scalp's map `(S, 2)`; None where there is no map."""
         if not self.has("scalp_map.npz"):
             return None
-        roots = np.asarray(self.arrays("scalp_map.npz")["roots"], float)
+        try:
+            roots = np.asarray(self.arrays("scalp_map.npz")["roots"], float)
+        except KeyError as error:
+            raise ModelError(f"{self.file('scalp_map.npz')}: {error} is missing") from error
         return np.clip(roots, 0, 1) if len(roots) == len(strands) else None
 
     def json(self, name: str) -> Any:

@@ -139,7 +139,7 @@ class ReconstructOptions:
     head_mesh: str | None = None
     within: Length | None = None
     radius: Length | None = None
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     motion: MotionOptions = MotionOptions()
     measure: MeasureOptions = MeasureOptions()
     light_codes: LightCodeOptions = LightCodeOptions()

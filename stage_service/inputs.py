@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-
 from appearance.model.relight import PROCEDURAL
 from reconstruction import Mesh, Rig, read_obj
 from reconstruction.arrays import Bools
 from reconstruction.containment import plain_file
+from reconstruction.files.masks import read_mask
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.records import PipelineRequest
 
@@ -32,15 +31,11 @@ def read_masks(folder: Path, rig: Rig) -> dict[str, Bools]:
     for camera in rig.cameras:
         path = folder / f"{camera.name}.png"
         try:
-            image = cv2.imread(str(plain_file(path)), cv2.IMREAD_GRAYSCALE)
+            masks[camera.name] = read_mask(path, camera.width, camera.height)
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:
             raise BadInput(f"masks: {error}") from error
-        if image is None or image.shape != (camera.height, camera.width):
-            found = "not an image" if image is None else f"{image.shape[1]}x{image.shape[0]}"
-            raise BadInput(f"masks: {path}: expected {camera.width}x{camera.height}, got {found}")
-        masks[camera.name] = image >= 128
     if not masks:
         raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
     return masks

@@ -10,7 +10,6 @@ import fcntl
 import logging
 import secrets
 import shutil
-import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,14 +18,13 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import cv2
-import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from reconstruction import Model, Rig, read_obj
 from reconstruction.capture.writer import JournalInUse, utc_now
 from reconstruction.containment import inside, is_file_name
 from reconstruction.files.durable import flush, require_free, write_json, write_whole
+from reconstruction.files.masks import decode_mask
 from reconstruction.reading import read_json
 from stage_service.captures.control import Caller, Control
 from stage_service.captures.manager import CaptureManager
@@ -211,14 +209,10 @@ class Storage:
         known = {c.name: c for c in rig.cameras}
         if camera not in known:
             raise BadUpload(f"masks: the rig has no camera {camera!r}; it has {sorted(known)}")
-        expected = (known[camera].width, known[camera].height)
-        if not data.startswith(b"\x89PNG\r\n\x1a\n") or len(data) < 24:
-            raise BadUpload(f"masks/{camera}.png: no PNG")
-        size = struct.unpack(">II", data[16:24])  # before anything is made that large
-        if size != expected:
-            raise BadUpload(f"masks/{camera}.png: expected {expected}, got {size} pixels")
-        if cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) is None:
-            raise BadUpload(f"masks/{camera}.png: it does not decode")
+        try:
+            decode_mask(data, known[camera].width, known[camera].height)
+        except ValueError as error:
+            raise BadUpload(f"masks/{camera}.png: {error}") from error
         return self._upload(subject, f"masks/{camera}.png", data, by)
 
     def uploaded(self, subject: str) -> tuple[Path | None, Path | None]:

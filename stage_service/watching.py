@@ -19,6 +19,9 @@ from stage_service.jobs.slots import workers_seen
 LONGEST_LOOK_S = 0.5
 """How long a request waits for a disk that is slow to say how it is."""
 
+SILENT_S = 5.0
+"""How long a disk may take to say how it is."""
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -50,7 +53,8 @@ class Watching:
     ) -> None:
         self.root, self.captures, self.queue, self.follower = root, captures, queue, follower
         self._started = time.time()
-        self._disk = LastSeen(self._look, {"free": None, "workers": []}, LONGEST_LOOK_S)
+        unseen: dict[str, Any] = {"free": None, "workers": [], "gone": None}
+        self._disk = LastSeen(self._look, unseen, LONGEST_LOOK_S)
 
     def free_bytes(self) -> int | None:
         """What the disk of the root folder has left; None where it does not answer."""
@@ -59,9 +63,12 @@ class Watching:
 
     def problems(self) -> list[str]:
         """Why no capture could begin, a sentence each; one that runs is no reason."""
-        safety, free = self.captures.safety(), self._disk.get()["free"]
+        safety, disk = self.captures.safety(), self._disk.get()
         found = [safety["detail"]] if safety["state"] == "unknown, unsafe" else []
-        if free is None:
+        free = disk["free"]
+        if disk["gone"]:
+            found.append(disk["gone"])
+        elif free is None or self._disk.looking_s() > SILENT_S:
             found.append(f"{self.root}: the disk does not answer")
         elif free < RESERVE:
             left = f"{free / 1e6:.0f} MB free; {RESERVE / 1e6:.0f} MB are kept"
@@ -102,8 +109,12 @@ class Watching:
         yield _per("worker_heartbeat_age_seconds", "since it last said so", "worker", ages)
 
     def _look(self) -> dict[str, Any]:
-        free = shutil.disk_usage(self.root).free
-        return {"free": float(free), "workers": workers_seen(self.root)}
+        try:
+            free = float(shutil.disk_usage(self.captures.folder).free)
+        except OSError as error:
+            gone = f"{self.captures.folder}: {error.strerror}: is its disk there?"
+            return {"free": None, "workers": [], "gone": gone}
+        return {"free": free, "workers": workers_seen(self.root), "gone": None}
 
 
 _COUNTED = {

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
-from reconstruction import Mesh, Model, Strands
+from reconstruction import Mesh, Model, ModelError, Strands
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array
 from reconstruction.head.scalp_map import ScalpMap, sphere_center
@@ -88,11 +88,18 @@ class HairMaps:
 
     @classmethod
     def load(cls, model: Model) -> tuple[HairMaps, Array]:
-        """The maps that `save` wrote, and `root_uv (S, 2)`; `ModelError` where there are none."""
+        """The maps that `save` wrote, and `root_uv (S, 2)`.
+
+        Raises `ModelError` where there are none, or other things.
+        """
         data = model.arrays("hair_maps.npz")
-        scalars = [float(x) for x in data["scalars"]]
-        maps = cls(data["sigma_a"], data["rotation"], *scalars)
-        return maps, np.asarray(data["root_uv"], float)
+        try:
+            scalars = [float(x) for x in data["scalars"]]
+            maps = cls(data["sigma_a"], data["rotation"], *scalars)
+            return maps, np.asarray(data["root_uv"], float)
+        except (KeyError, TypeError, ValueError) as error:
+            path = model.file("hair_maps.npz")
+            raise ModelError(f"{path}: {error!r}: run 'hairstage fit' again") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from appearance.inverse_rendering.unknowns import LightDeviations
-from reconstruction import Light, Model
+from reconstruction import Light, Model, ModelError
 
 LIGHTS_FILE = "lights.json"
 
@@ -28,13 +29,24 @@ def save_lights(model: Model, found: LightDeviations, lights: Sequence[Light]) -
 
 
 def lights_as_found(model: Model, lights: Sequence[Light]) -> list[Light]:
-    """The calibrated `lights` as they were found to be; those that were not fitted as they are."""
-    rows = {row["name"]: row for row in model.json(LIGHTS_FILE)} if model.has(LIGHTS_FILE) else {}
-    out = []
-    for light in lights:
-        row = rows.get(light.name)
-        if row is not None:
-            names = ("moved_m", "turned_rad", "gain", "profile_scale")
-            (light,) = LightDeviations(*(np.array([row[n]], float) for n in names)).applied([light])
-        out.append(light)
-    return out
+    """The calibrated `lights` as they were found to be; those that were not fitted as they are.
+
+    Raises `ModelError` for a file that is damaged.
+    """
+    if not model.has(LIGHTS_FILE):
+        return list(lights)
+    try:
+        rows = {row["name"]: row for row in model.json(LIGHTS_FILE)}
+        return [_as_found(light, rows.get(light.name)) for light in lights]
+    except ModelError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        path = model.file(LIGHTS_FILE)
+        raise ModelError(f"{path}: {error!r}: run 'hairstage fit' again") from error
+
+
+def _as_found(light: Light, row: Mapping[str, Any] | None) -> Light:
+    if row is None:
+        return light
+    names = ("moved_m", "turned_rad", "gain", "profile_scale")
+    return LightDeviations(*(np.array([row[n]], float) for n in names)).applied([light])[0]

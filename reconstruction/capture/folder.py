@@ -22,12 +22,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats
 from reconstruction.containment import NotContained, inside, plain_file
 from reconstruction.files.exr import read_exr
+from reconstruction.files.masks import read_mask
 from reconstruction.geometry.blocks import block_any, block_means, unblocked
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
@@ -190,19 +190,22 @@ class Capture:
         shot = self._shot[camera]
         return mask if self._by == 1 else unblocked(mask, self._by, shot.height, shot.width)
 
+    def strangers(self) -> list[Path]:
+        """The files among the frames that no line of the journal names, as crashes leave them."""
+        known = {self.path / r.file for r in self.records.values() if r.file is not None}
+        return sorted(p for p in self.path.glob("frames/**/*") if p.is_file() and p not in known)
+
     def read_mask(self, path: Path, camera: str) -> Bools:
         """A mask `(H, W)` from a picture as large as the frames on disk, in this view's pixels.
 
         Half grey and above, and at least half of what a pixel stands for. Raises `CaptureError`.
         """
         shot, lens = self._shot[camera], self._lenses.get(camera)
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None or image.shape != (shot.height, shot.width):
-            found = None if image is None else image.shape
-            raise CaptureError(
-                f"{path}: expected a {shot.height, shot.width} grey PNG, got {found}"
-            )
-        mask = np.asarray(block_means(image >= 128, self._by) >= 0.5)
+        try:
+            whole = read_mask(path, shot.width, shot.height)
+        except (OSError, ValueError) as error:
+            raise CaptureError(str(error)) from error
+        mask = np.asarray(block_means(whole, self._by) >= 0.5)
         return mask if lens is None else lens.undistort_mask(mask)
 
     def _journal(self) -> Iterator[tuple[tuple[int, str], FrameRecord]]:

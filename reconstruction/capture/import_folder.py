@@ -344,12 +344,14 @@ def _sized(camera: Camera, found: Found) -> Camera:
 
 def _mask(path: Path, camera: Camera) -> Bools:
     """A mask `(H, W)` in the pixels of the pictures, half grey and above."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    found = None if image is None else image.shape
-    if found != (camera.height, camera.width):
-        raise ImportProblem(
-            f"{path}: expected a PNG of {(camera.height, camera.width)} pixels, got {found}"
-        )
+    expected = (camera.width, camera.height)
+    try:
+        found = picture_size(path)
+    except PictureError as error:
+        raise ImportProblem(str(error)) from error
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if found == expected else None
+    if image is None:
+        raise ImportProblem(f"{path}: expected a PNG of {expected} pixels, got {found}")
     return np.asarray(image) >= 128
 
 

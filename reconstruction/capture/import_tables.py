@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,16 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig, RigError
+from reconstruction.reading import read_json
 
 
 def _entries(path: Path, key: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The list of tables under `key`, and the whole document."""
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
     except FileNotFoundError:
         raise ImportProblem(f"{path}: no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ImportProblem(f"{path}: not JSON ({error})") from error
     if not isinstance(data, dict) or key not in data:
         raise ImportProblem(f"{path}: the field {key!r} is missing")

@@ -103,9 +103,7 @@ def _left_over(path: Path) -> Iterator[str]:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return
-        known = {path / r.file for r in Capture(path).records.values() if r.file is not None}
-        found = {p for p in path.glob("frames/**/*") if p.is_file()}
-    strangers = sorted(str(p.relative_to(path)) for p in found - known)
+        strangers = [str(p.relative_to(path)) for p in Capture(path).strangers()]
     if strangers:
         yield (
             f"{len(strangers)} files among the frames are in no line of the journal, left by a "

@@ -1,7 +1,7 @@
 """Writing capture folders: frames first, then their journal lines, the manifest last.
 
-A crash at any moment leaves every frame that the journal names whole: a frame's file is flushed
-and renamed before its line is appended and flushed. `reopen` continues such a folder. A full disk
+A crash at any moment leaves every frame that the journal names whole: a frame's file and its name
+are flushed before its line is appended and flushed. `reopen` continues such a folder. A full disk
 raises `DiskFull`, before that while there is still room to `finish`.
 """
 
@@ -27,7 +27,6 @@ from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture, CaptureError, FrameRecord, Step
 from reconstruction.containment import inside
 from reconstruction.files.durable import (
-    PART,
     RESERVE,
     FileSystem,
     append_whole,
@@ -143,8 +142,9 @@ class CaptureWriter:
         journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
-        for left_over in capture.path.glob(f"frames/*/{PART}*"):
-            left_over.unlink()
+        for left_over in capture.strangers():
+            if left_over.suffix == ".exr":  # perhaps torn: a name that is in no line yet
+                left_over.unlink()
         return cls(capture, journal)
 
     def missing(self) -> list[tuple[Step, str]]:
@@ -221,15 +221,14 @@ class CaptureWriter:
         return FrameRecord(step.index, camera, name, checksum, recorded=utc_now())
 
     def commit(self, records: Sequence[FrameRecord]) -> None:
-        """Make the records part of the capture: flush the files, their names, then the journal.
+        """Make the records part of the capture: flush the files and their names, then the journal.
 
         A disk flushes many files together as fast as one: commit what has gathered.
         """
         names = [r.file for r in records if r.file is not None]
         files = [self._stored[name] for name in names]
         if len(files) > 1 and self._disk.supported and all(f.direct for f in files):
-            self._disk.flush()
-            for file in files:
+            for file in files:  # as long as no line names it, a file counts for nothing
                 file.temporary.replace(file.path)
             self._disk.flush()
         else:

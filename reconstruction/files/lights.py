@@ -12,13 +12,13 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from reconstruction.arrays import Array
 from reconstruction.containment import is_file_name, plain_file
+from reconstruction.files.numpy_files import read_array
 from reconstruction.geometry.lights import Light
 from reconstruction.reading import read_json
 
@@ -125,8 +125,8 @@ def _entry(value: Any) -> dict[str, Any]:
 
 def _npy(path: Path) -> list[dict[str, Any]]:
     try:
-        positions = np.load(plain_file(path), allow_pickle=False)
-    except (EOFError, SyntaxError, TokenError) as error:  # of a header that is cut off
+        positions = read_array(path)
+    except ValueError as error:
         raise LightFileError(f"{path}: no NumPy array ({error})") from error
     if positions.ndim != 2 or positions.shape[1] != 3 or positions.dtype.kind not in "fiu":
         raise LightFileError(f"{path}: expected (N, 3) numbers, got {positions.shape}")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import Array, Floats
 from reconstruction.files.durable import writing
+from reconstruction.files.numpy_files import read_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +101,15 @@ class PointCloud:
     @classmethod
     def load(cls, path: str | Path) -> PointCloud:
         """Read what `save` wrote; `ValueError` names the file and the column that is missing."""
-        with np.load(path, allow_pickle=False) as data:
-            missing = [f.name for f in fields(cls) if f.name not in data]
-            if missing:
-                raise ValueError(f"{path}: not a point cloud, {missing} are missing")
-            columns = {k: data[k] for k in _COLUMNS}
-            cameras, projectors = (
-                tuple(str(n) for n in data[k]) for k in ("cameras", "projectors")
-            )
+        try:
+            data = read_arrays(Path(path))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        missing = [f.name for f in fields(cls) if f.name not in data]
+        if missing:
+            raise ValueError(f"{path}: not a point cloud, {missing} are missing")
+        columns = {k: data[k] for k in _COLUMNS}
+        cameras, projectors = (tuple(str(n) for n in data[k]) for k in ("cameras", "projectors"))
         return cls(**columns, cameras=cameras, projectors=projectors)
 
 

@@ -7,13 +7,25 @@ import queue
 import threading
 from dataclasses import dataclass, replace
 
-from reconstruction import CaptureWriter, Step
+from reconstruction import CaptureWriter, Rig, Step
 from reconstruction.capture.folder import FrameRecord
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
 THREADS = (os.cpu_count() or 1) + 2
 """Threads that convert, hash and write side by side: one a processor, and one each that waits for
 the disk while it writes and while it flushes."""
+FEWEST_STEPS, MOST_STEPS = 2, 8
+SMALL_BYTES = 32 << 20
+
+
+def queued_frames(rig: Rig) -> int:
+    """How many of the rig's frames may wait for the disk before the sequence waits, too.
+
+    Those of two steps, and of up to eight while they have no more than `SMALL_BYTES` together: a
+    flush takes nearly as long for a few small files as for many.
+    """
+    step = sum(12 * c.width * c.height for c in rig.cameras)  # float32 RGB
+    return len(rig.cameras) * min(max(SMALL_BYTES // step, FEWEST_STEPS), MOST_STEPS)
 
 
 @dataclass(frozen=True, eq=False)

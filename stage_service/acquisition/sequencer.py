@@ -12,7 +12,7 @@ from typing import Any
 from reconstruction import Capture, CaptureWriter, Step
 from stage_service.acquisition.accounting import FrameAccount, PulseAccount
 from stage_service.acquisition.exposing import Exposing, Pulse
-from stage_service.acquisition.frame_queue import FrameWriter, Shot
+from stage_service.acquisition.frame_queue import FrameWriter, Shot, queued_frames
 from stage_service.acquisition.hardware_run import HardwareRun, Shots
 from stage_service.acquisition.progress import RunProgress
 from stage_service.acquisition.safety import Blackout, blackout, check_interlocks
@@ -28,8 +28,6 @@ from stage_service.plan.resolved import ResolvedPlan
 from stage_service.plan.stepping import SHORTEST_RUN
 
 Notify = Callable[[str, dict[str, Any]], None]
-QUEUED_STEPS = 2
-"""Steps' worth of frames that may wait for the disk before the sequence waits, too."""
 ORDERLY_S = 0.5
 """How long whoever darkens a run waits for it to do so itself."""
 MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
@@ -226,7 +224,7 @@ class Sequencer:
     def _session(self) -> None:
         devices = self.devices
         with ExitStack() as stack:
-            frames = FrameWriter(self._writer, QUEUED_STEPS * len(devices.cameras))
+            frames = FrameWriter(self._writer, queued_frames(self._writer.rig))
             stack.callback(frames.close)
             stack.callback(devices.close)
             # The heartbeat ends before the blackout begins: should that fail, the bank's own

@@ -11,11 +11,11 @@ from importlib.metadata import version
 
 from stage_service.cli import bench, calibrate, demo, head, rig, verify
 from stage_service.cli.model import edit, evaluate, export, fit, page, reconstruct, render, view
-from stage_service.cli.stage import capture, jobs, lease, processes, queue, store, tokens
+from stage_service.cli.stage import capture, jobs, lease, processes, queue, stage, store, tokens
 from stage_service.cli.support.commands import EXIT_CODES, run_command
 
 COMMANDS = (
-    *(demo, processes, capture, queue, lease, jobs, store, tokens),
+    *(demo, processes, stage, capture, queue, lease, jobs, store, tokens),
     *(verify, reconstruct, fit, render, view, edit, export, page),
     *(evaluate, bench, rig, calibrate, head),
 )

@@ -25,6 +25,7 @@ class LastSeen:
     ) -> None:
         self._look, self._seen, self._wait_s = look, unseen, wait_s
         self._at: float | None = None
+        self._began = 0.0
         self._looking = False
         self._changed = threading.Condition()
 
@@ -32,11 +33,16 @@ class LastSeen:
         """What was seen last and, as "age_s", how many seconds ago (None: not yet)."""
         with self._changed:
             if not self._looking:
-                self._looking = True
+                self._looking, self._began = True, time.monotonic()
                 threading.Thread(target=self._run, name="device-look", daemon=True).start()
             self._changed.wait_for(lambda: not self._looking, self._wait_s)
             age = None if self._at is None else time.monotonic() - self._at
             return {**self._seen, "age_s": age}
+
+    def looking_s(self) -> float:
+        """How long the look that is under way has taken; 0 where none is."""
+        with self._changed:
+            return time.monotonic() - self._began if self._looking else 0.0
 
     def peek(self) -> dict[str, Any]:
         """What was seen last; has nobody look."""

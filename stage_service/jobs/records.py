@@ -41,7 +41,7 @@ class JobOptions(Strict):
     reduced: int = Field(default=1, ge=1, le=64)
     environment: str = "studio"
     truth: str | None = None
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**32)
     reconstruct: ReconstructOptions = Field(default_factory=ReconstructOptions)
     fit: FitOptions = Field(default_factory=FitOptions)
     inverse_rendering: InverseRenderingRequest = Field(default_factory=InverseRenderingRequest)

@@ -63,8 +63,11 @@ class ResolvedPlan:
             raise FlashRefusal(cost.flash, consent, seconds=cost.seconds, slow_seconds=slow.seconds)
 
     def check_room(self, folder: Path) -> None:
-        """Raise `PlanError` where its frames do not fit on the disk of `folder`."""
-        needed, free = self.cost.bytes, shutil.disk_usage(folder).free
+        """Raise `PlanError` where its frames do not fit on the disk of `folder`, or it is gone."""
+        try:
+            needed, free = self.cost.bytes, shutil.disk_usage(folder).free
+        except FileNotFoundError:
+            raise PlanError([f"{folder} is not there: is its disk?"]) from None
         if needed + RESERVE > free:
             need, kept, have = (f"{n / 1e9:.2f} GB" for n in (needed, RESERVE, free))
             raise PlanError([f"the plan writes {need} and leaves {kept} free, {folder} has {have}"])

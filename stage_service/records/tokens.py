@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from reconstruction.capture.writer import utc_now
 from reconstruction.containment import is_file_name, plain_file
 from reconstruction.files.durable import writing
+from reconstruction.reading import read_json
 
 Scope = Literal["read", "steer", "arm", "jobs", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
@@ -75,7 +76,7 @@ class Tokens:
     def entries(self) -> list[Entry]:
         """All of the file, the oldest first. Raises `TokenError`."""
         try:
-            lines = json.loads(plain_file(self._path).read_text()) if self._path.exists() else []
+            lines = read_json(self._path) if self._path.exists() else []
             return [Entry.model_validate(line) for line in lines]
         except (OSError, ValueError, TypeError, ValidationError) as error:
             raise TokenError(f"{self._path}: {error}") from error

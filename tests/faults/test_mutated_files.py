@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mutate import FORMATS, MOST_BYTES
+from file_formats import FORMATS
+from mutate import MOST_BYTES
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

@@ -62,6 +62,8 @@ def _camera(path: Path, i: int, block: dict[str, list[str]]) -> Camera:
     offset = numbers("centerOffset", 2)
     if not (wide > 0 and high > 0):
         raise CameraFileError(f"{where}: sensorSize must be positive")
+    if not 0.01 < high / wide < 100:
+        raise CameraFileError(f"{where}: sensorSize is {wide:g} x {high:g} mm")
     size = WIDTH, round(WIDTH * high / wide)
     fx = WIDTH * f / wide
     K = pinhole_K(

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import signal
+import ssl
 import sys
 import time
 from pathlib import Path
@@ -21,6 +22,7 @@ from stage_service.cli.support.commands import (
     Output,
     add_command,
     rig_path,
+    whole,
 )
 
 if TYPE_CHECKING:
@@ -36,7 +38,9 @@ def add(commands: Commands) -> None:
     serve.add_argument("--rig", type=rig_path, required=True, help=RIG_HELP)
     serve.add_argument("--devices", type=Path, help="file whose [devices] wins over the rig file's")
     serve.add_argument("--root", type=Path, default=Path("runs/stage"), help="captures and models")
-    serve.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 takes any free port")
+    serve.add_argument(
+        "--port", type=whole(0, 65535), default=DEFAULT_PORT, help="0 takes any free port"
+    )
     serve.add_argument("--host", default="127.0.0.1", help="address; beyond this machine with TLS")
     serve.add_argument("--socket", type=Path, help="a Unix socket instead, for user and group")
     serve.add_argument("--tls-cert", type=Path, help="certificate and what leads to it, PEM")
@@ -57,7 +61,7 @@ def add(commands: Commands) -> None:
 
     worker = add_command(commands, "worker", run_worker)
     worker.add_argument("--root", type=Path, default=Path("runs/stage"), help="as the service's")
-    worker.add_argument("--concurrency", type=int, default=1, help="jobs at the same time")
+    worker.add_argument("--concurrency", type=whole(1), default=1, help="jobs at the same time")
     worker.add_argument(
         "--gpu", action="store_true", help="the jobs that 'serve --gpu-workers' keeps for a GPU"
     )
@@ -98,6 +102,9 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             f"--host {args.host}: beyond this machine tokens are asked for and must not be "
             "overheard: leave out --no-auth, and give --tls-cert and --tls-key"
         )
+    if args.verify_days is not None and not args.verify_days > 0:
+        raise BadArgument(f"--verify-days: expected days above 0, got {args.verify_days:g}")
+    _check_certificate(args)
     access = _access(args, output)
     rig_file = load_rig_file(args.rig, args.devices)
     try:
@@ -117,6 +124,25 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
         output.result({"url": url, "root": str(args.root), "rig": str(args.rig)}, text)
 
     serve(service, endpoint, access, ready)
+
+
+def _check_certificate(args: argparse.Namespace) -> None:
+    """Raise `BadArgument` for one that cannot be used, before any device is asked."""
+    if args.tls_cert is None:
+        if args.tls_key is not None:
+            raise BadArgument("--tls-key is of no use without --tls-cert")
+        return
+    for file in filter(None, (args.tls_cert, args.tls_key)):
+        if not file.is_file():
+            raise BadArgument(f"{file}: no such file")
+    try:
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(
+            args.tls_cert, args.tls_key
+        )
+    except OSError as error:
+        raise BadArgument(
+            f"--tls-cert {args.tls_cert}: not a certificate with its key: {error}"
+        ) from error
 
 
 def _access(args: argparse.Namespace, output: Output) -> Access:

@@ -209,6 +209,17 @@ def rig_path(text: str) -> Path:
     return own if own.is_file() else Path(text)
 
 
+def whole(least: int, most: int = 1_000_000) -> Callable[[str], int]:
+    """What reads an option's whole number from `least` to `most`."""
+
+    def number(text: str) -> int:
+        if not least <= (value := int(text)) <= most:
+            raise argparse.ArgumentTypeError(f"{value} is not from {least} to {most}")
+        return value
+
+    return number
+
+
 def read_json(text: str | Path | None) -> Any:
     """The JSON of an option: the text itself, or the file that it names; {} for None."""
     if text is None:

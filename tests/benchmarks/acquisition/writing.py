@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from reconstruction import Camera, CaptureWriter, Rig, Step
-from stage_service.acquisition.frame_queue import FrameWriter, Shot
-from stage_service.acquisition.sequencer import QUEUED_STEPS
+from stage_service.acquisition.frame_queue import FrameWriter, Shot, queued_frames
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
 GOAL = 0.8
@@ -79,7 +78,7 @@ def _capture(
     info = CameraInfo(rig.cameras[0].width, rig.cameras[0].height, 4095, 64.0, 10000.0)
     _settle(len(steps) * sum(2 * image.nbytes for image in counts))
     begin = time.perf_counter()
-    frames = FrameWriter(writer, QUEUED_STEPS * len(counts))
+    frames = FrameWriter(writer, queued_frames(rig))
     for step in steps:
         for camera, image in zip(rig.cameras, counts, strict=True):
             frame = Frame(image, step.index + 1, 0.0, step.exposure)

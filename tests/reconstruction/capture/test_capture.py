@@ -74,7 +74,7 @@ def test_a_dark_frame_is_its_own_response(capture):
 def test_a_mask_of_the_wrong_size_is_named(capture):
     (capture.path / "masks").mkdir()
     (capture.path / "masks" / "cam_0.png").write_bytes(b"no picture")
-    with pytest.raises(CaptureError, match=r"cam_0.png: expected a \(6, 8\) grey PNG"):
+    with pytest.raises(CaptureError, match=r"cam_0.png: expected a PNG of 8x6"):
         capture.mask("cam_0")
 
 

@@ -333,6 +333,20 @@ def test_job_events_follow_the_queue(http, server, tmp_path):
     assert (event["kind"], event["data"]["state"]) == ("job.state", "queued")
 
 
+@pytest.mark.parametrize("text", ["", '{"job": "job-8"', "[]"])
+def test_progress_that_a_power_cut_left_ends_nothing(http, server, tmp_path, text):
+    """Neither the list of jobs nor the thread that tells of them."""
+    before, model = server.service.events.last, Model(tmp_path / "m").create()
+    model.file("progress.json").write_text(text)
+    for job, place in (("job-8", model), ("job-9", Model(tmp_path / "n"))):
+        server.service._queue.submit(PipelineRequest(name="fit"), tmp_path, place, job=job)
+        (event,) = read_events(http, 1, {"Last-Event-ID": str(before)})
+        assert (event["kind"], event["data"]["job"]) == ("job.state", job)
+        before = event["number"]
+    listed = {job["id"]: job["progress"] for job in http.get("/jobs").json()}
+    assert listed == {"job-8": None, "job-9": None}
+
+
 def test_a_stranger_host_name_is_refused(http):
     refused = http.get("/health", headers={"Host": "rebound.example"})
     assert refused.status_code == 421
@@ -351,7 +365,7 @@ def test_files_of_a_request_are_checked_before_anything_is_lit(http, world, tmp_
         assert named in problem(refused, "bad-input")["detail"]
     cv2.imwrite(str(tmp_path / "cam_0.png"), np.zeros((4, 4), np.uint8))
     refused = http.post("/captures", json={"plan": SHORT, "masks": str(tmp_path)})
-    assert "expected 8x6, got 4x4" in problem(refused, "bad-input")["detail"]
+    assert "a PNG of 8x6 pixels, got 4x4" in problem(refused, "bad-input")["detail"]
     assert http.get("/captures").json() == []
     assert world.pulses == 0
 
@@ -383,6 +397,7 @@ def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, h
     [
         ({"heldout": []}, "heldout"),
         ({"seed": -1}, "seed"),
+        ({"seed": 2**32}, "seed"),
         ({"reconstruct": {"seed": 3}}, "reconstruct"),
         ({"reconstruct": {"roots": 10**15}}, "reconstruct.roots"),
         ({"reconstruct": {"measure": {"thinn": 1}}}, "reconstruct.measure.thinn"),

@@ -177,7 +177,7 @@ def test_a_token_that_is_revoked_opens_nothing_any_more(ask, tmp_path, capsys):
 
 def test_a_damaged_file_of_tokens_opens_nothing(ask, tokens, tmp_path):
     token = tokens.make("ada", SCOPES)
-    for text in ("", "[", '[{"name": "ada"}]', '{"a": 1}', "[1]"):
+    for text in ("", "[", '[{"name": "ada"}]', '{"a": 1}', "[1]", "[" * 10**5):
         (tmp_path / "root" / "tokens.json").write_text(text)
         refused(ask("GET /lease", token), "unauthorized", 401)
         with pytest.raises(TokenError, match=r"tokens\.json"):

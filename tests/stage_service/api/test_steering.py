@@ -92,6 +92,24 @@ def test_the_command_line_steers_under_a_lease(http, tmp_path, capsys):
     assert (code, told["error"]["problem"]["type"]) == (1, "/docs/errors.md#wrong-state")
 
 
+def test_the_command_line_darkens_and_says_what_it_knows(http, world, capsys):
+    def run(*words: str) -> tuple[int, str]:
+        code = main(["stage", *words, "--url", str(http.base_url)])
+        told = capsys.readouterr()
+        return code, told.out + told.err
+
+    assert run("status") == (0, "ok: lamps dark, no capture runs, no worker is there\n")
+    world.lit = {2}
+    code, told = run("blackout")
+    assert (code, world.lit, told.partition(":")[0]) == (0, set(), "dark")
+    code, told = run("acknowledge", "Ada", "all dark, I looked")
+    assert (code, "nothing to acknowledge" in told) == (1, True), told
+    world.lit, world.stuck_lamps = {7}, True
+    code, told = run("blackout")
+    assert (code, told.partition(":")[0]) == (1, "unknown, unsafe")
+    assert run("status")[1].startswith("unsafe: lamps unknown, unsafe, no capture runs")
+
+
 def told_id(http: Client) -> str:
     capture: str = http.get("/captures").json()[0]["id"]
     return capture

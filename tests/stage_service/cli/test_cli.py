@@ -105,6 +105,39 @@ def test_wrong_usage_is_exit_code_2(capsys):
     assert "exit codes" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("serve --rig demo --port 99999", "99999 is not from 0 to 65535"),
+        ("serve --rig demo --port x", "invalid number value: 'x'"),
+        ("worker --concurrency 0", "0 is not from 1"),
+    ],
+)
+def test_a_number_that_cannot_be_is_wrong_usage(capsys, words, why):
+    with pytest.raises(SystemExit) as error:
+        main(words.split())
+    assert error.value.code == 2
+    assert why in capsys.readouterr().err
+
+
+def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_path, monkeypatch):
+    def never(*_: object, **_more: object) -> None:
+        raise AssertionError("a service was made")
+
+    monkeypatch.setattr("stage_service.service.Service", never)
+    root, junk = tmp_path / "root", tmp_path / "junk.pem"
+    junk.write_text("no certificate")
+    for words, why in (
+        (["--tls-cert", tmp_path / "none.pem"], "none.pem: no such file"),
+        (["--tls-cert", junk, "--tls-key", junk], "not a certificate with its key"),
+        (["--tls-key", junk], "without --tls-cert"),
+        (["--verify-days", "-1"], "above 0, got -1"),
+    ):
+        code, data = run(capsys, "serve", "--rig", "demo", "--root", root, *words)
+        assert code == 3
+        assert why in data["error"]["detail"]
+
+
 @pytest.mark.parametrize("name", ["demo.toml", "stage331.toml"])
 def test_rig_check_counts_and_conditions(capsys, name):
     code, data = run(capsys, "rig", "check", RIGS / name)

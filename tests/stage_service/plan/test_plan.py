@@ -115,6 +115,27 @@ def test_what_the_rig_cannot_do_is_refused_before_anything_lights(demo, plan, pr
     assert problem in str(error.value)
 
 
+class Counted(str):
+    """A name that counts how often it is compared."""
+
+    compared = 0
+
+    def __eq__(self, other: object) -> bool:
+        Counted.compared += 1
+        return str.__eq__(self, other)
+
+    __hash__ = str.__hash__
+
+
+def test_many_names_that_the_rig_lacks_are_not_compared_with_each_other(demo):
+    names = tuple(Counted(f"lamp_{i}") for i in range(2000))
+    plan = CapturePlan().model_copy(update={"lights": names})
+    with pytest.raises(PlanError) as error:
+        resolve(plan, demo)
+    assert str(error.value).count("\n") < 30
+    assert Counted.compared < 10 * len(names)
+
+
 @pytest.mark.parametrize(
     "plan",
     [

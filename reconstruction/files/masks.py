@@ -1,0 +1,48 @@
+"""Masks as grey PNG."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from reconstruction.arrays import Bools
+from reconstruction.containment import plain_file
+
+_LENGTH = struct.Struct(">I")
+_SIZE = struct.Struct(">II")
+
+
+def read_mask(path: Path, width: int, height: int) -> Bools:
+    """Where a grey PNG of that size is half grey and above `(height, width)`.
+
+    Raises `FileNotFoundError`, and `ValueError` naming the file and what is wrong.
+    """
+    data = plain_file(path).read_bytes()
+    try:
+        return decode_mask(data, width, height)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def decode_mask(data: bytes, width: int, height: int) -> Bools:
+    """`read_mask` of a file's bytes; the `ValueError` names no file.
+
+    What the file says of its sizes is held against them before anything is made that large.
+    """
+    expected = f"expected a PNG of {width}x{height} pixels"
+    if not data.startswith(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR") or len(data) < 24:
+        raise ValueError(f"{expected}, got another file")
+    if (found := _SIZE.unpack_from(data, 16)) != (width, height):
+        raise ValueError(f"{expected}, got {found[0]}x{found[1]}")
+    end = 8
+    while end + _LENGTH.size <= len(data):
+        end += 12 + _LENGTH.unpack_from(data, end)[0]  # a chunk's own three words, and its data
+    image = None
+    if end <= len(data):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None or image.shape != (height, width):
+        raise ValueError(f"{expected}, got one that is damaged")
+    return np.asarray(image >= 128)

@@ -1,0 +1,35 @@
+"""Masks as PNG."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.files.masks import decode_mask, read_mask
+
+
+@pytest.fixture
+def png() -> bytes:
+    grey = np.array([[0, 127, 128], [255, 3, 200]], np.uint8)
+    return bytes(cv2.imencode(".png", grey)[1])
+
+
+def test_half_grey_and_above_is_the_mask(png, tmp_path):
+    (tmp_path / "m.png").write_bytes(png)
+    mask = read_mask(tmp_path / "m.png", 3, 2)
+    assert mask.tolist() == [[False, False, True], [True, False, True]]
+
+
+def test_what_a_file_says_of_its_sizes_is_not_believed(png, monkeypatch):
+    with pytest.raises(ValueError, match="expected a PNG of 2x3 pixels, got 3x2"):
+        decode_mask(png, 2, 3)
+    with pytest.raises(ValueError, match="another file"):
+        decode_mask(b"GIF89a" + bytes(40), 3, 2)
+    with pytest.raises(ValueError, match="damaged"):
+        decode_mask(png[:-14], 3, 2)
+    data_length = png.index(b"IDAT") - 4  # OpenCV makes room for as much as it says
+    monkeypatch.setattr(cv2, "imdecode", None)
+    gigabyte = png[:data_length] + (1 << 30).to_bytes(4, "big") + png[data_length + 4 :]
+    with pytest.raises(ValueError, match="damaged"):
+        decode_mask(gigabyte, 3, 2)
