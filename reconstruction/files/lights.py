@@ -12,13 +12,13 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from reconstruction.arrays import Array
 from reconstruction.containment import is_file_name, plain_file
+from reconstruction.files.npy import read_npy
 from reconstruction.geometry.lights import Light
 from reconstruction.reading import read_json
 
@@ -124,10 +124,7 @@ def _entry(value: Any) -> dict[str, Any]:
 
 
 def _npy(path: Path) -> list[dict[str, Any]]:
-    try:
-        positions = np.load(plain_file(path), allow_pickle=False)
-    except (EOFError, SyntaxError, TokenError) as error:  # of a header that is cut off
-        raise LightFileError(f"{path}: no NumPy array ({error})") from error
+    positions = read_npy(path)
     if positions.ndim != 2 or positions.shape[1] != 3 or positions.dtype.kind not in "fiu":
         raise LightFileError(f"{path}: expected (N, 3) numbers, got {positions.shape}")
     return [{"position": p} for p in positions]

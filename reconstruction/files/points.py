@@ -11,6 +11,7 @@ import numpy as np
 
 from reconstruction.arrays import Array
 from reconstruction.containment import plain_file
+from reconstruction.files.npy import read_npy
 
 SUFFIXES = (".obj", ".ply", ".csv", ".npy")
 _KINDS = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
@@ -28,7 +29,7 @@ def read_points(path: str | Path) -> tuple[Array, Array | None]:
     """
     path = Path(path)
     readers: dict[str, Callable[[Path], Any]]
-    readers = {".obj": _obj, ".ply": _ply, ".csv": _csv, ".npy": np.load}
+    readers = {".obj": _obj, ".ply": _ply, ".csv": _csv, ".npy": read_npy}
     if path.suffix.lower() not in readers:
         raise ValueError(f"{path}: expected a file of points ({', '.join(SUFFIXES)})")
     try:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -267,13 +265,6 @@ def cut_off(path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
 
 
-def claims_ten_gigabytes(path: Path) -> None:
-    """A whole header of 60,000 x 60,000 pixels of three bytes."""
-    header = b"IHDR" + struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0)
-    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
-
-
 def is_smaller(path: Path) -> None:
     save(path, np.zeros((SIZE, SIZE // 2, 3), np.float32), np.uint16)
 
@@ -289,7 +280,6 @@ def is_text(path: Path) -> None:
         (cut_off, "copy it anew"),
         (is_text, "copy it anew"),
         (is_smaller, "12x24 pixels, its camera has 24x24: give a picture of that size"),
-        (claims_ten_gigabytes, "60000x60000 pixels|copy it anew|unexpected"),
     ],
 )
 def test_a_broken_picture_says_what_to_do(folder, tmp_path, suffix, break_it, says):
