@@ -20,7 +20,7 @@ NOISE = 0.002  # of a fully lit pixel
 HAIR, SKIN = (0.35, 0.2, 0.1), (0.45, 0.31, 0.25)
 AMBIENT = 0.3  # of a pixel's light that no surface takes away
 LOBE = 0.2  # width of the highlight, in sines
-BLOCK = 1 << 14  # pixels that are painted together
+BLOCK = 1 << 14  # pixels that are painted together: they stay in the cache
 SHIFTS = 64  # pixels by which the noise differs from frame to frame
 
 
@@ -76,7 +76,10 @@ class PaintedCapture(Capture):
             share = projector.row_weight(step.row, rows[first:last]).astype(np.float32)
             flat[seen.at[lit]] += share[:, None] * seen.answers(projector.center, lit)
         elif step.kind == "olat" and step.light is not None:
-            flat[seen.at] += seen.answers(self.rig.light(step.light).position, slice(None))
+            position = self.rig.light(step.light).position
+            for begin in range(0, len(seen.at), BLOCK):
+                part = slice(begin, begin + BLOCK)
+                flat[seen.at[part]] += seen.answers(position, part)
         elif step.kind == "all_on":
             flat[seen.at] += seen.colour
         return out, {}
@@ -144,25 +147,15 @@ class _Seen:
         return cls(**(found | {"shape": tuple(found["shape"].tolist())}))
 
     def answers(self, position: Array, some: Ints | slice) -> Floats:
-        """What `some` of the pixels answer to a light at `position (3,)`: `(Q, 3)`.
-
-        A few pixels at a time, which stay in the processor's cache.
-        """
-        seen = self.points[some], self.normals[some], self.tangents[some]
-        colour, away = self.colour[some], self.away[some]
-        out = np.empty_like(colour)
-        for begin in range(0, len(out), BLOCK):
-            part = slice(begin, begin + BLOCK)
-            points, normals, tangents = (a[part] for a in seen)
-            to = position.astype(np.float32) - points
-            to /= np.sqrt(np.einsum("pi,pi->p", to, to))[:, None]
-            facing = AMBIENT + np.maximum(np.einsum("pi,pi->p", to, normals), 0)
-            along = np.einsum("pi,pi->p", to, tangents)
-            matte = facing * np.sqrt(np.maximum(1 - along * along, 0))
-            gloss = facing * np.exp(-(((along + away[part]) / LOBE) ** 2))
-            gloss[~tangents.any(axis=1)] = 0
-            out[part] = matte[:, None] * colour[part] + 0.2 * gloss[:, None]
-        return out
+        """What `some` of the pixels answer to a light at `position (3,)`: `(Q, 3)`."""
+        to = position.astype(np.float32) - self.points[some]
+        to /= np.sqrt(np.einsum("pi,pi->p", to, to))[:, None]
+        facing = AMBIENT + np.maximum(np.einsum("pi,pi->p", to, self.normals[some]), 0)
+        along = np.einsum("pi,pi->p", to, self.tangents[some])
+        matte = facing * np.sqrt(np.maximum(1 - along * along, 0))
+        gloss = facing * np.exp(-(((along + self.away[some]) / LOBE) ** 2))
+        gloss[~self.tangents[some].any(axis=1)] = 0
+        return np.asarray(matte[:, None] * self.colour[some] + 0.2 * gloss[:, None])
 
     @cached_property
     def _rows(self) -> dict[str, tuple[Ints, Array]]:
