@@ -15,6 +15,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from reconstruction.capture.folder import Capture, MissingFrame, Step, StepKind
+from reconstruction.capture.kept_frames import kept_bytes
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.orientation import responses
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
@@ -51,12 +52,16 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a whole reconstruction: `stages` in order, the `frames` read, the `disk_gb` written."""
+    """Of a whole reconstruction: `stages` in order, the `frames` read, the `disk_gb` written.
+
+    `working_gb` more are on the disk meanwhile: frames of a reduced view.
+    """
 
     method: Method
     stages: tuple[StageCost, ...]
     frames: int
     disk_gb: float
+    working_gb: float
 
     @property
     def seconds(self) -> float:
@@ -90,7 +95,8 @@ def estimate(
     progress("probed", 1.0)
     frames = sum(r.file is not None for r in capture.records.values())
     each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
-    return Estimate(method, tuple(stages), frames, 0.01 + each * probe.points)
+    disk_gb, working_gb = 0.01 + each * probe.points, kept_bytes(capture) / GB
+    return Estimate(method, tuple(stages), frames, disk_gb, working_gb)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +165,11 @@ class _Probe:
         self.progress("reading frames", 0.1)
         return self.reading("olat") if self.frames("olat") else 0.0
 
+    @property
+    def again(self) -> float:
+        """Seconds that it takes to be read once more: a reduced view keeps its own."""
+        return self.read if self.capture.reduced_by == 1 else 2e-8 * self.pixels
+
     @cached_property
     def hair(self) -> float:
         """Pixels of all cameras that show the subject or, where that is known, its hair."""
@@ -213,9 +224,10 @@ class _Probe:
             base += 560 * hair / GB
         looked = min(lights, 1.5 * LOOKS) * len(self.cameras)
         lit = len(self.cameras) if self.frames("all_on") else self.frames("olat")
+        more = looked + (lit if self.capture.head is None else 0)
         add(
             "masks",
-            (looked + 2 * lit) * self.read,
+            lit * self.read + more * (self.read if self.frames("all_on") else self.again),
             looked * 1.7e-7 * self.pixels,
             (8 * min(lights, 1.5 * LOOKS) / len(self.cameras) + 40) * hair / GB,
         )
@@ -242,7 +254,7 @@ class _Probe:
         lights, n = self.lights, self.points
         self.progress("filtering", 0.6)
         groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
-        measured = self.frames("olat") * self.read + groups * self.filtering()
+        measured = self.frames("olat") * self.again + groups * self.filtering()
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * (2.2e-4 + 1.4e-6 * reads)
         count = self.options.measure.bank.count
@@ -253,7 +265,7 @@ class _Probe:
 
     def _line_stereo(self, add: Callable[[str, float, float, float], None]) -> None:
         cameras, lights, hair = len(self.cameras), self.lights, self.hair
-        measured = self.frames("olat") * self.read
+        measured = self.frames("olat") * self.again
         gb = self.pixels * (18 * lights + 400) / GB
         add("lightcodes", measured, 6e-7 * cameras * lights * self.pixels, gb)
         near = min(self.options.light_codes.search.neighbours, max(cameras // 2, 1))
