@@ -365,7 +365,9 @@ def test_what_was_understood_is_said_and_drawn(folder, tmp_path):
     settings(folder, "first_light = 1")
     understood = Import.of(folder, None, settings_of(folder))
     assert understood.counts()["frames"] == 6
-    assert "left: 3 frames of 24x24, images/left/0001.png, …" in understood.said()
+    said = understood.said()
+    assert "left: 3 frames of 24x24, images/left/0001.png, …" in said
+    assert {"cameras: 2", "steps: 3 olat", "units: relative"} <= set(said)
     assert any("images/notes/x.png" in note for note in understood.found.notes)
     contact_sheet(understood, tmp_path / "sheet.png")
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
