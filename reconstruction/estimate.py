@@ -93,7 +93,7 @@ def estimate(
         method = method_for(capture)
     stages = list(probe.stages(method))
     progress("probed", 1.0)
-    frames = sum(r.file is not None for r in capture.records.values())
+    frames = sum(capture.has(s, c.name) for s in capture.steps for c in capture.rig.cameras)
     each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
     disk_gb, working_gb = 0.01 + each * probe.points, kept_bytes(capture) / GB
     return Estimate(method, tuple(stages), frames, disk_gb, working_gb)
