@@ -233,6 +233,7 @@ class _Probe:
         )
         seen = method in ("photometric", "lmvs")
         voxels = (2e-3 / self.options.grid) ** 3
+        volume = voxels * (1.0 if self.capture.head is not None else 2.0)  # the head's own, too
         if not seen:
             add("envelope", 0.0, 3.0 * voxels, 0.3 * voxels)
             if lights:
@@ -242,12 +243,13 @@ class _Probe:
         if not seen:
             if sweep:
                 add("surface", 0.0, 8e-9 * n * n, 8e-6 * n)
-            add("field", 0.0, 2.9 * voxels, 0.5 * voxels)
-            add("strands", 0.0, 7.0 + 2e-4 * n, 0.6 + (2e-5 if sweep else 3.6e-5) * n)
+            grown = 0.6 + 2e-5 * n if sweep else 0.9 * volume + 7e-6 * n
+            add("field", 0.0, 2.9 * voxels, 0.8 * volume)
+            add("strands", 0.0, 7.0 + 2e-4 * n, grown)
             if sweep:
                 add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.3 + 4e-5 * n)
             if self.capture.head is not None:
-                add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n)
+                add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n if sweep else grown)
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
