@@ -121,7 +121,10 @@ class Capture:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if not (self.path / "rig.json").is_file() or not (self.path / "plan.json").is_file():
-            raise CaptureError(f"{self.path} is not a capture: expected rig.json and plan.json")
+            raise CaptureError(
+                f"{self.path} is not a capture: expected rig.json and plan.json; of a folder of "
+                "photographs 'hairstage import' makes one"
+            )
         try:
             self.rig = Rig.load(self._own("rig.json"))
             self.plan: dict[str, Any] = _object(self._own("plan.json"))
