@@ -15,6 +15,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from reconstruction.capture.folder import Capture, MissingFrame, Step, StepKind
+from reconstruction.capture.kept_frames import kept_bytes
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.orientation import responses
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
@@ -51,12 +52,16 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a whole reconstruction: `stages` in order, the `frames` read, the `disk_gb` written."""
+    """Of a whole reconstruction: `stages` in order, the `frames` read, the `disk_gb` written.
+
+    `working_gb` more are on the disk meanwhile: frames of a reduced view.
+    """
 
     method: Method
     stages: tuple[StageCost, ...]
     frames: int
     disk_gb: float
+    working_gb: float
 
     @property
     def seconds(self) -> float:
@@ -88,9 +93,10 @@ def estimate(
         method = method_for(capture)
     stages = list(probe.stages(method))
     progress("probed", 1.0)
-    frames = sum(r.file is not None for r in capture.records.values())
+    frames = sum(capture.has(s, c.name) for s in capture.steps for c in capture.rig.cameras)
     each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
-    return Estimate(method, tuple(stages), frames, 0.01 + each * probe.points)
+    disk_gb, working_gb = 0.01 + each * probe.points, kept_bytes(capture) / GB
+    return Estimate(method, tuple(stages), frames, disk_gb, working_gb)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +165,11 @@ class _Probe:
         self.progress("reading frames", 0.1)
         return self.reading("olat") if self.frames("olat") else 0.0
 
+    @property
+    def again(self) -> float:
+        """Seconds that it takes to be read once more: a reduced view keeps its own."""
+        return self.read if self.capture.reduced_by == 1 else 2e-8 * self.pixels
+
     @cached_property
     def hair(self) -> float:
         """Pixels of all cameras that show the subject or, where that is known, its hair."""
@@ -213,14 +224,16 @@ class _Probe:
             base += 560 * hair / GB
         looked = min(lights, 1.5 * LOOKS) * len(self.cameras)
         lit = len(self.cameras) if self.frames("all_on") else self.frames("olat")
+        more = looked + (lit if self.capture.head is None else 0)
         add(
             "masks",
-            (looked + 2 * lit) * self.read,
+            lit * self.read + more * (self.read if self.frames("all_on") else self.again),
             looked * 1.7e-7 * self.pixels,
             (8 * min(lights, 1.5 * LOOKS) / len(self.cameras) + 40) * hair / GB,
         )
         seen = method in ("photometric", "lmvs")
         voxels = (2e-3 / self.options.grid) ** 3
+        volume = voxels * (1.0 if self.capture.head is not None else 2.0)  # the head's own, too
         if not seen:
             add("envelope", 0.0, 3.0 * voxels, 0.3 * voxels)
             if lights:
@@ -230,19 +243,20 @@ class _Probe:
         if not seen:
             if sweep:
                 add("surface", 0.0, 8e-9 * n * n, 8e-6 * n)
-            add("field", 0.0, 2.9 * voxels, 0.5 * voxels)
-            add("strands", 0.0, 7.0 + 2e-4 * n, 0.6 + (2e-5 if sweep else 3.6e-5) * n)
+            grown = 0.6 + 2e-5 * n if sweep else 0.9 * volume + 7e-6 * n
+            add("field", 0.0, 2.9 * voxels, 0.8 * volume)
+            add("strands", 0.0, 7.0 + 2e-4 * n, grown)
             if sweep:
                 add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.3 + 4e-5 * n)
             if self.capture.head is not None:
-                add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n)
+                add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n if sweep else grown)
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
         lights, n = self.lights, self.points
         self.progress("filtering", 0.6)
         groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
-        measured = self.frames("olat") * self.read + groups * self.filtering()
+        measured = self.frames("olat") * self.again + groups * self.filtering()
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * (2.2e-4 + 1.4e-6 * reads)
         count = self.options.measure.bank.count
@@ -253,7 +267,7 @@ class _Probe:
 
     def _line_stereo(self, add: Callable[[str, float, float, float], None]) -> None:
         cameras, lights, hair = len(self.cameras), self.lights, self.hair
-        measured = self.frames("olat") * self.read
+        measured = self.frames("olat") * self.again
         gb = self.pixels * (18 * lights + 400) / GB
         add("lightcodes", measured, 6e-7 * cameras * lights * self.pixels, gb)
         near = min(self.options.light_codes.search.neighbours, max(cameras // 2, 1))

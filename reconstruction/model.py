@@ -259,6 +259,11 @@ class Model:
 
     def _needed(self, name: str, command: str) -> Path:
         path = self.file(name)
+        if not path.exists() and (self.path / "rig.json").exists():
+            raise ModelError(
+                f"{self.path} is a capture, no model: run 'hairstage reconstruct {self.path} --out "
+                "MODEL' first"
+            )
         if not path.exists():
             raise ModelError(f"{path} is missing: run '{command} {self.path}' first")
         return path

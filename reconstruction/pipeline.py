@@ -13,6 +13,7 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.kept_frames import frames_kept
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
@@ -74,9 +75,19 @@ def reconstruct(
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
     stages = _Stages(model.create(), options, progress, Report())
+    with frames_kept(capture, model.path) as kept:
+        _run(stages, kept, method, motion)
+    if not any(stage.name == "head" for stage in stages.report.stages):
+        model.remove("head.obj")  # an earlier reconstruction's: this one has the capture's, or none
+    model.write_report(stages.report)
+    return stages.report
+
+
+def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | None) -> None:
+    """The stages of `method`, as `reconstruct` says."""
     stages.imported(capture)
     whole = stages.undistorted(capture)
-    capture = _without(whole, options.held_out)
+    capture = _without(whole, stages.options.held_out)
     head = stages.known_head(capture)
     if method == "auto":
         method = stages.chosen(capture, head)
@@ -100,10 +111,6 @@ def reconstruct(
         grown = stages.grown(field, scalp, seen)
         grown = stages.refined(grown, measured, cloud)
         stages.rooted(grown, measured, scalp, head.scalp_map)
-    if not any(stage.name == "head" for stage in stages.report.stages):
-        model.remove("head.obj")  # an earlier reconstruction's: this one has the capture's, or none
-    model.write_report(stages.report)
-    return stages.report
 
 
 def method_for(capture: Capture) -> Method:

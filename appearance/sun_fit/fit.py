@@ -124,6 +124,12 @@ def fit(
         stage.figures["sigma_a_error"] = list(known.sigma_a)
         for warning in known.warnings(colours.hair.sigma_a):
             stage.warn(warning)
+        if capture.plan.get("import", {}).get("relative"):
+            stage.warn(
+                "the pictures are in relative units: how dark the hair is follows their "
+                "brightness; import them with a grey ball, or with `scale` and the lights' "
+                "intensities, to know it"
+            )
     v = float(variance_of_roughness(found.beta_m))
     made = (colours.hair, colours.colour, colours.skin, exposure)
     model.forget_appearance()

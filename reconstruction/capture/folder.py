@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig
 from reconstruction.reading import parse_json, read_json
+
+if TYPE_CHECKING:
+    from reconstruction.capture.kept_frames import KeptFrames
 
 T = TypeVar("T")
 StepKind = Literal["dark", "all_on", "olat", "scanline", "tracking"]
@@ -118,7 +121,10 @@ class Capture:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if not (self.path / "rig.json").is_file() or not (self.path / "plan.json").is_file():
-            raise CaptureError(f"{self.path} is not a capture: expected rig.json and plan.json")
+            raise CaptureError(
+                f"{self.path} is not a capture: expected rig.json and plan.json; of a folder of "
+                "photographs 'hairstage import' makes one"
+            )
         try:
             self.rig = Rig.load(self._own("rig.json"))
             self.plan: dict[str, Any] = _object(self._own("plan.json"))
@@ -131,6 +137,7 @@ class Capture:
         self._shot = {c.name: c for c in self.rig.cameras}
         self._lenses: dict[str, Lens] = {}
         self._by = 1
+        self._kept: KeptFrames | None = None
 
     def view(
         self,
@@ -234,13 +241,27 @@ class Capture:
         record = self.records.get((step.index, camera))
         return record is not None and record.file is not None
 
+    @property
+    def reduced_by(self) -> int:
+        """Pixels on disk that one of this view stands for, along a side."""
+        return self._by
+
+    def keeping(self, kept: KeptFrames) -> Capture:
+        """This view, of which frames under single lights, once read, are in `kept`."""
+        out = copy.copy(self)
+        out._kept = kept
+        return out
+
     def frame(self, step: Step, camera: str) -> Floats:
         """Scene-linear radiance `(H, W, 3)`, W/(sr m²), as exposed: at the step's light level.
 
         Noise may push dark pixels below zero. Raises `MissingFrame`.
         """
-        image, lens = self._read(step, camera)[0], self._lenses.get(camera)
-        image = block_means(image, self._by)
+        lens = self._lenses.get(camera)
+        if self._kept is not None and step.kind == "olat" and step.level in (0, 1):
+            image = self._means(step, camera)[0]
+        else:
+            image = block_means(self._read(step, camera)[0], self._by)
         return image if lens is None else lens.undistort(image)
 
     def response(self, step: Step, camera: str) -> Floats:
@@ -254,18 +275,28 @@ class Capture:
 
     def response_and_saturated(self, step: Step, camera: str) -> tuple[Floats, Bools]:
         """`response (H, W, 3)` and `saturated (H, W)` of one frame, read once."""
+        lens = self._lenses.get(camera)
+        image, saturated = self._means(step, camera)
+        if lens is None:
+            return image, saturated
+        return lens.undistort(image), lens.undistort_any(saturated)
+
+    def _means(self, step: Step, camera: str) -> tuple[Floats, Bools]:
+        """`response_and_saturated` through the lens."""
+        if self._kept is not None and step.kind == "olat":
+            return self._kept.get(step.index, camera, lambda: self._made(step, camera))
+        return self._made(step, camera)
+
+    def _made(self, step: Step, camera: str) -> tuple[Floats, Bools]:
         image, attributes = self._read(step, camera)
         full = np.float32(float(attributes.get("fullScale", np.inf)) * (1 - 1e-5))
         # an eighth of the time that any(axis=-1) takes, half of all that a frame costs
         red, green, blue = (image[..., channel] >= full for channel in range(3))
         saturated = red | green | blue
         image = image if step.level in (0, 1) else image / np.float32(step.level)
-        lens = self._lenses.get(camera)
-        if self._by > 1:
-            image, saturated = block_means(image, self._by), block_any(saturated, self._by)
-        if lens is None:
+        if self._by == 1:
             return image, saturated
-        return lens.undistort(image), lens.undistort_any(saturated)
+        return block_means(image, self._by), block_any(saturated, self._by)
 
     def count_scale(self, step: Step, camera: str) -> float:
         """Radiance of one count of the sensor in this frame; 0 where it was not quantised."""

@@ -175,15 +175,15 @@ class Import:
         }
 
     def said(self) -> list[str]:
-        """`counts`, and the sizes and first files of each camera, in lines for a person."""
-        lines = []
-        for what, count in self.counts().items():
-            text = (
-                ", ".join(f"{k}: {n}" for k, n in count.items())
-                if isinstance(count, dict)
-                else count
-            )
-            lines.append(f"{what.replace('_', ' ')}: {text}")
+        """`counts` where there is any, and the sizes and first files of each camera, for people."""
+        counts = self.counts()
+        relative, brackets = counts.pop("relative"), counts.pop("exposures_per_frame")
+        counts["steps"] = ", ".join(f"{n} {kind}" for kind, n in counts["steps"].items())
+        lines = [f"{what.replace('_', ' ')}: {n}" for what, n in counts.items() if n]
+        if set(brackets) != {1}:
+            told = ", ".join(f"{k} of {n} frames" for k, n in brackets.items())
+            lines.append(f"exposures merged: {told}")
+        lines.append(f"units: {'relative' if relative else 'W/(sr m²)'}")
         for name, camera in self.shot.items():
             frames = [b for (_, c), b in self.found.frames.items() if c == name]
             first = (

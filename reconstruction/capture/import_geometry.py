@@ -92,6 +92,10 @@ def read_geometry(files: GeometryFiles) -> Geometry:
         read = read_cameras(files.cameras)
         cameras = placed(read.cameras, files.placement, read.axes)
         notes += read.notes
+        if read.unitless:
+            unit = files.placement.unit
+            length = unit if isinstance(unit, str) else f"{unit:g} m"
+            notes.append(f"{files.cameras} has no unit of its own: taken as {length} (--unit)")
         try:
             notes += check_cameras(cameras, files.placement, read.axes)
         except PlacementError as error:

@@ -209,7 +209,10 @@ def _notes(
     if left:
         out.append(f"{len(left)} pictures match no pattern: {_few(left)}")
     if settings.units is None and settings.grey_ball is None and suffixes - {".exr"}:
-        out.append("relative units: no `scale` says what a full channel is in W/(sr m²)")
+        out.append(
+            "relative units: no `scale` says what a full channel is in W/(sr m²): how dark the "
+            "hair is, against its light, is not known until a grey ball in view says it"
+        )
     return out
 
 

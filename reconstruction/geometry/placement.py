@@ -186,8 +186,16 @@ def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: st
         scaled = {n: distance * m / metres(options.unit) for n, m in METRES.items()}
         text = f"the cameras stand {_length(distance)} from what they look at"
         raise PlacementError(text + _right_unit(scaled, "--unit"))
-    if options.up is None:
-        notes += _check_up(cameras)
+    try:
+        unsure = _check_up(cameras)
+        notes += unsure if options.up is None else []
+    except PlacementError:
+        if options.up is None:
+            raise
+        notes.append(
+            f"--up {options.up} is believed, though the cameras then lie on their side or stand on "
+            "their heads"
+        )
     width = float(
         np.median([d * c.width / c.K[0, 0] for c, d in zip(cameras, sight.distance, strict=True)])
     )

@@ -307,7 +307,7 @@ def _pictures(model: Model) -> Html:
     figures = [
         element(
             "figure",
-            link(path, element("img", src=path, alt=text, loading="lazy")),
+            link(path, element("img", src=path, alt=text)),
             element("figcaption", element("b", path), " ", text),
         )
         for path, text in SHOWN.items()

@@ -81,6 +81,9 @@ def test_a_missing_file_is_named_with_the_command_that_makes_it(
     with pytest.raises(KeyError, match=r"no file 'strand\.npz'; there are .*strands\.npz"):
         model.file("strand.npz")
     assert model.report() == Report()
+    (model.path / "rig.json").write_text("{}")
+    with pytest.raises(ModelError, match=r"is a capture, no model: run 'hairstage reconstruct .*'"):
+        model.strands()
 
 
 def test_masks_fall_back_to_the_users(model: Model, shoot: Callable[..., Capture]) -> None:

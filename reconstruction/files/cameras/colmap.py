@@ -74,7 +74,7 @@ def read_colmap(folder: Path) -> CameraFile:
         lens = lenses[image.camera]
         R = Rotation.from_quat(np.roll(image.quaternion, -1)).as_matrix()
         cameras.append(camera_of(image.where, name, lens.size, lens.K, (R, image.t), lens.lens))
-    return CameraFile(cameras, ["a COLMAP model has no unit of its own"])
+    return CameraFile(cameras, unitless=True)
 
 
 def _intrinsics(where: str, model: str, size: tuple[int, int], params: list[float]) -> _Intrinsics:

@@ -27,14 +27,15 @@ class CameraFileError(ValueError):
 class CameraFile:
     """Cameras as a file has them, in its own units and axes of the world; `notes` for its user.
 
-    `metres` is the length of its unit where the file says so, else None. `axes` are those in which
-    it was read to give its cameras' poses.
+    `metres` is the length of its unit where the file says so, else None; `unitless` where its kind
+    has none of its own. `axes` are those in which it was read to give its cameras' poses.
     """
 
     cameras: list[Camera]
     notes: list[str] = field(default_factory=list)
     metres: float | None = None
     axes: CameraAxes = "opencv"
+    unitless: bool = False
 
 
 def camera_names(pictures: Sequence[str], where: str) -> list[str]:

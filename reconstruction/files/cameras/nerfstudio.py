@@ -61,7 +61,7 @@ def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
         _camera(path, name, groups[key][0], *found[key])
         for key, name in zip(found, names, strict=True)
     ]
-    return CameraFile(cameras, ["transforms.json has no unit of its own"], axes="opengl")
+    return CameraFile(cameras, axes="opengl", unitless=True)
 
 
 def _shared(pictures: list[str]) -> str:

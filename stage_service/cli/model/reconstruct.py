@@ -107,10 +107,11 @@ def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:
     lines += [
         f"{s.name:<14}{s.seconds:9.0f}{s.peak_gb:8.1f} GB{s.measured:8.0%}" for s in found.stages
     ]
+    meanwhile = f", and {found.working_gb:.1f} GB more meanwhile" if found.working_gb else ""
     lines.append(
         f"{_duration(found.seconds)} in all, {found.peak_gb:.1f} GB of this machine's "
         f"{machine_gb:.0f}; {found.frames:,} frames are read, the model takes {found.disk_gb:.1f} "
-        "GB of disk. A third more or less is usual, where nothing else runs."
+        f"GB of disk{meanwhile}. A third more or less is usual, where nothing else runs."
     )
     data = {"reduced": by, "method": found.method, **asdict(found), "seconds": found.seconds}
     if found.peak_gb > MEMORY_SHARE * machine_gb:

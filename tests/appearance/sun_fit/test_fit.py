@@ -59,9 +59,8 @@ def made(tmp_path_factory):
     rig = Rig("board", cameras, tuple(lights))
     scene = build_scene(strands, head, hair=TRUTH, skin=SKIN)
     steps = [Step(i, "olat", 0.02, level=0.5, light=x.name) for i, x in enumerate(lights)]
-    writer = CaptureWriter.create(
-        folder / "capture", rig, {"steps": [s.to_dict() for s in steps]}, head=head
-    )
+    plan = {"steps": [s.to_dict() for s in steps], "import": {"relative": True, "notes": []}}
+    writer = CaptureWriter.create(folder / "capture", rig, plan, head=head)
     model = Model(folder / "model").create()
     model.write_strands(strands)
     for camera in cameras:
@@ -100,6 +99,7 @@ def test_fit_reports_what_it_did(made, fitted):
     dark = [x for x in samples.left_out if "reach no hair" in x.why]
     assert len(dark) == 1
     assert "dark" in dark[0].what
+    assert sum("relative units" in w for w in report["colour"].warnings) == 1
     errors = [e for _, e in report["colour"].series[0].points]
     assert min(errors) < 0.05
     assert len(report["roughness"].series[0].points) == 2

@@ -20,6 +20,7 @@ NOISE = 0.002  # of a fully lit pixel
 HAIR, SKIN = (0.35, 0.2, 0.1), (0.45, 0.31, 0.25)
 AMBIENT = 0.3  # of a pixel's light that no surface takes away
 LOBE = 0.2  # width of the highlight, in sines
+BLOCK = 1 << 14  # pixels that are painted together: they stay in the cache
 SHIFTS = 64  # pixels by which the noise differs from frame to frame
 
 
@@ -75,7 +76,10 @@ class PaintedCapture(Capture):
             share = projector.row_weight(step.row, rows[first:last]).astype(np.float32)
             flat[seen.at[lit]] += share[:, None] * seen.answers(projector.center, lit)
         elif step.kind == "olat" and step.light is not None:
-            flat[seen.at] += seen.answers(self.rig.light(step.light).position, slice(None))
+            position = self.rig.light(step.light).position
+            for begin in range(0, len(seen.at), BLOCK):
+                part = slice(begin, begin + BLOCK)
+                flat[seen.at[part]] += seen.answers(position, part)
         elif step.kind == "all_on":
             flat[seen.at] += seen.colour
         return out, {}

@@ -188,7 +188,9 @@ def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
     files = GeometryFiles(
         cameras=sparse, lights=folder / "lights.json", light_distance=1.5, placement=where
     )
-    capture = import_folder(folder, tmp_path / "out", geometry=read_geometry(files))
+    geometry = read_geometry(files)
+    assert f"{sparse} has no unit of its own: taken as mm (--unit)" in geometry.notes
+    capture = import_folder(folder, tmp_path / "out", geometry=geometry)
     first, left = capture.rig.cameras
     assert [first.name, left.name] == list(CAMERAS)
     np.testing.assert_allclose(first.K, [[50, 0, 3.5], [0, 50, 2.5], [0, 0, 1]])

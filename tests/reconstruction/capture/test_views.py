@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from reconstruction import Camera, Capture, CaptureError, Model
+from reconstruction import Camera, Capture, CaptureError, Light, Model, Step
+from reconstruction.arrays import Floats
+from reconstruction.capture.kept_frames import frames_kept, kept_bytes
 from reconstruction.geometry.blocks import block_means
 from reconstruction.geometry.lens import Lens
 from reconstruction.images.silhouettes import silhouette
@@ -195,3 +199,43 @@ def test_a_view_is_a_part_and_leaves_the_whole_alone(bent: Capture) -> None:
     assert bent.olat_lights() == lights
     with pytest.raises(CaptureError, match=r"no camera \['middle'\]"):
         bent.view(cameras=["middle"])
+
+
+def test_reduced_frames_of_single_lights_are_read_once(
+    shoot: Callable[..., Capture], bent: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kept, they are the same numbers; nothing is left behind, also of what was killed."""
+    lights = [Light(f"l{i}", np.array([i, -1.0, 0.5]), np.ones(3)) for i in range(2)]
+    capture = shoot(cameras=bent.rig.cameras, lights=lights, sweep=False)
+    capture = capture.view(undistorted=True, reduced=3)
+    files: list[Path] = []
+    plain = Capture._read
+
+    def counted(self: Capture, step: Step, camera: str) -> tuple[Floats, dict[str, float | str]]:
+        files.append(self._file(step, camera))
+        image, attributes = plain(self, step, camera)
+        top = float(image.max()) + 1
+        image[:40, :40] = top  # saturated
+        return image, attributes | {"fullScale": top}
+
+    monkeypatch.setattr(Capture, "_read", counted)
+    (tmp_path / "frames-killed").mkdir()
+    with frames_kept(capture, tmp_path) as kept:
+        assert [path.name for path in tmp_path.iterdir()] != ["frames-killed"]
+        assert kept_bytes(capture.view(undistorted=False)) == 13 * 4 * 26 * 26
+        for step in (*capture.of_kind("olat"), *capture.of_kind("dark")):
+            for camera in capture.rig.cameras:
+                image, saturated = capture.response_and_saturated(step, camera.name)
+                assert 0 < saturated.mean() < 1
+                files.clear()
+                for _ in range(2):
+                    again = kept.response_and_saturated(step, camera.name)
+                    np.testing.assert_array_equal(again[0], image)
+                    np.testing.assert_array_equal(again[1], saturated)
+                    np.testing.assert_array_equal(kept.frame(step, camera.name), image)
+                assert len(files) == (1 if step.kind == "olat" else 4)
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    for view in (bent, capture):
+        with frames_kept(view, tmp_path) as kept:
+            assert kept is view

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,14 @@ def test_points_without_normals_are_read(tmp_path: Path) -> None:
     assert normals is None
 
 
+def npy(shape: tuple[int, int]) -> bytes:
+    """Twelve numbers under a header of `shape`."""
+    file = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + bytes(8 * 12)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -83,6 +92,8 @@ def test_points_without_normals_are_read(tmp_path: Path) -> None:
         ("a.ply", ply("ascii").replace(b" z", b" w"), "expected x, y and z"),
         ("a.ply", ply("ascii").replace(b"ascii", b"gzip"), "format 'gzip'"),
         ("a.npy", b"no array", r"a\.npy: "),
+        ("a.npy", npy((4, 3))[:-8], "claims more numbers than it has"),
+        ("a.npy", npy((450_000_000, 3)), "claims more numbers than it has"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, name: str, content: bytes, words: str) -> None:

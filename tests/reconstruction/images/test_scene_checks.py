@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from reconstruction import Camera
+from reconstruction import Camera, Capture, CaptureWriter, Light, Rig, Step
 from reconstruction.geometry.lights import dome_positions
-from reconstruction.images.scene_checks import check_light_axes, check_silhouettes, odd_lights
+from reconstruction.images.scene_checks import (
+    check_light_axes,
+    check_scene,
+    check_silhouettes,
+    odd_lights,
+)
 
 BALLS = (([0, 0, 0], 0.1), ([0.09, 0.02, 0.05], 0.05), ([-0.03, 0.1, -0.06], 0.06))
 """A lumpy subject: centres and radii."""
@@ -88,6 +95,13 @@ def test_lights_with_each_others_pictures_are_found(lit) -> None:
     assert abs(found[7] - angle) < 15
 
 
+def test_one_light_that_stands_elsewhere_is_found(lit) -> None:
+    pictures, places, _ = lit
+    wrong = places.copy()
+    wrong[41] = places[np.argmin(places @ places[41])]  # across the stage, where another one is
+    assert list(odd_lights(pictures, wrong)) == [41]
+
+
 @pytest.mark.parametrize(
     ("axes", "signs", "named"),
     [
@@ -106,3 +120,34 @@ def test_lights_in_another_world_than_the_cameras_are_told(lit, axes, signs, nam
 def test_pictures_that_show_nothing_say_nothing() -> None:
     places = dome_positions(30, 1.5)
     assert check_light_axes(np.full((30, 2, 9), 3.0), places, np.eye(3)[:2]) == []
+
+
+def test_a_whole_capture_is_held_against_its_pictures(tmp_path: Path) -> None:
+    """As `hairstage import` does it, from frames on disk; only what is said of them changes."""
+    stage, places = cameras(), dome_positions(36, 1.5)
+    lights = tuple(Light(f"l{i:02d}", p, np.ones(3)) for i, p in enumerate(places))
+    steps = [Step(k, "olat", 0.01, light=light.name) for k, light in enumerate(lights)]
+    rig = Rig("lumps", tuple(stage), lights)
+    writer = CaptureWriter.create(tmp_path / "capture", rig, {"steps": steps})
+    for camera in stage:
+        depth, normal = hits(camera)
+        for step, place in zip(steps, places, strict=True):
+            shade = np.maximum(normal @ (place / 1.5), 0) * np.isfinite(depth)
+            frame = np.repeat((shade + 1e-3 * RNG.normal(size=shade.shape))[..., None], 3, 2)
+            writer.write_frame(step, camera.name, frame.astype(np.float32))
+    writer.finish("completed")
+
+    def said(rig: Rig) -> list[str]:
+        (tmp_path / "capture" / "rig.json").write_text(json.dumps(rig.to_dict()))
+        return check_scene(Capture(tmp_path / "capture"))
+
+    assert said(rig) == []
+    swapped = [*stage]
+    swapped[3] = replace(stage[5], name="cam_3")
+    swapped[5] = replace(stage[3], name="cam_5")
+    (found,) = said(replace(rig, cameras=tuple(swapped)))
+    assert found.startswith("cam_3 and cam_5: their pictures, or their poses")
+    wrong = [*lights]
+    wrong[20] = replace(lights[20], position=places[np.argmin(places @ places[20])])
+    (found,) = said(replace(rig, lights=tuple(wrong)))
+    assert found.startswith("l20: under it the subject looks as under lights")

@@ -245,6 +245,7 @@ def test_reconstruct_tells_what_it_would_take(capsys, tmp_path):
     assert (data["reduced"], data["method"], data["frames"]) == (2, "hull", 4)
     assert data["seconds"] == pytest.approx(sum(s["seconds"] for s in data["stages"]))
     assert data["peak_gb"] == max(s["peak_gb"] for s in data["stages"])
+    assert data["working_gb"] == pytest.approx(4 * 20 * 15 * 13e-9)
     assert main(["reconstruct", str(tmp_path / "c"), "--estimate"]) == 0
     assert "orientation" in capsys.readouterr().out
     assert sorted(tmp_path.rglob("*")) == before
