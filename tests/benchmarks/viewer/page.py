@@ -114,8 +114,8 @@ AT_REST = """async ([size, least, ambient]) => {
     const { picture, canvas, relight, gl } = viewer, before = relight.ambient;
     canvas.width = canvas.height = size;
     relight.ambient = ambient ?? before;
-    picture.samples = 0;
-    picture.sample = null;
+    await relight.inView(picture.ofModel(viewer.view));
+    picture.again();
     const enough = Math.ceil(least / picture.cycle()) * picture.cycle();
     while (picture.samples < enough) {
         for (const _ of picture.oneSample(viewer.view)) gl.finish();
