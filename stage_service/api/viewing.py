@@ -194,8 +194,8 @@ def post_indirect(model: OnModel, body: Light) -> Response:
 @reading.post("/{name}/indirect/view", **BYTES)
 def post_indirect_in_view(model: OnModel, body: LightInView) -> Response:
     """Light between fibres under these lights as one view sees it: of hair, then of the head, for
-    each pixel its radiance (RGB) times the share that it covers, and that share; float32. Paths are
-    traced for seconds."""
+    each pixel its radiance (RGB) times the share that it covers, and that share, a fiftieth of both
+    in pixels of the other; float32. Paths are traced for seconds."""
     return _bytes(model.lighting.indirect_in_view(body.view.camera(), dict(body.weights)))
 
 

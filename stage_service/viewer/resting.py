@@ -14,6 +14,9 @@ from reconstruction import Camera, Light
 from reconstruction.arrays import Array, Floats
 from reconstruction.options import Count, options
 
+_OTHER = 0.02
+"""What a pixel of the head weighs for hair, and one of hair for the head."""
+
 
 @options
 class RestOptions:
@@ -33,8 +36,10 @@ def indirect_in_view(
 ) -> Floats:
     """What `camera` sees of light that met the subject before, under `lights` at their weight (3,).
 
-    Returns `(2, H, W, 4)`, for pixels of hair and of head: radiance averaged over `SIGMA` pixels
-    times the share of the pixel that it covers, and that share; 0 in pixels of the other.
+    Returns `(2, H, W, 4)`, for hair and for head: radiance averaged over `SIGMA` pixels times
+    a weight, and that weight: the share of the pixel that hair or head covers. What pixels of the
+    other have weighs little, and counts where there is nothing else: a strand before the face is
+    lit as the face is.
     """
     share = coverage(scene, camera)
     is_hair = share["hair"] >= share["head"]
@@ -48,6 +53,7 @@ def indirect_in_view(
     weights = np.array([weight for _, weight in lights], np.float32)
     light = np.einsum("lpc,lc->pc", olat, weights)
     smooth = smoothed(spread_out(light[None], index, camera), share, SIGMA)[0]
-    for part, kind, mask in zip(out, ("hair", "head"), (is_hair, ~is_hair), strict=True):
-        part[mask, :3], part[mask, 3] = smooth[mask], share[kind][mask]
+    for k, (kind, mask) in enumerate((("hair", is_hair), ("head", ~is_hair))):
+        own = np.dstack([smooth, share[kind]])[mask]
+        out[k][mask], out[1 - k][mask] = own, _OTHER * own
     return out

@@ -295,12 +295,12 @@ bool hidden(vec3 p, uint mine, float slack) {
 `;
 
 // Light between fibres, traced for the view of this picture: radiance times the share of the pixel
-// that is hair (or head), and that share; what it does not know is looked up in the grid.
+// that is hair (or head), and that share, little of the other; what it does not know is looked up in the grid.
 const IN_VIEW = `
 uniform vec2 uPart;  // pixels that the view is drawn on
 vec3 between(sampler2D traced, vec3 p) {
   vec4 found = texture(traced, vec2(gl_FragCoord.x, uPart.y - gl_FragCoord.y) / uPart);
-  return found.a > 0.02 && gl_FragCoord.x < uPart.x ? uAmbient * found.rgb / found.a : indirect(p);
+  return found.a > 1e-3 && gl_FragCoord.x < uPart.x ? uAmbient * found.rgb / found.a : indirect(p);
 }
 `;
 
