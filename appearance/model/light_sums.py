@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from appearance.render.environment_maps import check_environment
 from reconstruction import Camera, Capture, Light
-from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.geometry.blocks import block_means
 
 MEMORY = 1 << 30
@@ -95,7 +95,36 @@ def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple
     The brightest are taken apart first: each group, of the lights nearest to one of those chosen,
     has the irradiance of its members and stands where its brightest one is.
     """
+    power, own = weights * irradiance(lights), irradiance(lights)
+    return [
+        (chosen, power[members].sum(axis=0) / np.maximum(own[chosen], 1e-12))
+        for chosen, members in _groups(lights, power, most)
+    ]
+
+
+def lights_in_turn(
+    lights: Sequence[Light], weights: Array, most: int, turns: int
+) -> list[list[tuple[int, Array]]]:
+    """Of each group of `few_lights` which member, at which weight, stands for it in each turn.
+
+    A member has its turn as often as it is bright; the mean over many turns is all of the lights
+    at their own places. A group of one has one turn.
+    """
     power = weights * irradiance(lights)
+    unit = np.array([x.position / np.linalg.norm(x.position) for x in lights])
+    out = []
+    for chosen, members in _groups(lights, power, most):
+        bright = power[members].sum(axis=1)
+        order = (unit[members] @ unit[chosen]).argsort()  # those that follow each other lie apart
+        share = bright[order] / bright.sum()
+        places = [_radical_inverse(t + 1) for t in range(turns if len(members) > 1 else 1)]
+        picks = np.minimum(np.searchsorted(share.cumsum(), places), len(members) - 1)
+        out.append([(int(members[order[p]]), weights[members[order[p]]] / share[p]) for p in picks])
+    return out
+
+
+def _groups(lights: Sequence[Light], power: Array, most: int) -> list[tuple[int, Ints]]:
+    """The brightest and all numbers of each group of `few_lights`, of irradiance `power (L, 3)`."""
     bright = power.sum(axis=1)
     lit = np.flatnonzero(bright > 0)
     if len(lit) == 0:
@@ -110,8 +139,9 @@ def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple
             break
         chosen.append(int(cost.argmax()))
     group = (unit @ unit[chosen].T).argmax(axis=1)
-    own = irradiance(lights)
-    return [
-        (int(lit[c]), power[lit[group == k]].sum(axis=0) / np.maximum(own[lit[c]], 1e-12))
-        for k, c in enumerate(chosen)
-    ]
+    return [(int(lit[c]), lit[group == k]) for k, c in enumerate(chosen)]
+
+
+def _radical_inverse(i: int) -> float:
+    """Van der Corput's sequence: the binary digits of `i` behind the point, mirrored."""
+    return int(f"{i:b}"[::-1], 2) / (1 << i.bit_length())

@@ -6,14 +6,17 @@ import mimetypes
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
+from reconstruction import Camera
 from stage_service.api.downloads import file_response
 from stage_service.api.gate import VIEW, VIEW_PAGE
 from stage_service.api.steering import READS
-from stage_service.viewer import NothingToView, Viewed, Viewing
+from stage_service.viewer import BadLight, NothingToView, Viewed, Viewing
+from stage_service.viewer.viewed import MOST_PIXELS
 
 FILES = Path(__file__).parents[1] / "viewer" / "page"
 POLICY = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'"
@@ -38,6 +41,38 @@ class Light(BaseModel):
 
     weights: dict[Annotated[int, Field(ge=0, le=100_000)], Colour] = {}
     exposure: Annotated[float, Field(gt=0, le=1e9)] = 1.0
+
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
+
+
+class View(BaseModel):
+    """A pinhole camera: pixels, intrinsics, and world to camera (x right, y down, z forward)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    width: Annotated[int, Field(ge=1, le=MOST_PIXELS)]
+    height: Annotated[int, Field(ge=1, le=MOST_PIXELS)]
+    K: Matrix
+    R: Matrix
+    t: Vector
+
+    def camera(self) -> Camera:
+        """Raises `BadLight` where it cannot be one."""
+        if self.width * self.height > MOST_PIXELS:
+            raise BadLight(f"a view may have {MOST_PIXELS} pixels, not {self.width * self.height}")
+        try:
+            lens, turned, moved = (np.array(x) for x in (self.K, self.R, self.t))
+            return Camera("view", self.width, self.height, lens, turned, moved)
+        except ValueError as error:
+            raise BadLight(str(error)) from error
+
+
+class LightInView(Light):
+    """Light, and from where it is looked at."""
+
+    view: View
 
 
 page = APIRouter(include_in_schema=False)
@@ -154,6 +189,14 @@ def post_indirect(model: OnModel, body: Light) -> Response:
     coefficients (RGB, float32) of harmonics over the direction in which it leaves. Paths are traced
     when it is first asked for, which takes many seconds."""
     return _bytes(model.lighting.indirect(dict(body.weights)))
+
+
+@reading.post("/{name}/indirect/view", **BYTES)
+def post_indirect_in_view(model: OnModel, body: LightInView) -> Response:
+    """Light between fibres under these lights as one view sees it: of hair, then of the head, for
+    each pixel its radiance (RGB) times the share that it covers, and that share, a fiftieth of both
+    in pixels of the other; float32. Paths are traced for seconds."""
+    return _bytes(model.lighting.indirect_in_view(body.view.camera(), dict(body.weights)))
 
 
 @reading.post("/{name}/sums/{camera}.png", **PNG)

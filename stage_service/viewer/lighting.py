@@ -15,19 +15,29 @@ import numpy as np
 from appearance import Exposure, FittedModel
 from appearance.bsdf.far_field import azimuthal_table
 from appearance.bsdf.lobes import logistic_scale, variances
-from appearance.model.light_sums import LightSums, few_lights, weights_of_environment
+from appearance.model.light_sums import (
+    LightSums,
+    few_lights,
+    lights_in_turn,
+    weights_of_environment,
+)
 from appearance.model.relight import PROCEDURAL
 from appearance.render.environment_maps import load_environment
 from appearance.render.visibility import above_faces, reached, within_fibres
-from reconstruction import Capture, Light, Model
+from reconstruction import Camera, Capture, Light, Model
 from reconstruction.arrays import Array
 from reconstruction.geometry.lights import dome_positions
 from stage_service.viewer.indirect import BakeOptions, IndirectLight, bake
 from stage_service.viewer.packing import PackedStrands
+from stage_service.viewer.resting import RestOptions, indirect_in_view
 from stage_service.viewer.viewed import BadLight
 
 MOST_LIGHTS = 8
 """Lights that the shader adds up."""
+LIGHTS_AT_REST = 32
+"""Lights that light between fibres is traced for, in one view."""
+TURNS_OF_A_LIGHT = 8
+"""Lights of the rig that stand for one of these by turns, at rest."""
 COSINES, TURNS = 24, 96
 KEPT_LIGHTS = 48
 """Lights whose shadows are kept: a byte for each point of the strands and of the head."""
@@ -40,7 +50,8 @@ class Lighting:
 
     def __init__(self, model: Model, capture: Capture | None, packed: PackedStrands) -> None:
         self._model, self._capture, self._packed = model, capture, packed
-        self._lock, self._baking = threading.RLock(), threading.Lock()
+        self._lock = threading.RLock()
+        self._baking, self._resting = threading.Lock(), threading.Lock()
         self._seen: OrderedDict[int, bytes] = OrderedDict()
         self._sums: tuple[str, LightSums] | None = None
 
@@ -98,16 +109,23 @@ class Lighting:
         return np.pad(values, ((0, 0),) * 3 + ((0, 1),)).astype("<f4").tobytes()
 
     def few(self, weights: dict[int, list[float]]) -> list[dict[str, Any]]:
-        """The few lights that the shader is to have for all of `weights` (number: RGB)."""
-        chosen = few_lights(self.lights, self._full(weights), MOST_LIGHTS)
+        """The few lights that the shader is to have for all of `weights` (number: RGB), and which
+        ones stand for each of them in `turns`, at rest."""
+        full = self._full(weights)
+        chosen = few_lights(self.lights, full, MOST_LIGHTS)
+        turns = lights_in_turn(self.lights, full, MOST_LIGHTS, TURNS_OF_A_LIGHT)
         return [
-            {
-                "number": i,
-                "position": self.lights[i].position.tolist(),
-                "intensity": (w * self.lights[i].intensity_towards(np.zeros(3))).tolist(),
-            }
-            for i, w in chosen
+            {**self._placed(i, w), "turns": [self._placed(*x) for x in some]}
+            for (i, w), some in zip(chosen, turns, strict=True)
         ]
+
+    def _placed(self, number: int, weight: Array) -> dict[str, Any]:
+        light = self.lights[number]
+        return {
+            "number": number,
+            "position": light.position.tolist(),
+            "intensity": (weight * light.intensity_towards(np.zeros(3))).tolist(),
+        }
 
     def _full(self, weights: dict[int, list[float]]) -> Array:
         full = np.zeros((len(self.lights), 3))
@@ -139,6 +157,15 @@ class Lighting:
         power = np.array([x.intensity_towards(np.zeros(3)) for x in self.lights])
         lit = baked.lit(places, full * power / (places**2).sum(axis=1, keepdims=True))
         return lit.astype("<f4").tobytes()
+
+    def indirect_in_view(self, camera: Camera, weights: dict[int, list[float]]) -> bytes:
+        """The same as `camera` sees it: `indirect_in_view`, float32. Traces paths for seconds."""
+        chosen = few_lights(self.lights, self._full(weights), LIGHTS_AT_REST)
+        with self._resting:
+            found = indirect_in_view(
+                self._scene, camera, [(self.lights[i], w) for i, w in chosen], RestOptions()
+            )
+        return found.astype("<f4").tobytes()
 
     def seen(self, number: int) -> bytes:
         """Whether light `number` reaches each point `(S, n)`, then each vertex of the head: uint8.

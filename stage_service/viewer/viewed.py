@@ -20,6 +20,10 @@ FAR = 5e-3
 """Metres to the nearest measured point beyond which a strand's point counts as not measured."""
 
 
+MOST_PIXELS = 100_000
+"""That a view may have which light is traced for."""
+
+
 class NothingToView(LookupError):
     """The model, the capture or the part of it is not there; the message says what to do."""
 

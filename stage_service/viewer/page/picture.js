@@ -61,8 +61,7 @@ export class Picture {
 
   // Draw one frame in motion: lines of a pixel, straight to the page.
   moving(view) {
-    this.samples = 0;
-    this.sample = null;
+    this.again();
     this.frames++;
     for (const _ of this.scene(view, { linear: 0, ribbon: 0, shift: [0, 0], film: null }));
     this.mark();
@@ -77,12 +76,19 @@ export class Picture {
     return true;
   }
 
+  // The samples that there are show what is no more.
+  again() {
+    this.samples = 0;
+    this.sample = null;
+  }
+
   // Samples until every light has had its turn.
   cycle() { return TURN * ((this.lit() && this.lighting.lights.length) || 1); }
 
   enough() {
     const cycle = this.cycle();
-    return cycle * Math.max(Math.ceil(SAMPLES / cycle), LEAST_TURNS);
+    const turns = Math.max(LEAST_TURNS, this.lit() ? this.lighting.turns() : 0);
+    return cycle * Math.max(Math.ceil(SAMPLES / cycle), turns);
   }
 
   *oneSample(view) {
@@ -92,7 +98,8 @@ export class Picture {
     const shift = [radical(round, 2) - 0.5, radical(round, 3) - 0.5];
     const lit = this.lit() && this.lighting.lights.length > 0;
     if (lit && within === 0)
-      this.cast = yield* this.castShadow(Math.floor(this.samples % cycle / TURN), turn + 1);
+      this.cast = yield* this.castShadow(
+        this.lighting.inTurn(Math.floor(this.samples % cycle / TURN), turn), turn + 1);
     const light = lit ? this.cast : null;
     const film = this.film.sized(width, height).frame;
     yield* this.scene(view, { linear: 1, ribbon: this.state.width, shift, film, light });
@@ -111,10 +118,10 @@ export class Picture {
   }
 
   // What one light sees first, drawn; the uniforms to shade by it, as bright as all together.
-  *castShadow(number, round) {
+  *castShadow(from, round) {
     const gl = this.gl, hair = this.sets.model, { low, high } = hair, { lighting } = this;
     const { camera, range, texel } = ofLight(
-      lighting.lights[number].position, low, high, this.texels);
+      from.position, low, high, this.texels);
     const shift = [radical(round, 2) - 0.5, radical(round, 3) - 0.5];
     const seen = { uMatrix: camera.matrix(...range, shift), uEye: camera.eye, uFocal: camera.K[0][0] };
     const begin = () => {
@@ -130,7 +137,7 @@ export class Picture {
       this.hidingHead.use(seen);
       this.head.draw();
     }
-    const shade = lighting.uniforms(number);
+    const shade = lighting.uniforms(from);
     for (let first = 0; first < hair.here;) {
       const count = Math.min(this.batch, hair.here - first);  // which may change at every yield
       begin();
@@ -230,6 +237,7 @@ export class Picture {
     const away = Math.hypot(...camera.eye.map((x, i) => x - box.middle[i]));
     const near = Math.max(0.02 * box.reach, away - 2.2 * box.reach), far = away + 2.2 * box.reach;
     return {
+      uPart: [camera.width, camera.height],
       uMatrix: camera.matrix(near, state.wires ? Math.max(far, 2 * away + 4) : far, how.shift),
       uEye: camera.eye, uFocal: camera.K[0][0], uLinear: how.linear, uExposure: this.exposure(),
       uSlice: state.slice ?? NO_SLICE, uMode: MODES[state.mode],
@@ -238,6 +246,12 @@ export class Picture {
 
   // The uniforms of all light, or of the one whose turn it is.
   light(how) { return how.light ?? (this.lit() ? this.lighting.uniforms() : {}); }
+
+  // The view of the model, which may have half of the page.
+  ofModel(view) {
+    const { width, height } = this.canvas;
+    return view(this.state.show === "beside" ? Math.floor(width / 2) : width, height);
+  }
 
   lit() { return this.state.mode === "lit" && this.lighting; }
 

@@ -8,6 +8,7 @@ import { dot, sub, unit } from "./space.js";
 
 const NEAREST = 3;
 const TERMS = 9;
+const TRACED_PIXELS = 50000;  // of a view in which light between fibres is traced
 
 // Real spherical harmonics of degree 2, in the order of appearance/render/harmonics.py.
 function harmonics(x, y, z, out) {
@@ -40,6 +41,8 @@ export class Relight {
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, wide, high);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, wide, high, gl.RGBA, gl.FLOAT, values);
     });
+    this.nothing = texture(gl, gl.TEXTURE_2D, gl.NEAREST,
+      () => gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, 1, 1));
     this.between(new Float32Array(TERMS * 3));
     picture.setLighting(this);
   }
@@ -92,10 +95,42 @@ export class Relight {
     viewer.draw();
   }
 
-  // All lights, or number `only` alone, as bright as if it stood for all turns of `lights`.
+  // How often each light has its turn until all that it stands for had theirs.
+  turns() { return Math.max(1, ...this.lights.map((l) => l.turns.length)); }
+
+  // What stands for light number `only` in a turn of it.
+  inTurn(only, turn) { const { turns } = this.lights[only]; return turns[turn % turns.length]; }
+
+  // Light between fibres in the view of `camera`, finer than the grid's: the server traces it when
+  // the picture rests, once for a view and a light. Resolves when its answer is there.
+  inView(camera) {
+    const asked = JSON.stringify([this.weights, camera]);
+    if (asked === this.rest?.asked) return this.rest.done;
+    for (const old of Object.values(this.rest?.textures ?? {})) this.viewer.gl.deleteTexture(old.texture);
+    const rest = this.rest = { asked };
+    rest.done = this.traceView(rest, camera).catch((error) => this.viewer.status(error.message));
+    return rest.done;
+  }
+
+  async traceView(rest, camera) {
+    const { gl, picture } = this.viewer, { width, height, K, R, t } = camera.resized(TRACED_PIXELS);
+    const values = new Float32Array(
+      await net.bytes("/indirect/view", this.body({ view: { width, height, K, R, t } })));
+    if (rest !== this.rest) return;
+    const half = values.length / 2;
+    const [uOfHair, uOfHead] = [0, half].map((first) => texture(gl, gl.TEXTURE_2D, gl.LINEAR, () => {
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.FLOAT,
+        values.subarray(first, first + half));
+    }));
+    rest.textures = { uOfHair, uOfHead };
+    picture.again();
+  }
+
+  // All lights, or one alone, as bright as if it stood for all turns of `lights`.
   uniforms(only) {
     const { material } = this.told, { model } = this.viewer.picture.sets;
-    const used = only === undefined ? this.lights : [this.lights[only]];
+    const used = only ? [only] : this.lights;
     const times = this.lights.length / Math.max(used.length, 1);
     const at = new Float32Array(24), power = new Float32Array(24);
     used.forEach((l, i) => {
@@ -109,6 +144,7 @@ export class Relight {
       uEta: material.eta, uLogistic: material.logistic_scale, uAbsorption: material.absorption,
       uGrid: [material.cosines, material.turns], uSkin: material.skin,
       uIndirect: this.cells, uAmbient: this.ambient,
+      ...(this.rest?.textures ?? { uOfHair: this.nothing, uOfHead: this.nothing }),
       uCells: material.cells[0], uSpan: sub(material.cells[1], material.cells[0]),
     };
   }
@@ -152,9 +188,10 @@ export class Relight {
     viewer.draw();
   }
 
-  body() {
+  body(more = {}) {
     return { method: "POST", headers: { "content-type": "application/json" },
-      body: JSON.stringify({ weights: this.weights, exposure: this.viewer.picture.state.exposure }) };
+      body: JSON.stringify({ weights: this.weights, exposure: this.viewer.picture.state.exposure,
+        ...more }) };
   }
 
   async showSum(camera, body) {
@@ -237,11 +274,11 @@ export class Relight {
         viewer.draw();
       })));
       const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and what leaves " +
-        "later) with shadows; light between fibres, times “indirect”, is path-traced once and kept " +
-        "coarsely: a centimetre or so, and smooth in direction."];
+        "later) with shadows; light between fibres, times “indirect”, is path-traced for a picture that " +
+        "rests, a moment after it; before, it is known to a centimetre or so."];
       if (!told.material.one_material) notes.push("One material is shown: the mean of its map.");
       if (told.material.field) notes.push("The model's field is not shown.");
-      notes.push("Of an environment the eight strongest lights are shaded.");
+      notes.push("Of an environment up to 64 lights are shaded at rest, eight in motion.");
       parts.push(element("p", { textContent: notes.join(" ") }));
     }
     return parts;

@@ -294,11 +294,22 @@ bool hidden(vec3 p, uint mine, float slack) {
 }
 `;
 
+// Light between fibres, traced for the view of this picture: radiance times the share of the pixel
+// that is hair (or head), and that share, little of the other; what it does not know is looked up in the grid.
+const IN_VIEW = `
+uniform vec2 uPart;  // pixels that the view is drawn on
+vec3 between(sampler2D traced, vec3 p) {
+  vec4 found = texture(traced, vec2(gl_FragCoord.x, uPart.y - gl_FragCoord.y) / uPart);
+  return found.a > 1e-3 && gl_FragCoord.x < uPart.x ? uAmbient * found.rgb / found.a : indirect(p);
+}
+`;
+
 // Direct light of the hair's BSDF where a fragment lies on its fibre: appearance/bsdf/lobes.py.
-export const FIBRE_FRAGMENT = FIBRE + LIGHTS + LONGITUDINAL + SHADOW + `
+export const FIBRE_FRAGMENT = FIBRE + LIGHTS + LONGITUDINAL + SHADOW + IN_VIEW + `
 uniform vec4 uSlice, uVariance;
 uniform float uOpacity, uTilt, uEta, uLogistic;
 uniform vec3 uEye, uAbsorption;
+uniform sampler2D uOfHair;
 out vec4 oColour;
 const float PI = 3.14159265;
 float turned(float x) {  // N_p: a logistic, trimmed to one turn
@@ -332,7 +343,7 @@ vec3 fibre(vec3 t, vec3 view, vec3 l) {
 void main() {
   vec3 p = surface(), l;
   if (dot(uSlice.xyz, p) > uSlice.w) discard;
-  vec3 power = incoming(0, p, l), c = indirect(p);
+  vec3 power = incoming(0, p, l), c = between(uOfHair, p);
   if (!hidden(p, vStrand, 2e-5)) c += power * fibre(normalize(vTangent), normalize(uEye - p), l);
   oColour = vec4(c * uOpacity, uOpacity);
 }`;
@@ -351,12 +362,13 @@ vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
 }`;
 
 // The same with the shadow of one light looked up, not taken from the vertices.
-export const SHADOWED_HEAD = LIGHTS + SHADOW + `
+export const SHADOWED_HEAD = LIGHTS + SHADOW + IN_VIEW + `
 uniform vec3 uSkin;
+uniform sampler2D uOfHead;
 uniform float uTexel;  // metres
 vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
   vec3 l, power = incoming(0, p, l);
   float cosine = max(dot(n, l), 0.0);
   bool dark = cosine == 0.0 || hidden(p + 2.0 * uTexel * n, 0xfffffffeu, 2.0 * uTexel);
-  return power * (dark ? 0.0 : cosine / 3.14159265) * uSkin + indirect(p);
+  return power * (dark ? 0.0 : cosine / 3.14159265) * uSkin + between(uOfHead, p);
 }`;

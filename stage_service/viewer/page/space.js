@@ -48,6 +48,15 @@ export class Pinhole {
     return product(lens, view);
   }
 
+  // The same view in about so many pixels.
+  resized(pixels) {
+    const s = Math.sqrt(pixels / (this.width * this.height));
+    const [width, height] = [this.width, this.height].map((n) => Math.ceil(s * n));
+    const [x, y] = [width / this.width, height / this.height], [[fx, skew, cx], [, fy, cy]] = this.K;
+    const K = [[fx * x, skew * x, (cx + 0.5) * x - 0.5], [0, fy * y, (cy + 0.5) * y - 0.5], [0, 0, 1]];
+    return new Pinhole({ ...this, K, width, height });
+  }
+
   // The same view in an image of another shape: the whole of this one fits into it.
   fitted(width, height) {
     const s = Math.min(width / this.width, height / this.height);

@@ -54,7 +54,11 @@ class Viewer {
       this.moved = false;
       picture.moving(this.view);
       this.restAt = now + (this.turning ? 250 : 60);
-    } else if (now > this.restAt && !this.turning && this.complete) picture.resting(this.view);
+    } else if (now > this.restAt && !this.turning && this.complete) {
+      if (picture.samples === 0 && picture.lit() && this.relight.lights.length)
+        this.relight.inView(picture.ofModel(this.view));
+      picture.resting(this.view);
+    }
   }
 
   pace(took) {

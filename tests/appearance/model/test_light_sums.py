@@ -7,7 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from appearance.model.light_sums import LightSums, few_lights, irradiance, weights_of_environment
+from appearance.model.light_sums import (
+    LightSums,
+    few_lights,
+    irradiance,
+    lights_in_turn,
+    weights_of_environment,
+)
 from reconstruction import Light
 from reconstruction.geometry.lights import dome_positions
 
@@ -69,3 +75,22 @@ def test_few_lights_keep_the_power_and_few_stay_as_they_are():
     assert set(found) == {5, 90}
     np.testing.assert_allclose(found[5], (1, 2, 3))
     assert few_lights(DOME, 0 * two, 8) == []
+
+
+def test_in_the_mean_over_turns_every_light_stands_at_its_own_place():
+    weights = np.random.default_rng(2).gamma(0.3, 1, (200, 3))
+    turns = lights_in_turn(DOME, weights, 8, 4096)
+    assert [len(x) for x in turns] == [4096] * 8
+    mean = np.zeros_like(weights)
+    for some in turns:
+        for number, weight in some:
+            mean[number] += weight / len(some)
+    own = irradiance(DOME)
+    # each light's turns are counted to 13 in 4096, by the discrepancy of the sequence
+    most = 13 / 4096 * max(sum(w * own[i] for i, w in some).sum() / 4096 for some in turns)
+    np.testing.assert_allclose(mean * own, weights * own, atol=most)
+    two = np.zeros((200, 3))
+    two[[5, 90]] = (1, 2, 3), (0.1, 0, 0)
+    found = dict(one for (one,) in lights_in_turn(DOME, two, 8, 4))
+    np.testing.assert_allclose(found[5], (1, 2, 3))
+    np.testing.assert_allclose(found[90], (0.1, 0, 0))

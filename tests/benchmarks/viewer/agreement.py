@@ -6,6 +6,7 @@ path tracer's is white.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +14,10 @@ import cv2
 import numpy as np
 
 from appearance import Exposure, HairScene, Sampling, psnr, render_environment, render_olat
+from appearance.model.light_sums import weights_of_environment
 from appearance.model.relight import environment_map
 from appearance.render.coverage import coverage
+from appearance.render.environment import direct_environment
 from benchmarks.viewer.page import Shown
 from reconstruction import Camera, Light, Progress
 from reconstruction.arrays import Array, Bools, Floats
@@ -22,33 +25,33 @@ from reconstruction.arrays import Array, Bools, Floats
 STUDIO = "studio"
 DEPTH = 24
 """Vertices that a path may have."""
+SAMPLED = 32, 8
+"""Of the rig's lights that stand for the map, those that a path's first and later vertices ask."""
+
+Halves = tuple[Floats, Floats]
+"""Two independent pictures `(H, W, 3)` of one thing, radiance."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Pixels a side, paths a pixel of what the viewer is held against.
+    """Pixels a side, paths a pixel of each of two pictures that the viewer is held against.
 
     Each is `over` x `over` pixels of the viewer's, of so many `samples`.
     """
 
     size: int = 128
-    spp: int = 1024
+    spp: int = 512
     over: int = 4
     samples: int = 24
 
 
 @dataclass(frozen=True)
 class Row:
-    """A light: what the page is told, its path-traced direct light and two halves of all."""
+    """A light: what the page is told, and the path tracer's direct and all light."""
 
     what: Any
-    direct: Floats
-    halves: tuple[Floats, Floats]
-
-    @property
-    def whole(self) -> Floats:
-        """All light `(H, W, 3)`, radiance."""
-        return 0.5 * (self.halves[0] + self.halves[1])
+    direct: Halves
+    whole: Halves
 
 
 def compare(
@@ -59,57 +62,93 @@ def compare(
     camera = shown.camera(effort.size)
     hair = coverage(scene, camera)["hair"] > 0.5
     figures: dict[str, dict[str, float]] = {}
-    pictures = list[Array]()
+    pictures, lit = list[Array](), None
     for name, row in _traced(scene, camera, shown.lights(), effort).items():
         progress(name, 0.2 * len(figures))
-        exposure = Exposure.of([row.whole[hair]])
-        shown.light(row.what)
-        direct, whole = (
-            shown.at_rest(effort.size, effort.over, effort.samples, a) for a in (0.0, None)
-        )
+        exposure = Exposure.of([_mean(row.whole)[hair]])
+        if row.what != lit:
+            shown.light(row.what)
+            direct, whole = (
+                shown.at_rest(effort.size, effort.over, effort.samples, a) for a in (0.0, None)
+            )
+            lit = row.what
         figures[name] = {
-            "psnr_db": psnr(exposure(whole), exposure(row.whole), hair),
-            "over_path_tracer": _ratio(whole, row.whole, hair),
-            "direct_psnr_db": psnr(exposure(direct), exposure(row.direct), hair),
-            "direct_over_depth_1": _ratio(direct, row.direct, hair),
-            "direct_share": _ratio(row.direct, row.whole, hair),
-            # a half differs from the other by twice the error of their mean: 6 dB
-            "path_tracer_itself_db": psnr(exposure(row.halves[0]), exposure(row.halves[1]), hair)
-            + 6.02,
+            **_judged("", whole, row.whole, exposure, hair),
+            **_judged("direct_", direct, row.direct, exposure, hair),
+            "direct_share": _mean(row.direct)[hair].sum() / _mean(row.whole)[hair].sum(),
         }
-        pictures.append(np.hstack([exposure(x) for x in (row.whole, whole, row.direct, direct)]))
+        drawn = (_mean(row.whole), whole, _mean(row.direct), direct)
+        pictures.append(np.hstack([exposure(x) for x in drawn]))
     return figures, np.rint(255 * np.vstack(pictures)).astype(np.uint8)
 
 
-def _ratio(found: Floats, truth: Floats, mask: Bools) -> float:
-    return float(found[mask].sum() / truth[mask].sum())
+def _judged(
+    what: str, found: Floats, truth: Halves, exposure: Exposure, mask: Bools
+) -> dict[str, float]:
+    """PSNR without the path tracer's noise, by the product of both halves' errors; PSNR beside
+    their mean; that mean's own; light over the path tracer's."""
+    one, other = (exposure(x) for x in truth)
+    error = ((exposure(found) - one) * (exposure(found) - other))[mask].mean()
+    return {
+        f"{what}psnr_db": float(-10 * np.log10(max(error, 1e-10))),
+        f"{what}psnr_with_noise_db": psnr(exposure(found), exposure(_mean(truth)), mask),
+        # a half differs from the other by twice the error of their mean: 6 dB
+        f"{what}path_tracer_itself_db": psnr(one, other, mask) + 6.02,
+        f"{what}over_path_tracer": float(found[mask].sum() / _mean(truth)[mask].sum()),
+    }
+
+
+def _mean(halves: Halves) -> Floats:
+    return 0.5 * (halves[0] + halves[1])
 
 
 def _traced(
     scene: HairScene, camera: Camera, lights: list[Light], effort: Effort
 ) -> dict[str, Row]:
-    """From before, from the side, from behind, and an environment map."""
+    """From before, from the side, from behind, an environment map, and that of the rig's lights."""
     ways = np.array([x.position / np.linalg.norm(x.position) for x in lights])
     eye = camera.center / np.linalg.norm(camera.center)
     places = {"front": eye, "side": np.cross(eye, [0, 0, 1.0]), "behind": -eye}
     numbers = {name: int((ways @ way).argmax()) for name, way in places.items()}
-    chosen = [lights[n] for n in numbers.values()]
+    environment = environment_map(STUDIO)
 
-    def olat(depth: int, spp: int, seed: int) -> Floats:
-        return render_olat(scene, camera, chosen, spp=spp, max_depth=depth, seed=seed)
+    def twice(render: Callable[[int, int], Floats]) -> tuple[Array, Array]:
+        """Direct light and all light, two pictures of each `(2, ..., H, W, 3)`."""
+        both = [np.array([render(depth, seed) for seed in (1, 2)]) for depth in (1, DEPTH)]
+        return both[0], both[1]
 
-    def studio(depth: int, spp: int, seed: int) -> Floats:
-        sampling = Sampling(spp, depth, seed)
-        return render_environment(scene, camera, environment_map(STUDIO), sampling)
+    def single(depth: int, seed: int) -> Floats:
+        chosen = [lights[n] for n in numbers.values()]
+        return render_olat(scene, camera, chosen, spp=effort.spp, max_depth=depth, seed=seed)
 
-    half = effort.spp // 2
-    direct, one, other = olat(1, effort.spp, 1), olat(DEPTH, half, 2), olat(DEPTH, half, 3)
-    rows = {
-        name: Row({number: [1, 1, 1]}, direct[i], (one[i], other[i]))
-        for i, (name, number) in enumerate(numbers.items())
-    }
-    halves = studio(DEPTH, half, 2), studio(DEPTH, half, 3)
-    return {**rows, STUDIO: Row(STUDIO, studio(1, effort.spp, 1), halves)}
+    def mapped(depth: int, seed: int) -> Floats:
+        if depth == 1:
+            return direct_environment(scene, camera, environment, effort.spp, seed)
+        sampling = Sampling(effort.spp, depth, seed)
+        return render_environment(scene, camera, environment, sampling)
+
+    def summed(depth: int, seed: int) -> Floats:
+        weights = weights_of_environment(lights, environment).astype(np.float32)
+        olat = render_olat(
+            scene,
+            camera,
+            lights,
+            spp=-(-effort.spp // 4),
+            max_depth=depth,
+            seed=seed,
+            first_lights=SAMPLED[0],
+            deep_lights=SAMPLED[1],
+        )
+        return np.einsum("lhwc,lc->hwc", olat, weights)
+
+    rows = {}
+    direct, whole = twice(single)
+    for i, (name, number) in enumerate(numbers.items()):
+        rows[name] = Row({number: [1, 1, 1]}, tuple(direct[:, i]), tuple(whole[:, i]))
+    for name, render in ((STUDIO, mapped), (f"{STUDIO}, as lights", summed)):
+        direct, whole = twice(render)
+        rows[name] = Row(STUDIO, tuple(direct), tuple(whole))
+    return rows
 
 
 def write(path: Any, picture: Array) -> None:

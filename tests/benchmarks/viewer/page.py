@@ -49,7 +49,8 @@ class Shown:
 
     def at_rest(self, size: int, over: int, samples: int, ambient: float | None = None) -> Floats:
         """The picture at rest `(size, size, 3)`, radiance: means of `over` x `over` pixels, each of
-        at least so many `samples`. `ambient` as the page's slider sets it."""
+        at least so many `samples` and of all turns of its lights. `ambient` as the page's slider
+        sets it."""
         told = self.page.evaluate(AT_REST, [size * over, samples, ambient])
         blocks = np.array(told, np.float32).reshape(size, over, size, over, 4)
         return np.asarray(blocks.mean((1, 3))[::-1, :, :3])
@@ -114,9 +115,10 @@ AT_REST = """async ([size, least, ambient]) => {
     const { picture, canvas, relight, gl } = viewer, before = relight.ambient;
     canvas.width = canvas.height = size;
     relight.ambient = ambient ?? before;
-    picture.samples = 0;
-    picture.sample = null;
-    const enough = Math.ceil(least / picture.cycle()) * picture.cycle();
+    await relight.inView(picture.ofModel(viewer.view));
+    picture.again();
+    const cycle = picture.cycle();
+    const enough = cycle * Math.max(Math.ceil(least / cycle), relight.turns());
     while (picture.samples < enough) {
         for (const _ of picture.oneSample(viewer.view)) gl.finish();
         await new Promise((done) => setTimeout(done));

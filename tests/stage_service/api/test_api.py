@@ -454,6 +454,7 @@ def test_every_route_of_the_api_is_there_and_documented(http):
         "GET /view/models/{name}/seen/{light}",
         "GET /view/models/{name}/table",
         "POST /view/models/{name}/indirect",
+        "POST /view/models/{name}/indirect/view",
         "POST /view/models/{name}/few",
         "POST /view/models/{name}/sums/{camera}.png",
         "PUT /view/models/{name}/environments/{file}",

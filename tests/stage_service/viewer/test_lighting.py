@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from reconstruction import Light
+from reconstruction import Camera, Capture, CaptureWriter, Light, Rig, Step
 from reconstruction.geometry.lights import dome_positions
 from stage_service.viewer.lighting import Lighting
 from stage_service.viewer.packing import PackedStrands
+from stage_service.viewer.viewed import Viewed
 
 
 def test_a_sum_of_frames_is_exact_to_8_bits(model):
@@ -35,6 +36,35 @@ def test_a_sum_of_frames_is_exact_to_8_bits(model):
 
     x = 1.7 * sum(frames[i].astype(float) * w for i, w in weights.items())
     x = np.clip(x, 0, 1)
+    shown = 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    near_half = np.abs(shown % 1 - 0.5) < 1e-3  # float32 may round those the other way
+    assert (found == np.rint(shown))[~near_half].all()
+    assert near_half.mean() < 0.01
+    assert 20 < found.mean() < 235
+
+
+def test_all_lights_together_are_the_captured_frame_of_all(model, tmp_path):
+    """A capture on disk, of other levels and exposures; the frame with all lights
+    on, which no sum reads, is what a camera without noise would have seen."""
+    rng = np.random.default_rng(5)
+    lights = tuple(Light(f"l{i}", p, (1, 1, 1)) for i, p in enumerate(dome_positions(12, 1.3)))
+    camera = Camera.look_at("c", 32, 24, (0, -1, 0), (0, 0, 0), 20.0)
+    answers = rng.gamma(0.5, 0.02, (12, 24, 32, 3))
+    olat = [Step(1 + i, "olat", 0.02, 0.5, light=x.name) for i, x in enumerate(lights)]
+    steps = [Step(0, "all_on", 0.005, 0.25), *olat]
+    writer = CaptureWriter.create(
+        tmp_path / "capture", Rig("r", (camera,), lights), {"steps": steps}
+    )
+    for step, radiance in zip(steps, (answers.sum(axis=0), *answers), strict=True):
+        writer.write_frame(step, "c", (step.level * radiance).astype(np.float32))
+    writer.finish("completed", {})
+    capture = Capture(tmp_path / "capture")
+    all_on = capture.frame(capture.steps[0], "c") / 0.25
+
+    lighting = Viewed(model, capture).lighting
+    png = lighting.sum("c", {i: [1, 1, 1] for i in range(12)}, exposure=1.3)
+    found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    x = np.clip(1.3 * all_on.astype(float), 0, 1)
     shown = 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     near_half = np.abs(shown % 1 - 0.5) < 1e-3  # float32 may round those the other way
     assert (found == np.rint(shown))[~near_half].all()

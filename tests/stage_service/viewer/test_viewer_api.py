@@ -100,6 +100,23 @@ def test_light_that_cannot_be_made_is_refused_with_what_is_wrong(http):
     assert http.post(f"{base}/indirect", json={"weights": {"4": [1, 1, 1]}}).status_code == 404
 
 
+def test_a_view_that_is_none_is_refused_before_a_path_is_traced(http):
+    lens = [[100, 0, 5], [0, 100, 5], [0, 0, 1]]
+    view = {"width": 9, "height": 9, "K": lens, "R": np.eye(3).tolist(), "t": [0, 0, 1]}
+
+    def asked(**what):
+        body = {"weights": {"4": [1, 1, 1]}, "view": {**view, **what}}
+        answer = http.post("/view/models/bristles/indirect/view", json=body)
+        return answer.status_code, answer.json()["detail"]
+
+    assert asked()[0] == 404  # no material was fitted
+    assert asked(R=[[1, 0, 0], [0, 1, 0], [0, 1, 1]])[0] == 422
+    assert asked(width=0)[0] == 422
+    status, detail = asked(width=1000, height=101)
+    assert status == 422
+    assert "101000" in detail
+
+
 def test_a_map_becomes_lights_of_its_power(http):
     image = np.full((8, 16, 3), 0.5, np.float32)
     data = cv2.imencode(".hdr", image)[1].tobytes()

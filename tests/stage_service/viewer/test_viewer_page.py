@@ -16,8 +16,9 @@ from appearance import Exposure, HairAppearance, render_olat
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from appearance.render.harmonics import harmonics
+from appearance.render.olat import render_olat_parts
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import Camera, Model, Strands
+from reconstruction import Camera, Light, Model, Strands
 
 api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -64,6 +65,32 @@ class Seen:
         url = self.page.evaluate("document.getElementById('canvas').toDataURL()")
         data = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
         return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+
+    def lit(self, lights: list[Light]) -> tuple[Camera, np.ndarray, list[int]]:
+        """Have it draw lit when it is told: its view of 96² pixels, the eye, and the numbers of the
+        lights in front, at the side and behind."""
+        self.drawn("viewer.relight")
+        self.page.evaluate("() => { viewer.frame = () => {}; }")
+        self.page.select_option("select >> nth=0", "lit")
+        self.page.wait_for_function("viewer.relight.seen", timeout=PATIENCE_MS)
+        told = self.page.evaluate(
+            "(() => { const { K, R, t } = viewer.orbit.pinhole(96, 96); return { K, R, t }; })()"
+        )
+        camera = Camera("orbit", 96, 96, *(np.array(told[k]) for k in "KRt"))
+        eye = camera.center
+        ways = np.array([x.position / np.linalg.norm(x.position) for x in lights])
+        places = (eye, np.cross(eye, [0, 0, 1.0]), -eye)
+        return camera, eye, [int((ways @ w).argmax()) for w in places]
+
+    def at_rest(self, number: int, ambient: float) -> np.ndarray:
+        """The picture at rest `(96, 96, 3)` under one light, radiance."""
+        self.page.evaluate(f"viewer.relight.set({{{number}: [1, 1, 1]}})")
+        self.page.wait_for_function(
+            f"!viewer.relight.under && viewer.relight.lights[0]?.number === {number}",
+            timeout=PATIENCE_MS,
+        )
+        told = self.page.evaluate(AT_REST, ambient)
+        return np.array(told, np.float32).reshape(96, 96, 4)[::-1, :, :3]
 
     def drawn(self, what: str = "true") -> None:
         """Wait until everything is there and drawn, and `what` holds."""
@@ -130,30 +157,14 @@ def test_strands_are_drawn_turn_and_take_another_colour(seen, url):
 )
 def test_direct_light_is_that_of_the_path_tracer(seen, model, viewing, allowed):
     """From in front, from the side, from behind; the picture's sum beside paths of one vertex."""
-    seen.drawn("viewer.relight")
-    seen.page.evaluate("() => { viewer.frame = () => {}; }")
-    seen.page.select_option("select >> nth=0", "lit")
-    seen.page.wait_for_function("viewer.relight.seen", timeout=PATIENCE_MS)
     lighting = viewing.get("bristles").lighting
-    eye = np.array(seen.page.evaluate("viewer.orbit.pinhole(96, 96).eye"))
-    ways = np.array([x.position / np.linalg.norm(x.position) for x in lighting.lights])
-    across = np.cross(eye, [0, 0, 1.0])
-    numbers = [int((ways @ w).argmax()) for w in (eye, across, -eye)]
-    told = seen.page.evaluate(
-        "(() => { const { K, R, t } = viewer.orbit.pinhole(96, 96); return { K, R, t }; })()"
-    )
-    camera = Camera("orbit", 96, 96, *(np.array(told[k]) for k in "KRt"))
+    camera, eye, numbers = seen.lit(lighting.lights)
     scene = FittedModel.load(model).scene()
     expected = render_olat(
         scene, camera, [lighting.lights[n] for n in numbers], spp=256, max_depth=1, thrift=0
     )
     for number, picture in zip(numbers, expected, strict=True):
-        seen.page.evaluate(f"viewer.relight.set({{{number}: [1, 1, 1]}})")
-        seen.page.wait_for_function(
-            f"!viewer.relight.under && viewer.relight.lights[0]?.number === {number}",
-            timeout=PATIENCE_MS,
-        )
-        found = np.array(seen.page.evaluate(AT_REST), np.float32).reshape(96, 96, 4)[::-1, :, :3]
+        found = seen.at_rest(number, 0)
         np.testing.assert_allclose(found.sum(axis=(0, 1)), picture.sum(axis=(0, 1)), rtol=allowed)
     # what of the server's grid leaves for the eye
     seen.page.wait_for_function("viewer.relight.grid.side > 1", timeout=PATIENCE_MS)
@@ -171,12 +182,30 @@ def test_direct_light_is_that_of_the_path_tracer(seen, model, viewing, allowed):
     assert seen.complaints == []
 
 
-AT_REST = """() => {
+@pytest.mark.parametrize("model", ["bundle"], indirect=True)
+def test_at_rest_light_between_fibres_is_that_of_the_path_tracer(seen, model, viewing):
+    """From the side: which pixels have it, and how much of it there is. The bundle is much the same
+    upside down, its light is not."""
+    lighting = viewing.get("bristles").lighting
+    camera, _, (_, side, _) = seen.lit(lighting.lights)
+    found = seen.at_rest(side, 1) - seen.at_rest(side, 0)
+    pixels = np.arange(96 * 96)
+    scene, light = FittedModel.load(model).scene(), [lighting.lights[side]]
+    expected = render_olat_parts(scene, camera, light, pixels, spp=192, max_depth=24)[1]
+    expected = expected.reshape(96, 96, 3)
+    np.testing.assert_allclose(found.sum(axis=(0, 1)), expected.sum(axis=(0, 1)), rtol=0.1)
+    assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.85
+    for flipped in (expected[::-1], expected[:, ::-1]):
+        assert np.corrcoef(found.ravel(), flipped.ravel())[0, 1] < 0.8
+    assert seen.complaints == []
+
+
+AT_REST = """async (ambient) => {
     const { picture, canvas, relight } = viewer;
     canvas.width = canvas.height = 96;
-    relight.ambient = 0;
-    picture.samples = 0;
-    picture.sample = null;
+    relight.ambient = ambient;
+    if (ambient) await relight.inView(picture.ofModel(viewer.view));
+    picture.again();
     while (picture.samples < picture.enough()) for (const _ of picture.oneSample(viewer.view));
     return Array.from(picture.radiance());
 }"""

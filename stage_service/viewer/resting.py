@@ -1,0 +1,59 @@
+"""Light between fibres in one view, path-traced when the page's picture rests in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from appearance import HairScene
+from appearance.render.coverage import coverage
+from appearance.render.olat import render_olat_parts, spread_out
+from appearance.render.smoothed import SIGMA, smoothed
+from reconstruction import Camera, Light
+from reconstruction.arrays import Array, Floats
+from reconstruction.options import Count, options
+
+_OTHER = 0.02
+"""What a pixel of the head weighs for hair, and one of hair for the head."""
+
+
+@options
+class RestOptions:
+    """`spp` paths a pixel of at most `max_depth` vertices; of many lights, each later vertex asks
+    `deep_lights`."""
+
+    spp: Count = 48
+    max_depth: Count = 24
+    deep_lights: Count = 8
+
+
+def indirect_in_view(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[tuple[Light, Array]],
+    options: RestOptions,
+) -> Floats:
+    """What `camera` sees of light that met the subject before, under `lights` at their weight (3,).
+
+    Returns `(2, H, W, 4)`, for hair and for head: radiance averaged over `SIGMA` pixels times
+    a weight, and that weight: the share of the pixel that hair or head covers. What pixels of the
+    other have weighs little, and counts where there is nothing else: a strand before the face is
+    lit as the face is.
+    """
+    share = coverage(scene, camera)
+    is_hair = share["hair"] >= share["head"]
+    index = np.flatnonzero((share["hair"] + share["head"]).ravel() > 0)
+    out = np.zeros((2, camera.height, camera.width, 4), np.float32)
+    if not (len(index) and lights):
+        return out
+    how = {"spp": options.spp, "max_depth": options.max_depth}
+    how |= {"first_lights": 1, "deep_lights": options.deep_lights}  # the first vertex's is direct
+    olat = render_olat_parts(scene, camera, [light for light, _ in lights], index, **how)[1]
+    weights = np.array([weight for _, weight in lights], np.float32)
+    light = np.einsum("lpc,lc->pc", olat, weights)
+    smooth = smoothed(spread_out(light[None], index, camera), share, SIGMA)[0]
+    for k, (kind, mask) in enumerate((("hair", is_hair), ("head", ~is_hair))):
+        own = np.dstack([smooth, share[kind]])[mask]
+        out[k][mask], out[1 - k][mask] = own, _OTHER * own
+    return out
