@@ -8,7 +8,7 @@ import numpy as np
 
 from appearance import HairScene
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat_parts, spread_out
+from appearance.render.olat import render_indirect, spread_out
 from appearance.render.smoothed import SIGMA, smoothed
 from reconstruction import Camera, Light
 from reconstruction.arrays import Array, Floats
@@ -47,9 +47,8 @@ def indirect_in_view(
     out = np.zeros((2, camera.height, camera.width, 4), np.float32)
     if not (len(index) and lights):
         return out
-    how = {"spp": options.spp, "max_depth": options.max_depth}
-    how |= {"first_lights": 1, "deep_lights": options.deep_lights}  # the first vertex's is direct
-    olat = render_olat_parts(scene, camera, [light for light, _ in lights], index, **how)[1]
+    how = {"spp": options.spp, "max_depth": options.max_depth, "deep_lights": options.deep_lights}
+    olat = render_indirect(scene, camera, [light for light, _ in lights], index, **how)
     weights = np.array([weight for _, weight in lights], np.float32)
     light = np.einsum("lpc,lc->pc", olat, weights)
     smooth = smoothed(spread_out(light[None], index, camera), share, SIGMA)[0]

@@ -7,7 +7,7 @@ import pytest
 
 from appearance import build_scene
 from appearance.render.coverage import coverage
-from appearance.render.olat import render_olat_parts, spread_out
+from appearance.render.olat import render_indirect, spread_out
 from reconstruction import Camera, Light
 from simulators.subject.subject import make_subject
 from stage_service.viewer.resting import RestOptions, indirect_in_view
@@ -28,7 +28,7 @@ def scene():
 def traced(scene, seed: int) -> np.ndarray:
     """What comes by way of others `(H, W, 3)`."""
     lights, pixels = [light for light, _ in LIGHTS], np.arange(CAMERA.width * CAMERA.height)
-    light = render_olat_parts(scene, CAMERA, lights, pixels, spp=128, max_depth=24, seed=seed)[1]
+    light = render_indirect(scene, CAMERA, lights, pixels, spp=128, max_depth=24, seed=seed)
     weights = np.array([weight for _, weight in LIGHTS])
     return spread_out(np.einsum("lpc,lc->pc", light, weights)[None], pixels, CAMERA)[0]
 

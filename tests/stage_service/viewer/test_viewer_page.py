@@ -16,7 +16,7 @@ from appearance import Exposure, HairAppearance, render_olat
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from appearance.render.harmonics import harmonics
-from appearance.render.olat import render_olat_parts
+from appearance.render.olat import render_indirect
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Camera, Light, Model, Strands
 
@@ -191,7 +191,7 @@ def test_at_rest_light_between_fibres_is_that_of_the_path_tracer(seen, model, vi
     found = seen.at_rest(side, 1) - seen.at_rest(side, 0)
     pixels = np.arange(96 * 96)
     scene, light = FittedModel.load(model).scene(), [lighting.lights[side]]
-    expected = render_olat_parts(scene, camera, light, pixels, spp=192, max_depth=24)[1]
+    expected = render_indirect(scene, camera, light, pixels, spp=192, max_depth=24)
     expected = expected.reshape(96, 96, 3)
     np.testing.assert_allclose(found.sum(axis=(0, 1)), expected.sum(axis=(0, 1)), rtol=0.1)
     assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.85
