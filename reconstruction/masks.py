@@ -125,6 +125,11 @@ def usable_masks(
     out = {name: mask for name, mask in mine.items() if mask.subject.any()}
     if blind := [c.name for c in capture.rig.cameras if c.name not in out]:
         stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
+    if all(mask.source == "silhouette" for mask in out.values()):
+        stage.warn(
+            "hair could not be told from skin: all of the subject counts as hair, a face too; give "
+            "hair masks (masks/CAMERA.png in the capture, `hair` in import.toml) or head.obj"
+        )
     if any(mask.source == "geometry alone" for mask in out.values()):
         stage.warn(
             "hair and skin on the head look alike: all of it was taken for one of them: look at "

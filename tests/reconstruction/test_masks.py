@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,7 @@ from reconstruction.masks import (
     distance_to,
     hair_masks,
     report_agreement,
+    usable_masks,
 )
 from reconstruction.report.report import Stage
 
@@ -305,10 +307,17 @@ def test_the_users_mask_wins(shoot: Callable[..., Capture]) -> None:
 
 
 def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Capture) -> None:
-    mask = hair_masks(sphere_capture)["left"]
+    masks = hair_masks(sphere_capture)
+    mask = masks["left"]
     assert mask.source == "silhouette"
     assert mask.decided == 0
     assert np.array_equal(mask.hair, mask.subject)
+    usable_masks(sphere_capture, masks, stage := Stage("masks"))
+    (said,) = stage.warnings
+    assert "all of the subject counts as hair, a face too" in said
+    masks["left"] = replace(mask, source="user")
+    usable_masks(sphere_capture, masks, stage := Stage("masks"))
+    assert stage.warnings == []
 
 
 def test_an_empty_picture_gives_empty_masks(
