@@ -25,6 +25,8 @@ from reconstruction.arrays import Array, Bools, Floats
 STUDIO = "studio"
 DEPTH = 24
 """Vertices that a path may have."""
+DIRECT = 8
+"""Times as many paths of direct light: they are short, and from behind few of them are bright."""
 SAMPLED = 32, 8
 """Of the rig's lights that stand for the map, those that a path's first and later vertices ask."""
 
@@ -86,7 +88,8 @@ def _judged(
     what: str, found: Floats, truth: Halves, exposure: Exposure, mask: Bools
 ) -> dict[str, float]:
     """PSNR without the path tracer's noise, by the product of both halves' errors; PSNR beside
-    their mean; that mean's own; light over the path tracer's."""
+    their mean; that mean's own; light over the path tracer's, and half of what the halves differ
+    by, which is about the error of that."""
     one, other = (exposure(x) for x in truth)
     error = ((exposure(found) - one) * (exposure(found) - other))[mask].mean()
     return {
@@ -95,6 +98,9 @@ def _judged(
         # a half differs from the other by twice the error of their mean: 6 dB
         f"{what}path_tracer_itself_db": psnr(one, other, mask) + 6.02,
         f"{what}over_path_tracer": float(found[mask].sum() / _mean(truth)[mask].sum()),
+        f"{what}over_error": float(
+            abs(truth[0][mask].sum() - truth[1][mask].sum()) / 2 / _mean(truth)[mask].sum()
+        ),
     }
 
 
@@ -112,28 +118,28 @@ def _traced(
     numbers = {name: int((ways @ way).argmax()) for name, way in places.items()}
     environment = environment_map(STUDIO)
 
-    def twice(render: Callable[[int, int], Floats]) -> tuple[Array, Array]:
+    def twice(render: Callable[[int, int, int], Floats]) -> tuple[Array, Array]:
         """Direct light and all light, two pictures of each `(2, ..., H, W, 3)`."""
-        both = [np.array([render(depth, seed) for seed in (1, 2)]) for depth in (1, DEPTH)]
+        spent = (1, DIRECT * effort.spp), (DEPTH, effort.spp)
+        both = [np.array([render(depth, spp, seed) for seed in (1, 2)]) for depth, spp in spent]
         return both[0], both[1]
 
-    def single(depth: int, seed: int) -> Floats:
+    def single(depth: int, spp: int, seed: int) -> Floats:
         chosen = [lights[n] for n in numbers.values()]
-        return render_olat(scene, camera, chosen, spp=effort.spp, max_depth=depth, seed=seed)
+        return render_olat(scene, camera, chosen, spp=spp, max_depth=depth, seed=seed)
 
-    def mapped(depth: int, seed: int) -> Floats:
+    def mapped(depth: int, spp: int, seed: int) -> Floats:
         if depth == 1:
-            return direct_environment(scene, camera, environment, effort.spp, seed)
-        sampling = Sampling(effort.spp, depth, seed)
-        return render_environment(scene, camera, environment, sampling)
+            return direct_environment(scene, camera, environment, spp, seed)
+        return render_environment(scene, camera, environment, Sampling(spp, depth, seed))
 
-    def summed(depth: int, seed: int) -> Floats:
+    def summed(depth: int, spp: int, seed: int) -> Floats:
         weights = weights_of_environment(lights, environment).astype(np.float32)
         olat = render_olat(
             scene,
             camera,
             lights,
-            spp=-(-effort.spp // 4),
+            spp=-(-spp // 4),
             max_depth=depth,
             seed=seed,
             first_lights=SAMPLED[0],
