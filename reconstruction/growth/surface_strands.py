@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.arrays import Array, Bools, Floats
+from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.geometry.strands import smoothed
 from reconstruction.tangents.estimate import Measured
 
@@ -24,7 +24,7 @@ PULL = 0.6
 LEAST_SUPPORT = 0.5
 SPACING = 0.4
 
-_BATCH = 2000
+_TOGETHER = 500  # strands that are traced at once; as soon as one ends another begins
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class SurfaceOptions:
     turn by at most `ANGLE_DEG` lead a strand, at most `NEIGHBOURS` of them; every `step` it moves
     `PULL` of the way to their middle. It ends where their confidences, each less the further
     away, add up to less than `LEAST_SUPPORT`, and at `longest` metres. Lines closer than `SPACING`
-    to a strand that runs along them within `SAME_DEG` start no other; strands shorter than
+    to one of its points that run along it within `SAME_DEG` start no other; strands shorter than
     `shortest` are not kept, the others are smoothed along their length by a Gaussian of `smooth`.
     """
 
@@ -47,23 +47,25 @@ class SurfaceOptions:
 
 
 class LineCloud:
-    """Measured lines that are looked up by place and direction."""
+    """Measured lines that are looked up by place and direction; `spent (N,)` are passed by."""
 
     def __init__(self, lines: Measured, options: SurfaceOptions) -> None:
         self._lines = lines
         self._options = options
         self._bandwidth = BANDWIDTH * options.apart
         self.step = options.step * options.apart
-        self.tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
+        self.spent = np.zeros(len(lines.points), bool)
+        self._tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
 
     def sample(self, p: Array, along: Array) -> tuple[Array, Array, Array]:
         """Unit directions `(N, 3)`, ways to the lines' middle `(N, 3)` across them, support `(N,)`.
 
         Of the lines around `p (N, 3)` that run as `along (N, 3)` does; that itself where none does.
+        Lines right beside them that run alike are spent, where the support is enough to go on.
         """
         k = min(NEIGHBOURS, len(self._lines.points))
-        distance, index = self.tree.query(
-            p, k=np.arange(1, k + 1), distance_upper_bound=2.5 * self._bandwidth, workers=-1
+        distance, index = self._tree.query(
+            p, k=np.arange(1, k + 1), distance_upper_bound=2.5 * self._bandwidth
         )
         there = np.isfinite(distance)
         index = np.where(there, index, 0)
@@ -73,32 +75,63 @@ class LineCloud:
         near = np.exp(-(np.where(there, distance, 0) ** 2) / (2 * self._bandwidth**2))
         weight = np.where(there, near * self._lines.confidence[index], 0.0)
         support = weight.sum(axis=1)
+        beside = (distance <= SPACING * self._options.apart) & (support >= LEAST_SUPPORT)[:, None]
         mean = np.einsum("nk,nki->ni", weight * np.sign(cosine), d)
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         mean = np.where(length > 1e-12, mean / np.maximum(length, 1e-12), along)
         middle = np.einsum("nk,nki->ni", weight, self._lines.points[index] - p[:, None])
         middle /= np.maximum(support, 1e-12)[:, None]
         middle -= np.einsum("ni,ni->n", middle, mean)[:, None] * mean
+        row, column = np.nonzero(beside)
+        alike = np.abs(np.einsum("ni,ni->n", d[row, column], mean[row]))
+        self.spent[index[row, column][alike >= np.cos(np.radians(SAME_DEG))]] = True
         return mean, middle, support
 
-    def trace(self, starts: Array, along: Array) -> list[Array]:
-        """Paths `(N, 3)` from `starts (N, 3)`, setting out along `along (N, 3)`."""
-        p, d = starts.copy(), along.copy()
-        active = np.arange(len(p))
-        rows, counts = [p.copy()], np.ones(len(p), np.int64)
-        for _ in range(int(self._options.longest / self.step)):
-            mean, middle, support = self.sample(p, d)
-            good = support >= LEAST_SUPPORT
-            active, d = active[good], mean[good]
-            if not len(active):
-                break
-            p = p[good] + self.step * d + PULL * middle[good]
-            row = np.zeros_like(starts)
-            row[active] = p
-            rows.append(row)
-            counts[active] += 1
-        columns = np.stack(rows, axis=1)
-        return [columns[i, :n] for i, n in enumerate(counts)]
+
+class _Pool:
+    """Strands in the making: `_TOGETHER` at most, both ways from where each began.
+
+    Way k and way `_TOGETHER` + k are one strand's: ahead and back.
+    """
+
+    def __init__(self, cloud: LineCloud, options: SurfaceOptions) -> None:
+        self._cloud, ways = cloud, 2 * _TOGETHER
+        self._most = int(options.longest / cloud.step)
+        self._rows = np.zeros((ways, self._most + 1, 3))
+        self._counts = np.zeros(ways, np.int64)
+        self._goes = np.zeros(ways, bool)
+        self._p, self._d = np.zeros((ways, 3)), np.zeros((ways, 3))
+        self.busy = np.zeros(_TOGETHER, bool)
+
+    def begin(self, starts: Array, along: Array) -> None:
+        """Set out from `starts (N, 3)` along `along (N, 3)`; N places at least must be free."""
+        k = np.flatnonzero(~self.busy)[: len(starts)]
+        self.busy[k] = True
+        for ways, sign in ((k, 1.0), (k + _TOGETHER, -1.0)):
+            self._p[ways], self._d[ways] = starts, sign * along
+            self._rows[ways, 0] = starts
+            self._counts[ways] = 1
+            self._goes[ways] = self._most > 0
+
+    def step(self) -> list[Array]:
+        """Take one step everywhere; returns the paths `(N, 3)` that have ended on both sides."""
+        ways = np.flatnonzero(self._goes)
+        mean, middle, support = self._cloud.sample(self._p[ways], self._d[ways])
+        good = support >= LEAST_SUPPORT
+        self._goes[ways[~good]] = False
+        ways, d = ways[good], mean[good]
+        self._d[ways] = d
+        self._p[ways] += self._cloud.step * d + PULL * middle[good]
+        self._rows[ways, self._counts[ways]] = self._p[ways]
+        self._counts[ways] += 1
+        self._goes[ways[self._counts[ways] > self._most]] = False
+        ended = np.flatnonzero(self.busy & ~self._goes[:_TOGETHER] & ~self._goes[_TOGETHER:])
+        self.busy[ended] = False
+        both = ((self._way(_TOGETHER + k), self._way(k)) for k in ended.tolist())
+        return [np.concatenate([back[:0:-1], ahead]) for back, ahead in both]
+
+    def _way(self, k: int) -> Array:
+        return self._rows[k, : self._counts[k]]
 
 
 def surface_strands(
@@ -106,40 +139,29 @@ def surface_strands(
 ) -> list[Floats]:
     """Polylines `(N, 3)` through measured lines, both ways from lines that none passes yet.
 
-    Lines are taken two thousand at a time in an order drawn by `seed`.
+    Lines are taken in an order drawn by `seed`, a new one whenever a strand has ended.
     """
     if not len(lines.points):
         return []
     cloud = LineCloud(lines, options)
+    pool = _Pool(cloud, options)
     order = np.random.default_rng(seed).permutation(len(lines.points))
-    spent = np.zeros(len(order), bool)
-    out: list[Floats] = []
-    while len(order := order[~spent[order]]):
-        chosen = order[:_BATCH]
-        spent[chosen] = True
-        p, d = lines.points[chosen], lines.directions[chosen]
-        ways = cloud.trace(np.tile(p, (2, 1)), np.concatenate([d, -d]))
-        paths = [
-            np.concatenate([back[:0:-1], ahead])
-            for ahead, back in zip(ways[: len(chosen)], ways[len(chosen) :], strict=True)
-        ]
-        paths = [p for p in paths if (len(p) - 1) * options.step >= options.shortest]
-        if paths:
-            _spend(cloud, lines, paths, spent, options)
-        sigma = options.smooth * options.apart
-        out += [smoothed(path, sigma).astype(np.float32) for path in paths]
-    return out
+    found: list[Array] = []
+    while len(order) or pool.busy.any():
+        free = int((~pool.busy).sum())
+        if free and len(order):
+            chosen, order = _next(order, cloud.spent, free)
+            cloud.spent[chosen] = True
+            pool.begin(lines.points[chosen], lines.directions[chosen])
+        found += [p for p in pool.step() if (len(p) - 1) * options.step >= options.shortest]
+    return [p.astype(np.float32) for p in smoothed(found, options.smooth * options.apart)]
 
 
-def _spend(
-    cloud: LineCloud, lines: Measured, paths: list[Array], spent: Bools, options: SurfaceOptions
-) -> None:
-    """Mark the lines that `paths` pass along."""
-    points = np.concatenate(paths)
-    tangents = np.concatenate([np.gradient(path, axis=0) for path in paths])
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-    near = cloud.tree.query_ball_point(points, SPACING * options.apart, workers=-1)
-    owner = np.repeat(np.arange(len(points)), [len(n) for n in near])
-    line = np.fromiter((j for n in near for j in n), np.int64, len(owner))
-    cosine = np.einsum("ni,ni->n", lines.directions[line], tangents[owner])
-    spent[line[np.abs(cosine) >= np.cos(np.radians(SAME_DEG))]] = True
+def _next(order: Ints, spent: Bools, count: int) -> tuple[Ints, Ints]:
+    """The first `count` lines of `order (N,)` that are not `spent`, and what comes after them."""
+    chosen: list[Ints] = []
+    while count > 0 and len(order):
+        some, order = order[:count], order[count:]
+        chosen.append(some[~spent[some]])
+        count -= len(chosen[-1])
+    return np.concatenate(chosen or [order]), order

@@ -64,6 +64,17 @@ def background_noise(image: AnyFloats) -> float:
     return background(image)[1]
 
 
+def noise_of_frames(images: AnyFloats, most: int = 1 << 22) -> float:
+    """Standard deviation of unlit pixels in dark-subtracted frames `(N, H, W)` of one camera.
+
+    Of all frames together: where hair fills a lit frame no pixel of it is dark, and the more
+    faithfully its shadows are shown, the less that is; the darkest hair would be taken for black
+    whose noise was clipped. Evenly spaced rows of about `most` pixels are looked at.
+    """
+    rows = images.reshape(-1, images.shape[-1])
+    return background_noise(rows[:: max(1, images.size // most)])
+
+
 def background(image: AnyFloats) -> tuple[float, float]:
     """Level and standard deviation of the unlit pixels of a dark-subtracted `image (...)`.
 

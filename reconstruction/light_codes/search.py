@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
@@ -24,6 +24,10 @@ little from one strand to the next: its best 24 depths of 160 held the best in 8
 
 SAMPLES, LENGTH = 25, 5e-3
 """Points of a segment that are compared in the second stage, and metres from its end to its end."""
+
+AROUND, FEWEST, LEFT_OUT, BEYOND = 2, 8, 0.1, 1.5e-3
+"""Of the lattice: pixels to every side of one that tell its depths, how few tell nothing, the share
+of the nearest and of the furthest of them that is left out, and metres beyond the others."""
 
 LEAST_CONFIDENCE = 0.1  # of a pixel's line for it to be a reference
 LEAST_SPREAD = 0.05  # segments whose planes spread less are dropped as nearly parallel
@@ -105,8 +109,23 @@ class DepthSearch:
 
         Where `far` is not above `near` there is nothing to search, as off the mask.
         """
-        own, options = self.views[view], self.options
+        own = self.views[view]
         asked = own.mask & (own.confidence >= LEAST_CONFIDENCE) & (far > near)
+        apart = self.options.lattice
+        if apart == 1:
+            return self._among(view, asked, near, far)
+        lattice = np.zeros_like(asked)
+        lattice[apart // 2 :: apart, apart // 2 :: apart] = True
+        first = self._among(view, asked & lattice, near, far)
+        nearer, further = narrowed(first, near, far, apart)
+        rest = self._among(view, asked & ~lattice, nearer, further)
+        return DepthMap(
+            *(np.concatenate([getattr(m, f.name) for m in (first, rest)]) for f in fields(DepthMap))
+        )
+
+    def _among(self, view: int, asked: Bools, near: Floats, far: Floats) -> DepthMap:
+        """Search the pixels that are `asked (H, W)`."""
+        options = self.options
         y, x = np.nonzero(asked)
         if not len(x) or not self.neighbours[view]:
             none, no = np.zeros(0, np.int64), np.zeros(0, np.float32)
@@ -150,6 +169,36 @@ class DepthSearch:
         depth += step * dr.clip(shift, -0.5, 0.5)
         agree, line = fine.worth(depth)
         return fetched(depth, line.direction, agree, line)
+
+
+def narrowed(found: DepthMap, near: Floats, far: Floats, apart: int) -> tuple[Floats, Floats]:
+    """Where to search the pixels between those of a lattice: `near` and `far (H, W)`, narrower.
+
+    `found` is of every `apart`th pixel both ways. A pixel's hair lies between the depths that most
+    of the lattice's pixels around it have, give or take `BEYOND`; where fewer than `FEWEST` have
+    one, between `near` and `far` as they are.
+    """
+    shape = -(-near.shape[0] // apart), -(-near.shape[1] // apart)
+    depths = np.full(shape, np.nan, np.float32)
+    depths[found.y // apart, found.x // apart] = found.depth
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.pad(depths, AROUND, constant_values=np.nan), (2 * AROUND + 1,) * 2
+    ).reshape(*shape, -1)
+    around = np.sort(around, axis=-1)  # NaN comes last
+    count = np.isfinite(around).sum(axis=-1)
+    few = count < FEWEST
+    left_out = (LEFT_OUT * count).astype(np.int64)
+
+    def ranked(rank: Ints) -> Floats:
+        rank = np.clip(rank, 0, None)[..., None]
+        return np.asarray(np.take_along_axis(around, rank, axis=-1)[..., 0], np.float32)
+
+    low = np.where(few, -np.inf, ranked(left_out) - BEYOND)
+    high = np.where(few, np.inf, ranked(count - 1 - left_out) + BEYOND)
+    y, x = np.arange(near.shape[0]) // apart, np.arange(near.shape[1]) // apart
+    low, high = np.maximum(near, low[np.ix_(y, x)]), np.minimum(far, high[np.ix_(y, x)])
+    out = low >= high
+    return np.where(out, near, low), np.where(out, far, high)
 
 
 def fetched(depth: Any, direction: Any, agreement: Any, line: Line) -> tuple[Any, ...]:

@@ -26,6 +26,7 @@ from reconstruction.images.silhouettes import (
     background,
     background_noise,
     lit_rgb,
+    noise_of_frames,
     silhouette,
 )
 from reconstruction.light_planes import PointCloud, triangulate
@@ -110,6 +111,17 @@ def test_background_noise_is_measured_below_zero() -> None:
     image[:80] += 5
     assert background_noise(image) == pytest.approx(0.03, rel=0.05)
     assert background_noise(np.ones(4)) == 0
+
+
+def test_the_noise_of_frames_that_hair_fills_is_that_of_the_dark_ones() -> None:
+    """No pixel of the first frame is dark: taken alone, its darkest hair is clipped black."""
+    rng = np.random.default_rng(0)
+    frames = rng.normal(0, 1e-3, (6, 80, 80))
+    frames[0] += rng.gamma(1.0, 0.1, (80, 80)) + 5e-3
+    frames[1, :40] += 1.0
+    assert background_noise(frames[0]) > 2e-3
+    assert noise_of_frames(frames) == pytest.approx(1e-3, rel=0.05)
+    assert noise_of_frames(frames, most=9000) == pytest.approx(1e-3, rel=0.1)
 
 
 @pytest.mark.parametrize("frames", [1, 40])

@@ -25,8 +25,10 @@ from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank, S
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "depth step, mm": {str(1e3 * s): {"step": s} for s in (1e-3, 5e-4, 2.5e-4, 1.25e-4)},
     "neighbours": {str(n): {"neighbours": n} for n in (4, 8, 16, 23)},
-    "candidates": {str(n): {"candidates": n} for n in (1, 4, 8, 24)} | {"all": {"candidates": 0}},
+    "candidates": {str(n): {"candidates": n} for n in (1, 4, 8, 24)}
+    | {"all": {"candidates": 0, "lattice": 1}},
     "coarse-to-fine": {str(n): {"coarse": n} for n in (1, 2, 4)},
+    "lattice": {str(n): {"lattice": n} for n in (1, 4, 8)},
 }
 """What is varied from the defaults, one at a time."""
 
@@ -63,7 +65,7 @@ def study_depths(
     asked = sum(
         int((views[k].mask & (views[k].confidence >= LEAST_CONFIDENCE)).sum()) for k in which
     )
-    brute, _ = found(replace(options.search, candidates=0))
+    brute, _ = found(replace(options.search, candidates=0, lattice=1))
     out: dict[str, dict[str, dict[str, float]]] = {}
     for name, variants in VARIANTS.items():
         for value, change in variants.items():

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.light_codes import study
 
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank
+from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank, SearchOptions
 
 
 def test_opencvs_loop_gives_what_our_bank_gives() -> None:
@@ -28,9 +28,10 @@ def test_brute_force_agrees_with_itself_and_worse_searches_find_less(
         "neighbours": {"1": {"neighbours": 1}},
     }
     monkeypatch.setattr(study, "VARIANTS", variants)
+    options = LightCodeOptions(search=SearchOptions(lattice=1))
     inside = np.ones((16, 16, 16), bool)
     volume = VoxelGrid(np.full(3, -0.032), 4e-3, inside)
-    found = study.study_depths(fibres.views, volume, fibres.strands, LightCodeOptions(), [0])
+    found = study.study_depths(fibres.views, volume, fibres.strands, options, [0])
     candidates = found["candidates"]
     assert candidates["all"]["as_brute_force"] == 1
     assert candidates["1"]["as_brute_force"] <= candidates["8"]["as_brute_force"]

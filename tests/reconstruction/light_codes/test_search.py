@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from reconstruction.light_codes.lmvs import LmvsSearch
-from reconstruction.light_codes.search import DepthMap, DepthSearch
+from reconstruction.light_codes.search import DepthMap, DepthSearch, narrowed
 from reconstruction.reconstruct_options import SearchOptions
 
 
@@ -35,14 +35,36 @@ def test_depths_are_true_below_a_pixel(fibres: Any, method: type[DepthSearch]) -
 
 def test_two_stages_find_what_brute_force_finds(fibres: Any) -> None:
     brute, quick = (
-        DepthSearch(fibres.views, (0, 0, 0), SearchOptions(candidates=k)).run(0, *fibres.range(0))
-        for k in (0, 24)
+        DepthSearch(fibres.views, (0, 0, 0), options).run(0, *fibres.range(0))
+        for options in (SearchOptions(candidates=k, lattice=1) for k in (0, 24))
     )
     maps = np.full((2, *fibres.views[0].mask.shape), np.nan)
     for depths, found in zip(maps, (brute, quick), strict=True):
         depths[found.y, found.x] = found.depth
     same = np.abs(maps[0] - maps[1]) < 1.25e-4
     assert same.sum() > 0.98 * max(len(brute.x), len(quick.x))
+
+
+def test_pixels_between_those_of_a_lattice_are_searched_where_these_found_hair() -> None:
+    """A slope with a tenth of wild depths on the lattice; one corner has too few to tell."""
+    rng = np.random.default_rng(4)
+    size, apart = 80, 4
+    y, x = np.mgrid[:size, :size]
+    true = (1 + 1e-4 * x + 5e-5 * y).astype(np.float32)
+    at = np.arange(apart // 2, size, apart)
+    ly, lx = (a.ravel() for a in np.meshgrid(at, at, indexing="ij"))
+    keep = (ly > 24) | (lx > 24)
+    ly, lx = ly[keep], lx[keep]
+    depth = true[ly, lx] + np.where(rng.random(len(ly)) < 0.1, rng.uniform(-0.02, 0.02, len(ly)), 0)
+    none = np.zeros(len(ly), np.float32)
+    found = DepthMap(lx, ly, depth.astype(np.float32), none[:, None], none, none, none, none)
+    near, far = true - 0.03, true + 0.03
+    nearer, further = narrowed(found, near, far, apart)
+    inside = (nearer <= true) & (true <= further)
+    assert inside.mean() > 0.98
+    assert np.median(further - nearer) < 0.1 * 0.06
+    np.testing.assert_array_equal(nearer[:8, :8], near[:8, :8])
+    np.testing.assert_array_equal(further[:8, :8], far[:8, :8])
 
 
 def test_lights_beside_cameras_tell_who_sees_a_pixel(fibres: Any) -> None:

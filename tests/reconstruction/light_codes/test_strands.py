@@ -35,11 +35,24 @@ def test_smoothing_keeps_the_ends_and_takes_the_jitter() -> None:
     rng = np.random.default_rng(2)
     points, _ = arc(100)
     jitter = points + 1e-4 * rng.normal(size=points.shape)
-    found = smoothed(jitter, 1e-3)
+    (found,) = smoothed([jitter], 1e-3)
     off = np.hypot(np.linalg.norm(found[:, :2], axis=1) - 0.02, found[:, 2])
     assert off[15:-15].mean() < 0.5e-4
     np.testing.assert_allclose(found[[0, -1]], jitter[[0, -1]], atol=2e-4)
-    np.testing.assert_array_equal(smoothed(jitter[:2], 2e-3), jitter[:2])
+    np.testing.assert_array_equal(smoothed([jitter[:2]], 2e-3)[0], jitter[:2])
+
+
+def test_lines_that_are_smoothed_together_know_nothing_of_one_another() -> None:
+    """Straight ones stay as they are, however short; a wave loses what a Gaussian takes of it."""
+    rng = np.random.default_rng(5)
+    straight = [np.arange(n)[:, None] * [2e-4, 1e-4, 0] + rng.normal(size=3) for n in (2, 3, 5, 60)]
+    x = np.arange(400) * 1e-4
+    wave = np.stack([x, 1e-5 * np.sin(2 * np.pi * x / 5e-3), 0 * x], axis=1)
+    *found, waved = smoothed([*straight, wave], 1e-3)
+    for line, before in zip(found, straight, strict=True):
+        np.testing.assert_allclose(line, before, atol=1e-12)
+    left = np.exp(-0.5 * (2 * np.pi * 1e-3 / 5e-3) ** 2)
+    np.testing.assert_allclose(waved[60:-60, 1], left * wave[60:-60, 1], atol=2e-8)
 
 
 def test_how_many_views_must_agree() -> None:
