@@ -8,8 +8,9 @@ from pydantic import Field
 
 from reconstruction.options import Count, options
 
-Kind = Literal["modulation", "additive", "whole"]
-"""What the harmonics are of: a factor on inverse rendering's light, what is added to it, or all."""
+Kind = Literal["turns", "modulation", "additive", "whole"]
+"""What a field is of: a factor on inverse rendering's light and turns of its fibres, harmonics of
+such a factor, of what is added to it, or of all light."""
 Degree = Annotated[int, Field(ge=0, le=3)]
 Level = tuple[Count, Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
@@ -20,7 +21,9 @@ NESTED: tuple[Level, ...] = ((2, 4, 4), (4, 12, 12), (8, 32, 32))
 class FieldOptions:
     """How a field of reflectance is fitted.
 
-    `kind`: "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
+    `kind`: "turns" multiplies the light of inverse rendering by a factor of each place, and by what
+    two turns of the fibre do to lobes of the longitudinal roughness `beta_m` (a capture's fit takes
+    the model's); "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
     frames; "additive" (GroomLight §3.3) adds to it, in the world's frame; "whole" is all of the
     light, without inverse rendering (GaussianHair's appearance, as GroomLight's supplement has it).
     `degree` of the harmonics of the direction to the camera and to the light. `levels`: grids of
@@ -31,13 +34,19 @@ class FieldOptions:
     lights are parted into `folds` each, and left out part by part to choose the ridge and judge.
     """
 
-    kind: Kind = "modulation"
+    kind: Kind = "turns"
+    beta_m: Annotated[float, Field(gt=0, le=1)] = 0.3
     degree: Degree = 1
     levels: tuple[Level, ...] = NESTED
     ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
     iterations: Count = 40
     tolerance: Annotated[float, Field(gt=0)] = 0.01
     folds: Annotated[int, Field(ge=2, le=16)] = 3
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether the field is a factor on inverse rendering's light."""
+        return self.kind in ("turns", "modulation")
 
 
 @options
@@ -49,7 +58,7 @@ class FieldRequest:
     paths a pixel of at most `max_depth` vertices. "none" fits no field.
     """
 
-    field: Literal["none", "modulation", "additive"] = "modulation"
+    field: Literal["none", "turns", "modulation", "additive"] = "turns"
     lights: Count = 64
     pixels: Count = 20_000
     hits: Annotated[int, Field(ge=1, le=64)] = 8

@@ -34,13 +34,14 @@ class Rendered:
     """What inverse rendering has to show of a capture: a scene with its maps and no field.
 
     `lights` are those of the fit, as they were found; `mapped` the scene's strands; `scale` the
-    capture's exposure.
+    capture's exposure; `beta_m` the hair's longitudinal roughness.
     """
 
     mapped: MappedStrands
     scene: HairScene
     lights: tuple[Light, ...]
     scale: float
+    beta_m: float
 
 
 def fit_field(
@@ -57,7 +58,9 @@ def fit_field(
     goes on behind the last view that was rendered. Raises `ModelError` where no camera sees hair or
     memory is short.
     """
-    options = replace(request.fit, kind="additive" if request.field == "additive" else "modulation")
+    if request.field == "none":
+        raise ValueError("no field was asked for")
+    options = replace(request.fit, kind=request.field, beta_m=rendered.beta_m)
     rng, folder = np.random.default_rng(seed), model.work("field")
     pixels = {
         c.name: chosen(model.mask(c.name, "hair", training), request.pixels, rng)

@@ -16,7 +16,7 @@ from stage_service.cli.support.commands import (
 )
 
 METHODS = ("sun", "inverse_rendering")
-FIELDS = ("none", "modulation", "additive")
+FIELDS = ("none", "turns", "modulation", "additive")
 
 
 def add(commands: Commands) -> None:
