@@ -115,7 +115,7 @@ class _Fit:
         self.options, self.monitor, self.places = options, monitor, places
         self.form = Form.of(options)
         strands = len(places.fitted)
-        grids = [Grid.of(level, strands) for level in options.levels]
+        grids = [Grid.of(level, strands) for level in options.grids]
         self.grid = grids[-1]
         self.folds = Folds.of(len(views), len(views[0].lights), options.folds)
         unit = _unit(views) if not options.multiplies else 1.0
@@ -144,12 +144,7 @@ class _Fit:
         progress, options = self.monitor.progress, self.options
         ridges = sorted(options.ridges, reverse=True)
         if self.folds.count:
-            found = cross_validated(
-                self.data,
-                self.folds,
-                self.monitor.checkpoint,
-                lambda what, share: progress(what, 0.3 + 0.6 * share),
-            )
+            found = self._validated()
             if found.best == len(ridges) - 1:
                 self.warnings.append(
                     f"the weakest ridge of those allowed, {found.ridge:g}, is best"
@@ -170,6 +165,28 @@ class _Fit:
         made = Field.of(self.form, self.grid, self.places, values)
         scores = found.validation, found.gain, found.tried
         return FieldFit(made, found.ridge, *scores, clamped, self.warnings)
+
+    def _validated(self) -> Verdict:
+        """The verdict on the stiffness that left-out pictures prefer, which `data` has then."""
+        each = self.options.stiffness if self.options.kind == "turns" else (1.0,)
+        found: list[tuple[Verdict, Data]] = []
+        for k, stiffness in enumerate(each):
+            data = replace(self.data, stiffness=stiffness)
+            checkpoint = self.monitor.checkpoint
+            if checkpoint is not None and k:
+                checkpoint = checkpoint.with_name(f"{k}-{checkpoint.name}")
+            first, part = 0.3 + 0.6 * k / len(each), 0.6 / len(each)
+            verdict = cross_validated(
+                data,
+                self.folds,
+                checkpoint,
+                lambda what, share, first=first, part=part: self.monitor.progress(  # type: ignore[misc]
+                    what, first + part * share
+                ),
+            )
+            found.append((verdict, data))
+        best, self.data = max(found, key=lambda one: one[0].gain[0])
+        return best
 
     def _final(self, ridge: float, start: Floats | None) -> tuple[Floats, float]:
         """The field of all pictures `(M, Q · 3)`, and the share of samples that it clamps."""

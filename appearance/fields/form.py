@@ -10,7 +10,7 @@ from appearance.fields.anchors import Grid, Places
 from appearance.fields.basis import TurningBasis, ViewBasis
 from appearance.fields.hits import Hits
 from appearance.fields.options import FieldOptions, Kind
-from appearance.fields.turns import COUNT, DEGREE, GROWTH
+from appearance.fields.turns import COUNT, DEGREE
 from appearance.render.harmonics import count_of, degrees
 from reconstruction.arrays import Array, Ints
 
@@ -19,11 +19,15 @@ Basis = ViewBasis | TurningBasis
 
 @dataclass(frozen=True)
 class Form:
-    """A `kind` of field: of harmonics up to `degree`, or of turns of lobes of a roughness."""
+    """A `kind` of field: of harmonics up to `degree`, or of turns of lobes of a roughness.
+
+    `stiffness` is how much stronger the ridge of a factor is than that of turns.
+    """
 
     kind: Kind
     degree: int
     beta_m: float = 0.0
+    stiffness: float = 1.0
 
     @classmethod
     def of(cls, options: FieldOptions) -> Form:
@@ -41,7 +45,7 @@ class Form:
     def growth(self) -> Array:
         """What the ridge of each grows by `(Q,)`: (1 + a(a + 1))(1 + b(b + 1)) of degrees a, b."""
         if self.kind == "turns":
-            return GROWTH
+            return np.array([self.stiffness, 1.0, 1.0])
         grows = 1 + degrees(self.degree) * (degrees(self.degree) + 1.0)
         return np.asarray(np.outer(grows, grows).ravel())
 

@@ -7,28 +7,30 @@ order, what turned fibres scatter, whatever the directions of camera and light.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.fields.hits import Hits
-from appearance.render.harmonics import harmonics
+from appearance.render.harmonics import count_of, harmonics
 from reconstruction.arrays import Floats
 from reconstruction.geometry.lights import dome_positions
 
 COUNT = 3
 """What a place has: a factor, and turns towards the strand's binormal and its normal."""
-GROWTH = np.array([10.0, 1.0, 1.0])
-"""How much stronger the ridge is for each."""
 DEGREE = 3
 """Of the harmonics of the light's direction that stand for a derivative at a pixel."""
 _UNIT = 0.15
 """Radians that a coefficient of 1 turns by."""
-_STEP = 0.05
+_STEP = 0.03
 _MOST = 3.0
 _TILT = np.radians(2.0)
-_HITS = 4
+_HITS = 8
 """Of a pixel's hits, evenly chosen: its fibres' lobes vary slowly within it."""
+_AT_ONCE = 1 << 11
+"""Pixels whose hits are in memory at once."""
 _DIRECTIONS = dome_positions(64, 1.0)
 
 
@@ -38,6 +40,17 @@ def turning_features(hits: Hits, beta_m: float) -> Floats:
     Harmonics up to `DEGREE` of the direction to the light in the world: how the logarithm of what
     a pixel's hits scatter changes by turns of `_UNIT`; fitted where they scatter much.
     """
+    parts = [
+        _features(
+            replace(hits, pixels=hits.pixels[k : k + _AT_ONCE], table=hits.table[k : k + _AT_ONCE]),
+            beta_m,
+        )
+        for k in range(0, len(hits.pixels), _AT_ONCE)
+    ]
+    return np.concatenate([np.zeros((0, COUNT, count_of(DEGREE)), np.float32), *parts])
+
+
+def _features(hits: Hits, beta_m: float) -> Floats:
     few = hits.table[:, :: max(1, hits.count // _HITS)]
     on = few["strand"] >= 0
     pixel = np.nonzero(on)[0]
@@ -60,11 +73,8 @@ def turning_features(hits: Hits, beta_m: float) -> Floats:
     out = np.zeros((len(hits.pixels), COUNT, n), np.float32)
     out[:, 0, 0] = 1 / y[0, 0]
     for k, axis in enumerate(np.eye(3, dtype=np.float32)[:2], 1):
-        turned = [
-            np.log(_lobes(*(_turned(x, sign * axis) for x in (light, camera)), width))
-            for sign in (1, -1)
-        ]
-        change = np.clip((turned[0] - turned[1]) * (_UNIT / (2 * _STEP)), -_MOST, _MOST)
+        turned = _lobes(_turned(light, axis), _turned(camera, axis), width)
+        change = np.clip(np.log(turned / scattered) * (_UNIT / _STEP), -_MOST, _MOST)
         right = np.asarray(added @ (scattered * change)) @ y
         out[:, k] = np.linalg.solve(squares, right[..., None])[..., 0]
     return out

@@ -94,6 +94,7 @@ class Data:
     options: FieldOptions
     scale: float
     unit: float
+    stiffness: float = 1.0
 
     def system(self, ridge: float, without: tuple[Folds, range] | None = None) -> LeastSquares:
         """The fit to everything, or at once the fits to what each of some folds leaves."""
@@ -115,7 +116,7 @@ class Data:
     @property
     def form(self) -> Form:
         """What the coefficients are of."""
-        return Form.of(self.options)
+        return replace(Form.of(self.options), stiffness=self.stiffness)
 
     def blocks(self, folds: Folds) -> list[range]:
         """The folds in blocks that are solved at once: as many as `BLOCK` bytes hold."""
@@ -137,7 +138,7 @@ class Data:
 
     def fingerprint(self) -> str:
         """Of all that a fit depends on."""
-        total = hashlib.sha256(repr((self.options, self.scale)).encode())
+        total = hashlib.sha256(repr((self.options, self.scale, self.stiffness)).encode())
         for gram in (g for parts in self.grams for g in parts.values()):
             total.update(np.ascontiguousarray(gram.right).tobytes())
         return total.hexdigest()

@@ -133,7 +133,7 @@ def fit_field_validated(
             "validation": found.validation,
             "gain": found.gain,
             "rendered": model.has(FIELD_FILE),
-            "field": request.field,
+            "field": found.field.kind,
             "ridge": found.ridge,
             "ridges": found.tried,
             "clamped": found.clamped,

@@ -61,8 +61,9 @@ FIELDS = {
     "modulation, degree 0": FieldOptions("modulation", degree=0),
     "modulation, degree 1": FieldOptions("modulation"),
     "modulation, degree 2": FieldOptions("modulation", degree=2),
-    "turns": FieldOptions(),
+    "turns": FieldOptions("turns"),
 }
+BOTH = ("modulation, degree 1", "turns")
 SIZES = {"full": STAGE, "quick": SmallStage(12, cameras=4, lights=8, spp=16, max_depth=3)}
 
 
@@ -132,6 +133,9 @@ def rows_of(
     for name, options in fields.items():
         progress(name, 0.5)
         rows[name] = row_of(frames, training, options)
+    both = [rows[name] for name in BOTH if name in rows]
+    if len(both) == len(BOTH):
+        rows["the better of both, by validation"] = max(both, key=lambda row: row["gain"][0])
     return rows
 
 
@@ -152,6 +156,7 @@ def row_of(frames: Frames, training: Sequence[Pictures], options: FieldOptions) 
         "cpu_seconds": seconds,
         "ridge": found.ridge,
         "clamped": found.clamped,
+        "gain": found.gain,
         "kept": not found.doubts(),
         "validation": found.validation,
         "warnings": found.warnings,

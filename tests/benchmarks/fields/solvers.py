@@ -35,7 +35,7 @@ def curves(
 ) -> dict[str, Curve]:
     """Objective above its minimum, as a share of that of no field, against CPU seconds."""
     options = FieldOptions("modulation")
-    grids = [Grid.of(level, len(places.fitted)) for level in options.levels]
+    grids = [Grid.of(level, len(places.fitted)) for level in options.grids]
     samples = [p.samples(options, scale) for p in views]
     begun = time.process_time()
     grams = [Gram.of(s, options.degree) for s in samples]
