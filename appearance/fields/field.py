@@ -10,7 +10,7 @@ import numpy as np
 
 from appearance.bsdf.maps import MappedStrands
 from appearance.fields.anchors import Grid, Places
-from appearance.fields.basis import ViewBasis
+from appearance.fields.form import Form
 from appearance.fields.hits import HitOptions, Hits, find_hits
 from appearance.fields.options import Kind
 from appearance.render.harmonics import count_of
@@ -31,7 +31,8 @@ class Field:
     """Harmonics at the anchors of a grid; `places` find them from the strands.
 
     `values (M, v · n · 3)` are those of the anchors with numbers `rows (M,)`, 0 at all others; v
-    harmonics of the direction to the camera, n = v of that to the light, up to `degree`.
+    harmonics of the direction to the camera, n = v of that to the light, up to `degree`. A field of
+    turns has `(M, 3 · 3)`: a factor and two turns of lobes of the roughness `beta_m`.
     """
 
     kind: Kind
@@ -40,12 +41,19 @@ class Field:
     places: Places
     rows: Ints
     values: Floats
+    beta_m: float = 0.0
 
     @classmethod
-    def of(cls, kind: Kind, degree: int, grid: Grid, places: Places, coefficients: Floats) -> Field:
-        """The field of `coefficients` at all anchors `(grid.count, v · n · 3)`."""
+    def of(cls, form: Form, grid: Grid, places: Places, coefficients: Floats) -> Field:
+        """The field of `coefficients` at all anchors `(grid.count, Q · 3)`."""
         rows = np.flatnonzero(coefficients.any(axis=1))
-        return cls(kind, degree, grid, places, rows, coefficients[rows])
+        values = coefficients[rows]
+        return cls(form.kind, form.degree, grid, places, rows, values, form.beta_m)
+
+    @property
+    def form(self) -> Form:
+        """What its values are of."""
+        return Form(self.kind, self.degree, self.beta_m)
 
     def on_cut(self, share: Array) -> Field:
         """The field on strands of which only `share (S,)` of the length is left, from the root."""
@@ -69,12 +77,9 @@ class Field:
         for start in range(0, len(hits.pixels), _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
             few = replace(hits, pixels=hits.pixels[part], table=hits.table[part])
-            basis = ViewBasis.of(
-                few, self.grid, self.places, self.degree, in_strands=self.kind == "modulation"
-            )
-            parts.append(basis.at_pixels(full))
+            parts.append(self.form.basis(few, self.grid, self.places).shown(full))
         found = np.concatenate(parts) if parts else np.zeros((0, count_of(self.degree), 3))
-        additive = self.kind != "modulation"
+        additive = self.kind not in ("turns", "modulation")
         return PixelField(
             found.astype(np.float32), hits.middle(), additive, alone=self.kind == "whole"
         )
@@ -88,6 +93,7 @@ class Field:
             {
                 "kind": np.array(self.kind),
                 "degree": np.array(self.degree),
+                "beta_m": np.array(self.beta_m),
                 "grid": np.array(shape, np.int64),
                 "root_uv": self.places.root_uv.astype(np.float32),
                 "kept": self.places.kept.astype(np.float32),
@@ -106,7 +112,9 @@ class Field:
             kind, degree = kinds.get(str(data["kind"])), int(data["degree"])
             grid = Grid(*(int(n) for n in data["grid"]))
             rows, values = data["rows"].astype(np.int64), data["values"].astype(np.float32)
-            if kind is None or values.shape != (len(rows), count_of(degree) ** 2 * 3):
+            beta_m = float(data["beta_m"]) if "beta_m" in data else 0.0
+            form = Form(kind or "modulation", degree, beta_m)
+            if kind is None or values.shape != (len(rows), form.count * 3):
                 raise ValueError(f"kind {data['kind']}, degree {degree}, values {values.shape}")
             if len(rows) and (rows.min() < 0 or rows.max() >= grid.count):
                 raise ValueError(f"anchors {rows.min()} to {rows.max()} of {grid.count}")
@@ -117,7 +125,7 @@ class Field:
         except (KeyError, TypeError, ValueError) as error:
             path = model.file(FIELD_FILE)
             raise ModelError(f"{path}: {error}: run 'hairstage fit --field' again") from error
-        return cls(kind, degree, grid, places, rows, values)
+        return cls(kind, degree, grid, places, rows, values, beta_m)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from appearance.fields.anchors import Grid, Places, nested
-from appearance.fields.basis import ViewBasis
+from appearance.fields.basis import TurningBasis
 from appearance.fields.field import Field
-from appearance.fields.grams import Gram
+from appearance.fields.form import Basis, Form
+from appearance.fields.grams import Gram, Samples
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures, irradiance
 from appearance.fields.solver import ignore
@@ -112,11 +113,12 @@ class _Fit:
         monitor: Monitor,
     ) -> None:
         self.options, self.monitor, self.places = options, monitor, places
+        self.form = Form.of(options)
         strands = len(places.fitted)
-        grids = [Grid.of(level, strands) for level in options.levels]
+        grids = [Grid.of(level, strands) for level in options.grids]
         self.grid = grids[-1]
         self.folds = Folds.of(len(views), len(views[0].lights), options.folds)
-        unit = _unit(views) if options.kind != "modulation" else 1.0
+        unit = _unit(views) if not options.multiplies else 1.0
         bases, grams, judges = [], [], []
         for i, view in enumerate(views):
             monitor.progress(
@@ -125,32 +127,24 @@ class _Fit:
             bases.append(self._basis(view))
             few = view.some(JUDGED)
             judges.append((few, bases[-1] if few is view else self._basis(few)))
-            samples = view.samples(options, scale, unit)
+            samples = _featured(view.samples(options, scale, unit), bases[-1])
             grams.append(
                 {
-                    part: Gram.of(samples.under(self.folds.lights_of(part)), options.degree)
+                    part: Gram.of(samples.under(self.folds.lights_of(part)), self.form.degree)
                     for part in range(self.folds.of_lights)
                 }
             )
         self.data = Data(views, bases, grams, judges, nested(grids, places), options, scale, unit)
         self.warnings: list[str] = []
 
-    def _basis(self, view: Pictures) -> ViewBasis:
-        options, in_strands = self.options, self.options.kind == "modulation"
-        return ViewBasis.of(
-            view.hits, self.grid, self.places, options.degree, in_strands=in_strands
-        )
+    def _basis(self, view: Pictures) -> Basis:
+        return self.form.basis(view.hits, self.grid, self.places)
 
     def run(self) -> FieldFit:
         progress, options = self.monitor.progress, self.options
         ridges = sorted(options.ridges, reverse=True)
         if self.folds.count:
-            found = cross_validated(
-                self.data,
-                self.folds,
-                self.monitor.checkpoint,
-                lambda what, share: progress(what, 0.3 + 0.6 * share),
-            )
+            found = self._validated()
             if found.best == len(ridges) - 1:
                 self.warnings.append(
                     f"the weakest ridge of those allowed, {found.ridge:g}, is best"
@@ -168,17 +162,39 @@ class _Fit:
         progress("fitting to all pictures", 0.9)
         fine, clamped = self._final(found.ridge, found.start)
         values = np.asarray(self.data.unit * fine, np.float32)
-        made = Field.of(options.kind, options.degree, self.grid, self.places, values)
+        made = Field.of(self.form, self.grid, self.places, values)
         scores = found.validation, found.gain, found.tried
         return FieldFit(made, found.ridge, *scores, clamped, self.warnings)
 
+    def _validated(self) -> Verdict:
+        """The verdict on the stiffness that left-out pictures prefer, which `data` has then."""
+        each = self.options.stiffness if self.options.kind == "turns" else (1.0,)
+        found: list[tuple[Verdict, Data]] = []
+        for k, stiffness in enumerate(each):
+            data = replace(self.data, stiffness=stiffness)
+            checkpoint = self.monitor.checkpoint
+            if checkpoint is not None and k:
+                checkpoint = checkpoint.with_name(f"{k}-{checkpoint.name}")
+            first, part = 0.3 + 0.6 * k / len(each), 0.6 / len(each)
+            verdict = cross_validated(
+                data,
+                self.folds,
+                checkpoint,
+                lambda what, share, first=first, part=part: self.monitor.progress(  # type: ignore[misc]
+                    what, first + part * share
+                ),
+            )
+            found.append((verdict, data))
+        best, self.data = max(found, key=lambda one: one[0].gain[0])
+        return best
+
     def _final(self, ridge: float, start: Floats | None) -> tuple[Floats, float]:
-        """The field of all pictures `(M, v · n · 3)`, and the share of samples that it clamps."""
+        """The field of all pictures `(M, Q · 3)`, and the share of samples that it clamps."""
         data, options = self.data, self.options
         for round_ in range(_CLAMP_ROUNDS + 1):
             start = data.solved(data.system(ridge), start, ignore)
             fine = np.asarray(data.nested @ start)
-            if options.kind != "modulation":
+            if not options.multiplies:
                 return fine, 0.0
             below = [_below(data, i, fine) for i in range(len(data.views))]
             weighed = sum(int(v.valid.sum()) for v in data.views) * 3
@@ -186,10 +202,10 @@ class _Fit:
             if clamped <= MOST_CLAMPED or round_ == _CLAMP_ROUNDS:
                 break
             grams = []
-            for view, where in zip(data.views, below, strict=True):
-                samples = view.samples(options, data.scale)
+            for view, basis, where in zip(data.views, data.bases, below, strict=True):
+                samples = _featured(view.samples(options, data.scale), basis)
                 weight = np.where(where, 0, samples.weight)
-                grams.append({-1: Gram.of(replace(samples, weight=weight), options.degree)})
+                grams.append({-1: Gram.of(replace(samples, weight=weight), self.form.degree)})
             data = replace(data, grams=grams)
         if clamped > MOST_CLAMPED:
             self.warnings.append(
@@ -197,6 +213,11 @@ class _Fit:
                 "rendering is far from these frames"
             )
         return fine, clamped
+
+
+def _featured(samples: Samples, basis: Basis) -> Samples:
+    """`samples` of what the basis multiplies by its coefficients."""
+    return replace(samples, features=basis.features) if isinstance(basis, TurningBasis) else samples
 
 
 def _unit(views: Sequence[Pictures]) -> float:
@@ -213,9 +234,9 @@ def _unit(views: Sequence[Pictures]) -> float:
 def _below(data: Data, number: int, fine: Floats) -> Bools:
     """Where the modulation is below 0 `(L, P, 3)`."""
     view = data.views[number]
-    g, points = data.bases[number].at_pixels(fine), view.hits.middle()
+    g, points = data.bases[number].shown(fine), view.hits.middle()
     out = np.zeros(view.captured.shape, bool)
     for i, light in enumerate(view.lights):
-        y = harmonics(light.position - points, data.options.degree)
+        y = harmonics(light.position - points, data.form.degree)
         out[i] = (1 + np.einsum("pn,pnc->pc", y, g) < 0) & view.valid[i][:, None]
     return out

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from appearance.render.harmonics import count_of, harmonics
+from appearance.render.harmonics import harmonics
 from reconstruction import Light
 from reconstruction.arrays import Floats, Ints
 
@@ -25,16 +25,25 @@ class Samples:
     regressors: Floats
     targets: Floats
     weight: Floats
+    features: Floats | None = None
 
     def directions(self, degree: int, light: int) -> Floats:
-        """The harmonics `(P, n)` of the directions from the points to a light by its number."""
-        return harmonics(self.lights[light].position - self.points, degree)
+        """The harmonics `(P, n)` of the directions from the points to a light by its number.
+
+        Where there are `features (P, K, n)`, sums of harmonics, what each of these is: `(P, K)`.
+        """
+        y = harmonics(self.lights[light].position - self.points, degree)
+        if self.features is None:
+            return y
+        return np.asarray(np.matmul(self.features, y[:, :, None])[:, :, 0])
 
     def under(self, lights: list[int]) -> Samples:
         """The same pixels under some of the lights, by their numbers."""
         few = tuple(self.lights[i] for i in lights)
         regressors, targets = self.regressors[:, lights], self.targets[:, lights]
-        return Samples(few, self.points, regressors, targets, self.weight[lights])
+        return replace(
+            self, lights=few, regressors=regressors, targets=targets, weight=self.weight[lights]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +62,8 @@ class Gram:
     @classmethod
     def of(cls, samples: Samples, degree: int) -> Gram:
         """The quadratic of `samples`."""
-        y = np.zeros((len(samples.lights), len(samples.points), count_of(degree)), np.float32)
-        for i in range(len(y)):
-            y[i] = samples.directions(degree, i)
+        lights = range(len(samples.lights))
+        y = np.stack([samples.directions(degree, i) for i in lights]).astype(np.float32)
         upper = np.triu_indices(y.shape[-1])
         both = (y[..., upper[0]] * y[..., upper[1]]).transpose(1, 0, 2)  # (P, L, pairs)
         (x, other), (t, second), w = samples.regressors, samples.targets, samples.weight

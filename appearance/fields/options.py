@@ -8,19 +8,24 @@ from pydantic import Field
 
 from reconstruction.options import Count, options
 
-Kind = Literal["modulation", "additive", "whole"]
-"""What the harmonics are of: a factor on inverse rendering's light, what is added to it, or all."""
+Kind = Literal["turns", "modulation", "additive", "whole"]
+"""What a field is of: a factor on inverse rendering's light and turns of its fibres, harmonics of
+such a factor, of what is added to it, or of all light."""
 Degree = Annotated[int, Field(ge=0, le=3)]
 Level = tuple[Count, Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 NESTED: tuple[Level, ...] = ((2, 4, 4), (4, 12, 12), (8, 32, 32))
+OF_TURNS: tuple[Level, ...] = ((4, 4, 4), (8, 10, 10), (12, 24, 24))
 
 
 @options
 class FieldOptions:
     """How a field of reflectance is fitted.
 
-    `kind`: "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
+    `kind`: "turns" multiplies the light of inverse rendering by a factor of each place, and by what
+    two turns of the fibre do to lobes of the longitudinal roughness `beta_m` (a capture's fit takes
+    the model's), the ridge of the factor `stiffness` times that of turns, as left-out pictures
+    prefer; "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
     frames; "additive" (GroomLight §3.3) adds to it, in the world's frame; "whole" is all of the
     light, without inverse rendering (GaussianHair's appearance, as GroomLight's supplement has it).
     `degree` of the harmonics of the direction to the camera and to the light. `levels`: grids of
@@ -32,12 +37,24 @@ class FieldOptions:
     """
 
     kind: Kind = "modulation"
+    beta_m: Annotated[float, Field(gt=0, le=1)] = 0.3
+    stiffness: tuple[Annotated[float, Field(gt=0)], ...] = (10.0, 0.1)
     degree: Degree = 1
-    levels: tuple[Level, ...] = NESTED
+    levels: tuple[Level, ...] | None = None
     ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
     iterations: Count = 40
     tolerance: Annotated[float, Field(gt=0)] = 0.01
     folds: Annotated[int, Field(ge=2, le=16)] = 3
+
+    @property
+    def grids(self) -> tuple[Level, ...]:
+        """`levels`, or what the kind has."""
+        return self.levels or (OF_TURNS if self.kind == "turns" else NESTED)
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether the field is a factor on inverse rendering's light."""
+        return self.kind in ("turns", "modulation")
 
 
 @options
@@ -46,10 +63,11 @@ class FieldRequest:
 
     Of the training lights `lights` and of each camera's hair `pixels` are used, all where there are
     fewer. `hits` rays a pixel say which strands it shows; pictures of inverse rendering have `spp`
-    paths a pixel of at most `max_depth` vertices. "none" fits no field.
+    paths a pixel of at most `max_depth` vertices. "none" fits no field, "best" turns and
+    a modulation, of which the one stays whose left-out pictures gain more.
     """
 
-    field: Literal["none", "modulation", "additive"] = "modulation"
+    field: Literal["none", "best", "turns", "modulation", "additive"] = "modulation"
     lights: Count = 64
     pixels: Count = 20_000
     hits: Annotated[int, Field(ge=1, le=64)] = 8

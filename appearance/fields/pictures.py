@@ -61,7 +61,7 @@ class Pictures:
         weight = np.where(self.valid[..., None], losses.weights(np.maximum(level, 0)), 0)
         points = self.hits.middle()
         regressors: AnyFloats = halves
-        if options.kind != "modulation":
+        if not options.multiplies:
             given = np.stack([irradiance(x, points) for x in self.lights]) * scale * unit
             regressors = np.broadcast_to(given, halves.shape)
         targets = np.broadcast_to(captured, halves.shape)

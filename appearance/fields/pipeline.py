@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from appearance.bsdf.maps import MappedStrands
 from appearance.fields.anchors import Grid, Places
 from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures
 from appearance.fields.hits import RECORD, HitOptions, find_hits
-from appearance.fields.options import FieldRequest
+from appearance.fields.options import FieldRequest, Kind
 from appearance.fields.pictures import Pictures
+from appearance.fields.turns import COUNT, DEGREE
 from appearance.fields.validation import BLOCK
 from appearance.observations import chosen, observe
 from appearance.render.harmonics import count_of
@@ -34,13 +36,14 @@ class Rendered:
     """What inverse rendering has to show of a capture: a scene with its maps and no field.
 
     `lights` are those of the fit, as they were found; `mapped` the scene's strands; `scale` the
-    capture's exposure.
+    capture's exposure; `beta_m` the hair's longitudinal roughness.
     """
 
     mapped: MappedStrands
     scene: HairScene
     lights: tuple[Light, ...]
     scale: float
+    beta_m: float
 
 
 def fit_field(
@@ -57,7 +60,11 @@ def fit_field(
     goes on behind the last view that was rendered. Raises `ModelError` where no camera sees hair or
     memory is short.
     """
-    options = replace(request.fit, kind="additive" if request.field == "additive" else "modulation")
+    if request.field == "none":
+        raise ValueError("no field was asked for")
+    kinds: tuple[Kind, ...] = ("turns", "modulation")
+    if request.field != "best":
+        kinds = (request.field,)
     rng, folder = np.random.default_rng(seed), model.work("field")
     pixels = {
         c.name: chosen(model.mask(c.name, "hair", training), request.pixels, rng)
@@ -82,10 +89,19 @@ def fit_field(
     for i, (name, index) in enumerate(pixels.items()):
         progress(f"{name}: rendering {len(rendered.lights)} lights", 0.7 * i / len(pixels))
         views.append(_pictures(training, rendered, (name, index), request, folder, seed))
-    monitor = Monitor(
-        lambda what, share: progress(what, 0.7 + 0.3 * share), folder / "fit.checkpoint.npz"
-    )
-    return fit_pictures(views, Places.of(rendered.mapped.root_uv), rendered.scale, options, monitor)
+    places, fits = Places.of(rendered.mapped.root_uv), []
+    for k, kind in enumerate(kinds):
+        options = replace(request.fit, kind=kind, beta_m=rendered.beta_m)
+        first, part = 0.7 + 0.3 * k / len(kinds), 0.3 / len(kinds)
+        monitor = Monitor(
+            partial(_within, progress, first, part), folder / f"{kind}.checkpoint.npz"
+        )
+        fits.append(fit_pictures(views, places, rendered.scale, options, monitor))
+    return max(fits, key=lambda found: found.gain[0])
+
+
+def _within(progress: Progress, first: float, part: float, what: str, share: float) -> None:
+    progress(what, first + part * share)
 
 
 def _pictures(
@@ -134,12 +150,22 @@ def _materials(scene: HairScene) -> Sequence[Any]:
 
 def memory_needed(pixels: Sequence[int], lights: int, strands: int, request: FieldRequest) -> float:
     """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
-    n, folds = count_of(request.fit.degree), request.fit.folds
-    turning = sum((2 * k + 1) ** 2 for k in range(request.fit.degree + 1))
-    hit = RECORD.itemsize + 2 * n * 8 + 8 * turning + 4 * n + 8
-    pixel = request.hits * hit + folds * 3 * 4 * (n * (n + 1) // 2 + n) + 12 * 3 * lights
+    folds = request.fit.folds
+    kind: Kind = "turns" if request.field == "turns" else "modulation"
+    levels = replace(request.fit, kind=kind).grids
+    if kind == "turns":
+        n, per_anchor = COUNT, COUNT
+        hit = RECORD.itemsize + 4 * 8
+        own = 4 * COUNT * count_of(DEGREE)
+    else:
+        n = count_of(request.fit.degree)
+        per_anchor = n**2
+        turning = sum((2 * k + 1) ** 2 for k in range(request.fit.degree + 1))
+        hit = RECORD.itemsize + 2 * n * 8 + 8 * turning + 4 * n + 8
+        own = 0
+    pixel = request.hits * hit + own + folds * 3 * 4 * (n * (n + 1) // 2 + n) + 12 * 3 * lights
     judging = sum(min(p, JUDGED) for p in pixels) * 12 * 3 * lights
-    coefficients = 4 * n**2 * 3 * sum(Grid.of(x, strands).count for x in request.fit.levels)
+    coefficients = 4 * per_anchor * 3 * sum(Grid.of(x, strands).count for x in levels)
     at_once = min(max(1, BLOCK // coefficients), folds**2)
     view = max(pixels) * max(
         (3 * 8 * 8 + 4 * n * (n + 1) // 2) * lights, 2 * request.hits * n * 3 * 4 * at_once

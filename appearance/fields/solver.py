@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from appearance.fields.basis import ViewBasis
+from appearance.fields.form import Basis, Form
 from appearance.fields.grams import Gram, Samples
-from appearance.render.harmonics import count_of, degrees
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats
 
 Iteration = Callable[[int, Floats, float], None]
@@ -28,7 +27,7 @@ class Seen:
     Its pictures may be in parts, `grams`, of which each belongs to the fits with numbers in `fits`.
     """
 
-    basis: ViewBasis
+    basis: Basis
     grams: Sequence[Gram]
     fits: Sequence[tuple[int, ...]] = ((0,),)
 
@@ -56,7 +55,7 @@ class Seen:
 class LeastSquares:
     """The errors of F fields on some views, and a ridge: each a quadratic of its coefficients.
 
-    Coefficients `(N, v · n · 3 · F)` are those of all grids, the fits' side by side: sparse
+    Coefficients `(N, Q · 3 · F)` are those of all grids, the fits' side by side: sparse
     matrices are gone through once for all of them. `nested (M, N)` adds grids up at the anchors of
     the last. `ridge` is that of the degree 0; what it does not change is `known` to the systems
     that `dataclasses.replace` makes of this one.
@@ -64,7 +63,7 @@ class LeastSquares:
 
     views: Sequence[Seen]
     nested: Any
-    degree: int
+    form: Form
     ridge: float
     fits: int = 1
     known: dict[str, Floats] = field(default_factory=dict, repr=False)
@@ -72,53 +71,51 @@ class LeastSquares:
     @property
     def shape(self) -> tuple[int, int]:
         """Of the coefficients."""
-        return self.nested.shape[1], count_of(self.degree) ** 2 * 3 * self.fits
+        return self.nested.shape[1], self.form.count * 3 * self.fits
 
     @property
     def penalty(self) -> Floats:
-        """The ridge of each column `(v · n · 3 · F,)`, growing with the degrees."""
-        k = degrees(self.degree)
-        grows = 1 + k * (k + 1.0)
-        each = np.repeat(np.outer(grows, grows).ravel(), 3 * self.fits)
+        """The ridge of each column `(Q · 3 · F,)`, growing with the degrees."""
+        each = np.repeat(self.form.growth, 3 * self.fits)
         return (self.ridge * each).astype(np.float32)
 
     def right(self) -> Floats:
-        """The right side `(N, v · n · 3 · F)` of the normal equations."""
+        """The right side `(N, Q · 3 · F)` of the normal equations."""
         if "right" not in self.known:
             pixels = [s.summed(lambda gram, _: gram.right[..., None]) for s in self.views]
-            self.known["right"] = self.nested.T @ self._at_anchors(ViewBasis.at_anchors, pixels)
+            self.known["right"] = self.nested.T @ self._at_anchors(_anchors, pixels)
         return self.known["right"]
 
     def times(self, coefficients: Floats) -> Floats:
-        """The left side of the normal equations times `coefficients (N, v · n · 3 · F)`."""
+        """The left side of the normal equations times `coefficients (N, Q · 3 · F)`."""
         fine: Floats = self.nested @ coefficients
         pixels = (_times(seen, g) for seen, g in zip(self.views, self._pixels(fine), strict=True))
-        gathered = self.nested.T @ self._at_anchors(ViewBasis.at_anchors, pixels)
+        gathered = self.nested.T @ self._at_anchors(_anchors, pixels)
         return np.asarray(gathered + self.penalty * coefficients)
 
     def diagonal(self) -> Floats:
-        """About the diagonal `(N, v · n · 3 · F)` of the left side."""
+        """About the diagonal `(N, Q · 3 · F)` of the left side."""
         if "diagonal" not in self.known:
-            k = degrees(self.degree)
+            k = self.form.alike
             pixels = [s.summed(lambda gram, _: gram.diagonal(k)[..., None]) for s in self.views]
             squared = self.nested.copy()
             squared.data = squared.data**2
-            self.known["diagonal"] = squared.T @ self._at_anchors(ViewBasis.squares, pixels)
+            self.known["diagonal"] = squared.T @ self._at_anchors(_squared, pixels)
         return np.asarray(self.known["diagonal"] + self.penalty)
 
     def objective(self, coefficients: Floats) -> float:
-        """What is minimised over `coefficients (N, v · n · 3)` of one fit: its error, the ridge's
+        """What is minimised over `coefficients (N, Q · 3)` of one fit: its error, the ridge's
         part."""
         ridge = np.sum(self.penalty * coefficients**2, dtype=np.float64)
         pixels = zip(self.views, self._pixels(self.nested @ coefficients), strict=True)
         return float(ridge) + sum(gram.error(g) for seen, g in pixels for gram in seen.grams)
 
     def each(self, values: AnyFloats) -> Array:
-        """The sums `(F,)` of `values (N, v · n · 3 · F)` over all that belongs to a fit."""
+        """The sums `(F,)` of `values (N, Q · 3 · F)` over all that belongs to a fit."""
         return np.asarray(values.sum(axis=0, dtype=np.float64).reshape(-1, self.fits).sum(axis=0))
 
     def spread(self, factors: AnyFloats | Bools) -> Floats:
-        """Factors of the fits `(F,)` as those of the columns `(v · n · 3 · F,)`."""
+        """Factors of the fits `(F,)` as those of the columns `(Q · 3 · F,)`."""
         return np.tile(factors.astype(np.float32), self.shape[1] // self.fits)
 
     def _pixels(self, fine: Floats) -> Iterator[Floats]:
@@ -133,9 +130,9 @@ class LeastSquares:
             yield seen.basis.at_pixels(parts[used])
 
     def _at_anchors(
-        self, gather: Callable[[ViewBasis, Floats], Floats], pixels: Iterable[Floats]
+        self, gather: Callable[[Basis, Floats], Floats], pixels: Iterable[Floats]
     ) -> Floats:
-        """What views have at their pixels, summed up at the finest anchors `(M, v · n · 3 · F)`."""
+        """What views have at their pixels, summed up at the finest anchors `(M, Q · 3 · F)`."""
         parts: dict[tuple[int, ...], Floats] = {}
         for seen, values in zip(self.views, pixels, strict=True):
             found = gather(seen.basis, values)
@@ -151,6 +148,14 @@ class LeastSquares:
             for k, fit in enumerate(used):
                 _split(total, self.fits)[..., fit] += _split(found, len(used))[..., k]
         return total
+
+
+def _anchors(basis: Basis, values: Floats) -> Floats:
+    return basis.at_anchors(values)
+
+
+def _squared(basis: Basis, values: Floats) -> Floats:
+    return basis.squares(values)
 
 
 def _times(seen: Seen, g: Floats) -> Floats:
@@ -170,7 +175,7 @@ def conjugate_gradients(
     start: Floats | None = None,
     on_iteration: Iteration = ignore,
 ) -> Floats:
-    """The coefficients `(N, v · n · 3 · F)` that minimise `system`, from `start` (0 where None).
+    """The coefficients `(N, Q · 3 · F)` that minimise `system`, from `start` (0 where None).
 
     Preconditioned by the diagonal. Each fit ends after `iterations`, or once its preconditioned
     gradient has fallen to `tolerance` of that at 0: the answer is that of F systems solved one by
@@ -221,7 +226,7 @@ def adam(
 ) -> Floats:
     """The reference: Adam (Kingma & Ba 2015), a random view under a random light a step.
 
-    `samples` are those of the views of `system`, whose minimum `(N, v · n · 3)` is looked for.
+    `samples` are those of the views of `system`, whose minimum `(N, Q · 3)` is looked for.
     """
     rng = np.random.default_rng(options.seed)
     x, first, second = (np.zeros(system.shape, np.float32) for _ in range(3))
@@ -229,7 +234,7 @@ def adam(
     for k in range(1, options.steps + 1):
         view, light = pictures[rng.integers(len(pictures))]
         seen, picture = system.views[view], samples[view]
-        y = picture.directions(system.degree, light)
+        y = picture.directions(system.form.degree, light)
         g = seen.basis.at_pixels(system.nested @ x)
         answer = np.einsum("pn,pnc->pc", y, g)
         (x1, x2), (t1, t2) = picture.regressors[:, light], picture.targets[:, light]

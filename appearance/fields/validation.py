@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from appearance.fields.basis import ViewBasis
+from appearance.fields.form import Basis, Form
 from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
 from appearance.fields.solver import Iteration, LeastSquares, Seen, conjugate_gradients
 from appearance.metrics.scores import srgb
-from appearance.render.harmonics import count_of
 from appearance.render.pixel_field import PixelField
 from reconstruction import Progress
 from reconstruction.arrays import Array, Floats
@@ -88,13 +87,14 @@ class Data:
     """
 
     views: Sequence[Pictures]
-    bases: Sequence[ViewBasis]
+    bases: Sequence[Basis]
     grams: Sequence[dict[int, Gram]]
-    judges: Sequence[tuple[Pictures, ViewBasis]]
+    judges: Sequence[tuple[Pictures, Basis]]
     nested: Any
     options: FieldOptions
     scale: float
     unit: float
+    stiffness: float = 1.0
 
     def system(self, ridge: float, without: tuple[Folds, range] | None = None) -> LeastSquares:
         """The fit to everything, or at once the fits to what each of some folds leaves."""
@@ -111,29 +111,34 @@ class Data:
             ]
             if any(fits):
                 seen.append(Seen(basis, list(parts.values()), fits))
-        return LeastSquares(seen, self.nested, self.options.degree, ridge, len(which))
+        return LeastSquares(seen, self.nested, self.form, ridge, len(which))
+
+    @property
+    def form(self) -> Form:
+        """What the coefficients are of."""
+        return replace(Form.of(self.options), stiffness=self.stiffness)
 
     def blocks(self, folds: Folds) -> list[range]:
         """The folds in blocks that are solved at once: as many as `BLOCK` bytes hold."""
-        one = 4 * self.nested.shape[1] * count_of(self.options.degree) ** 2 * 3
+        one = 4 * self.nested.shape[1] * self.form.count * 3
         each = max(1, BLOCK // one)
         return [range(k, min(k + each, folds.count)) for k in range(0, folds.count, each)]
 
     def solved(self, system: LeastSquares, start: Floats | None, told: Iteration) -> Floats:
-        """Its minimum `(N, v · n · 3)`, by conjugate gradients."""
+        """Its minimum `(N, Q · 3)`, by conjugate gradients."""
         options = self.options
         return conjugate_gradients(system, options.iterations, options.tolerance, start, told)
 
     def judging(self, view: int, fine: Floats) -> PixelField:
-        """The fields of `fine (M, v · n · 3 · F)` at the pixels that judge a view."""
+        """The fields of `fine (M, Q · 3 · F)` at the pixels that judge a view."""
         pictures, basis = self.judges[view]
-        found = (self.unit * basis.at_pixels(fine)).astype(np.float32)
-        additive, alone = self.options.kind != "modulation", self.options.kind == "whole"
+        found = (self.unit * basis.shown(fine)).astype(np.float32)
+        additive, alone = not self.options.multiplies, self.options.kind == "whole"
         return PixelField(found, pictures.hits.middle(), additive, alone=alone)
 
     def fingerprint(self) -> str:
         """Of all that a fit depends on."""
-        total = hashlib.sha256(repr((self.options, self.scale)).encode())
+        total = hashlib.sha256(repr((self.options, self.scale, self.stiffness)).encode())
         for gram in (g for parts in self.grams for g in parts.values()):
             total.update(np.ascontiguousarray(gram.right).tobytes())
         return total.hexdigest()

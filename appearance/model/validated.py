@@ -114,7 +114,11 @@ def fit_field_validated(
     with report.stage("field") as stage:
         mapped = fitted.mapped()
         base = Rendered(
-            mapped, mapped.scene, tuple(fitted.lights(used)), fitted.appearance.exposure.scale
+            mapped,
+            mapped.scene,
+            tuple(fitted.lights(used)),
+            fitted.appearance.exposure.scale,
+            fitted.maps.beta_m,
         )
         found = fit_field(training, model, base, request, progress, seed)
         found.field.save(model)
@@ -129,7 +133,7 @@ def fit_field_validated(
             "validation": found.validation,
             "gain": found.gain,
             "rendered": model.has(FIELD_FILE),
-            "field": request.field,
+            "field": found.field.kind,
             "ridge": found.ridge,
             "ridges": found.tried,
             "clamped": found.clamped,

@@ -16,7 +16,7 @@ from stage_service.cli.support.commands import (
 )
 
 METHODS = ("sun", "inverse_rendering")
-FIELDS = ("none", "modulation", "additive")
+FIELDS = ("none", "best", "turns", "modulation", "additive")
 
 
 def add(commands: Commands) -> None:
@@ -29,8 +29,9 @@ def add(commands: Commands) -> None:
     fit.add_argument(
         "--field",
         choices=FIELDS,
-        help="then fit what the hair reflects beyond its material: a factor on its light "
-        "(modulation), or light that is added (additive); none removes it",
+        help="then fit what the hair reflects beyond its material: a smooth factor on its light "
+        "(modulation), a factor and turns of its fibres (turns), the better of these (best), or "
+        "light that is added (additive); none removes it",
     )
     fit.add_argument("--field-options", help="the field's options as JSON")
     add_view(fit)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from reconstruction import Camera, Capture, Light, Model, Progress, Strands
     from reconstruction.arrays import Floats
 
-FIELDS = ("none", "modulation", "additive", "interpolation")
+FIELDS = ("none", "turns", "modulation", "additive", "interpolation")
 SIZE, FILM_SIZE = 512, 192
 """Pixels across of a picture and of an animation, where no camera of a rig says."""
 SPP, FILM_SPP = 64, 6

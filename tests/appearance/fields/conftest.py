@@ -11,6 +11,7 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.anchors import Grid, Places
 from appearance.fields.field import Field
+from appearance.fields.form import Form
 from appearance.fields.hits import HitOptions, find_hits
 from appearance.fields.pictures import Pictures
 from appearance.render.coverage import coverage
@@ -46,7 +47,7 @@ def planted(small):
         if kind != "modulation":
             c *= 0.01
             c[:, :3] = 0.1  # nowhere below black
-        return Field.of(kind, degree, grid, places, c.astype(np.float32))
+        return Field.of(Form(kind, degree), grid, places, c.astype(np.float32))
 
     def views(field, count=16, distance=1.0):
         lights = tuple(

@@ -10,6 +10,7 @@ import pytest
 from appearance.fields.anchors import Grid, Places, nested
 from appearance.fields.basis import ViewBasis
 from appearance.fields.fit import Monitor, fit_pictures
+from appearance.fields.form import Form
 from appearance.fields.grams import Gram, Samples
 from appearance.fields.options import FieldOptions
 from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conjugate_gradients
@@ -19,7 +20,13 @@ from reconstruction import Light
 
 LEVELS = ((2, 3, 3), (4, 6, 6))
 EXACT = FieldOptions(
-    degree=1, levels=LEVELS, ridges=(1e-5, 1e-3, 0.1), tolerance=1e-4, iterations=100, folds=2
+    "modulation",
+    degree=1,
+    levels=LEVELS,
+    ridges=(1e-5, 1e-3, 0.1),
+    tolerance=1e-4,
+    iterations=100,
+    folds=2,
 )
 ROUGH = replace(EXACT, levels=LEVELS[:1], tolerance=1e-2, iterations=15)
 """Where the answer does not ask for the minimum."""
@@ -100,7 +107,9 @@ def system_of(planted, views, ridge, degree=1):
         )
         for v, s in zip(views, samples, strict=True)
     ]
-    return LeastSquares(seen, nested(grids, planted.places), degree, ridge), samples
+    return LeastSquares(
+        seen, nested(grids, planted.places), Form("modulation", degree), ridge
+    ), samples
 
 
 def test_conjugate_gradients_and_adam_go_to_the_same_minimum(planted):

@@ -33,7 +33,8 @@ COARSE = (4, 8, 8)
 DIRECT = 2
 """Times as many paths for the light of the first hit, which no smoothing frees of noise. What other
 light has is the same all over a small picture, so that it needs nearly as many."""
-HELD_VIEWS = (0, 4)
+HELD_VIEWS = (0.0, 0.5)
+"""How far round the ring the cameras are that no fit sees."""
 MAPS = ("studio", "sky")
 MAPPED = "maps"
 Pair = tuple[AnyFloats, AnyFloats]
@@ -130,7 +131,7 @@ def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
     fitted = mapped.with_maps(coarse)
     lights = tuple(dome(rig))
     cameras = ring(strands, rig)
-    held = tuple(k for k in HELD_VIEWS if k < len(cameras))
+    held = tuple(int(share * len(cameras)) for share in HELD_VIEWS)
     pictures, true, rendered = [], [], []
     for k, camera in enumerate(cameras):
         pixels = np.flatnonzero((coverage(shown, camera, 32)["hair"] > 0.7).ravel())

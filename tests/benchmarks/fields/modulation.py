@@ -22,12 +22,15 @@ from appearance.fields.field import Field
 from appearance.fields.fit import fit_pictures
 from appearance.fields.interpolation import Interpolation
 from appearance.fields.options import FieldOptions
+from appearance.fields.pictures import Pictures
 from appearance.fields.reflectance import CapturedView, ReflectanceField
 from appearance.fields.search import searched
 from appearance.fields.validation import GROUPS
 from benchmarks.appearance.known_subjects import SmallStage
-from benchmarks.command import SUBJECT, Benchmark, option
+from benchmarks.command import CAPTURE, SUBJECT, Benchmark, option
+from benchmarks.fields.fitted import captured_of, fitted_frames
 from benchmarks.fields.frames import (
+    HELD_VIEWS,
     MAPPED,
     Frames,
     Pair,
@@ -55,10 +58,12 @@ FIELDS = {
         "whole", **BASELINE
     ),
     "additive (GroomLight's), degree 3": FieldOptions("additive", **BASELINE),
-    "modulation, degree 0": FieldOptions(degree=0),
-    "modulation, degree 1": FieldOptions(),
-    "modulation, degree 2": FieldOptions(degree=2),
+    "modulation, degree 0": FieldOptions("modulation", degree=0),
+    "modulation, degree 1": FieldOptions("modulation"),
+    "modulation, degree 2": FieldOptions("modulation", degree=2),
+    "turns": FieldOptions("turns"),
 }
+BOTH = ("modulation, degree 1", "turns")
 SIZES = {"full": STAGE, "quick": SmallStage(12, cameras=4, lights=8, spp=16, max_depth=3)}
 
 
@@ -127,26 +132,35 @@ def rows_of(
     }
     for name, options in fields.items():
         progress(name, 0.5)
-        begun = time.process_time()
-        found = fit_pictures(training, frames.places, frames.scale, options)
-        seconds = time.process_time() - begun
-        lit = {}
-        for k, p in enumerate(frames.pictures):
-            at = found.field.at(p.hits)
-            one, other = (at.lit(x.astype(np.float32), p.lights) for x in frames.rendered[k])
-            lit[k] = one, other
-        rows[name] = {
-            **frames.psnr(lit),
-            "gains": frames.gains(lit),
-            BRIGHTEST: under_maps(frames, partial(in_brightest, frames, found.field)),
-            "cpu_seconds": seconds,
-            "ridge": found.ridge,
-            "clamped": found.clamped,
-            "kept": not found.doubts(),
-            "validation": found.validation,
-            "warnings": found.warnings,
-        }
+        rows[name] = row_of(frames, training, options)
+    both = [rows[name] for name in BOTH if name in rows]
+    if len(both) == len(BOTH):
+        rows["the better of both, by validation"] = max(both, key=lambda row: row["gain"][0])
     return rows
+
+
+def row_of(frames: Frames, training: Sequence[Pictures], options: FieldOptions) -> dict[str, Any]:
+    """What a field fitted to `training` is worth, whether or not the fit keeps it."""
+    begun = time.process_time()
+    found = fit_pictures(training, frames.places, frames.scale, options)
+    seconds = time.process_time() - begun
+    lit = {}
+    for k, p in enumerate(frames.pictures):
+        at = found.field.at(p.hits)
+        one, other = (at.lit(x.astype(np.float32), p.lights) for x in frames.rendered[k])
+        lit[k] = one, other
+    return {
+        **frames.psnr(lit),
+        "gains": frames.gains(lit),
+        BRIGHTEST: under_maps(frames, partial(in_brightest, frames, found.field)),
+        "cpu_seconds": seconds,
+        "ridge": found.ridge,
+        "clamped": found.clamped,
+        "gain": found.gain,
+        "kept": not found.doubts(),
+        "validation": found.validation,
+        "warnings": found.warnings,
+    }
 
 
 def run_bench(
@@ -178,6 +192,30 @@ def run_bench(
     return result
 
 
+def run_fitted(
+    args: argparse.Namespace, fields: Mapping[str, FieldOptions], progress: Progress
+) -> dict[str, Any]:
+    """The table of `fields` on top of a fit of captured frames, of one seed."""
+    captured, strands = captured_of(args)
+    frames, found = fitted_frames(captured, strands, seed=args.seed, progress=progress)
+    result = {"seeds": [{"fit": found, "rows": rows_of(frames, fields, progress)}]}
+    save(args.out / "fields.json", result)
+    (args.out / "fields.md").write_text(report(result))
+    return result
+
+
+def against_views(
+    frames: Frames, counts: Sequence[int], fields: Mapping[str, FieldOptions], progress: Progress
+) -> dict[str, Any]:
+    """Gains over inverse rendering of fits to so many of the training views, evenly chosen."""
+    training, found = frames.training(), {}
+    for count in counts:
+        progress(f"{count} views", 0.5)
+        few = [training[k * len(training) // count] for k in range(count)]
+        found[str(count)] = {name: row_of(frames, few, x) for name, x in fields.items()}
+    return found
+
+
 def report(result: Mapping[str, Any]) -> str:
     """The tables, for people."""
     seeds = [s["rows"] for s in result["seeds"]]
@@ -195,10 +233,10 @@ def report(result: Mapping[str, Any]) -> str:
     text = (
         markdown(["model", *GROUPS, MAPPED, BRIGHTEST, "fit, CPU s", "gains", "kept"], lines) + "\n"
     )
-    for name, curve in result["solvers"].items():
+    for name, curve in result.get("solvers", {}).items():
         points = ", ".join(f"{p['cpu_seconds']:.2f} s: {p['above']:.1e}" for p in curve)
         text += f"- {name}: {points}\n"
-    least = result["ratio"]
+    least = result.get("ratio", {})
     if "cpu_seconds" in least:
         text += (
             f"- to {least['above']:.1e}: {least['cpu_seconds']:.2f} s, "
@@ -222,13 +260,23 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         result = cost(tuple(args.cost), args.out, args.seed, progress)
         save(args.out / "fields_cost.json", result)
         return result
+    fields = {name: FIELDS[name] for name in args.only or FIELDS}
+    if args.on != BENT:
+        return run_fitted(args, fields, progress)
     rig = SIZES["quick"] if args.quick else STAGE
+    if args.views:
+        rig = replace(rig, cameras=max(args.views) + len(HELD_VIEWS))
+        subject = simulated(args.rig, args.subject, args.head, args.seed)
+        frames = frames_of(subject, rig, args.seed)
+        result = against_views(frames, args.views, fields, progress)
+        save(args.out / "fields_views.json", result)
+        return result
     count = 1 if args.quick else args.seeds
     subjects = [simulated(args.rig, args.subject, args.head, args.seed + k) for k in range(count)]
-    fields = {name: FIELDS[name] for name in args.only or FIELDS}
     return run_bench(args.out, subjects, rig, seed=args.seed, fields=fields, progress=progress)
 
 
+BENT = "bent"
 SEEDS = option("--seeds", "of the table", type=int, default=3)
 ONLY = option(
     "--only", "of the fields, by name: all unless given", nargs="+", choices=tuple(FIELDS)
@@ -239,4 +287,13 @@ COST = option(
     type=int,
     nargs=3,
 )
-BENCHMARK = Benchmark(_bench, (*SUBJECT, SEEDS, ONLY, COST))
+VIEWS = option("--views", "only gains against so many training views", type=int, nargs="+")
+ON = option(
+    "--on",
+    "bent strands, inverse rendering emulated; or inverse rendering of the subject's frames on "
+    "reconstructed --strands; or of Cycles' on its true or given --strands: one seed",
+    choices=(BENT, "reconstructed", "cycles"),
+    default=BENT,
+)
+STRANDS = option("--strands", "those of a reconstruction, for --on", type=Path)
+BENCHMARK = Benchmark(_bench, (*SUBJECT, SEEDS, ONLY, COST, VIEWS, ON, STRANDS, CAPTURE))

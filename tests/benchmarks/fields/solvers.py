@@ -13,6 +13,7 @@ import numpy as np
 from appearance.fields.anchors import Grid, Places, nested
 from appearance.fields.basis import ViewBasis
 from appearance.fields.fit import Monitor, fit_pictures
+from appearance.fields.form import Form
 from appearance.fields.grams import Gram
 from appearance.fields.hits import RECORD, Hits
 from appearance.fields.options import FieldOptions, FieldRequest
@@ -33,8 +34,8 @@ def curves(
     views: Sequence[Pictures], places: Places, scale: float, *, quick: bool = False
 ) -> dict[str, Curve]:
     """Objective above its minimum, as a share of that of no field, against CPU seconds."""
-    options = FieldOptions()
-    grids = [Grid.of(level, len(places.fitted)) for level in options.levels]
+    options = FieldOptions("modulation")
+    grids = [Grid.of(level, len(places.fitted)) for level in options.grids]
     samples = [p.samples(options, scale) for p in views]
     begun = time.process_time()
     grams = [Gram.of(s, options.degree) for s in samples]
@@ -43,7 +44,7 @@ def curves(
         Seen(ViewBasis.of(p.hits, grids[-1], places, options.degree, in_strands=True), [g])
         for p, g in zip(views, grams, strict=True)
     ]
-    system = LeastSquares(seen, nested(grids, places), options.degree, 0.03)
+    system = LeastSquares(seen, nested(grids, places), Form.of(options), 0.03)
     least = system.objective(conjugate_gradients(system, 12 if quick else 80, 1e-6))
     start = system.objective(np.zeros(system.shape, np.float32))
     found: dict[str, Curve] = {}
