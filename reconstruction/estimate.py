@@ -29,7 +29,7 @@ from reconstruction.tangents.reflection import FEWEST_LIGHTS
 KNOWN_TASK = 0.0155
 """Seconds that the known task takes on the machine of the table: a filter bank on 256² pixels."""
 
-SWEPT, UNSWEPT = 2.0, 6.0
+SWEPT, UNSWEPT = 2.0, 8.0
 """Cells of `MeasureOptions.thin` that a surface is deep: triangulated, and where hulls put it."""
 
 ROWS = 12  # of a sweep that the probe searches, in each of three places
@@ -243,7 +243,10 @@ class _Probe:
         if not seen:
             if sweep:
                 add("surface", 0.0, 8e-9 * n * n, 8e-6 * n)
-            grown = 0.6 + 2e-5 * n if sweep else 0.9 * volume + 7e-6 * n
+            grown = 0.6 + 2e-5 * n
+            if not sweep:  # lines that line stereo saw are many, and all get roots
+                fine = lights and self.pixel <= FINE_PIXEL
+                grown = 0.6 + 2.7e-5 * n if fine else 0.9 * volume + 7e-6 * n
             add("field", 0.0, 2.9 * voxels, 0.8 * volume)
             add("strands", 0.0, 7.0 + 2e-4 * n, grown)
             if sweep:
