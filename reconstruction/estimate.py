@@ -235,7 +235,7 @@ class _Probe:
         voxels = (2e-3 / self.options.grid) ** 3
         volume = voxels * (1.0 if self.capture.head is not None else 2.0)  # the head's own, too
         if not seen:
-            add("envelope", 0.0, 3.0 * voxels, 0.3 * voxels)
+            add("envelope", 0.0, 4.5 * voxels, 0.3 * voxels)
             if lights:
                 self._orientation(add)
         if seen or method == "fused" or (method == "hull" and lights and self.pixel <= FINE_PIXEL):
@@ -247,12 +247,12 @@ class _Probe:
             if not sweep:  # lines that line stereo saw are many, and all get roots
                 fine = lights and self.pixel <= FINE_PIXEL
                 grown = 0.6 + 2.7e-5 * n if fine else 0.9 * volume + 7e-6 * n
-            add("field", 0.0, 2.9 * voxels, 0.8 * volume)
+            add("field", 0.0, 5.0 * voxels, 0.8 * volume)
             add("strands", 0.0, 7.0 + 2e-4 * n, grown)
             if sweep:
                 add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.3 + 4e-5 * n)
             if self.capture.head is not None:
-                add("roots", 0.0, 0.5 + 2e-5 * n, 0.2 + 2e-5 * n if sweep else grown)
+                add("roots", 0.0, 1.5 + 3e-5 * n, 0.2 + 2e-5 * n if sweep else grown)
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
