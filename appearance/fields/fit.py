@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,11 @@ def fit_pictures(
     return _Fit(views, places, scale, options or FieldOptions(), monitor or Monitor()).run()
 
 
+def within(progress: Progress, first: float, part: float, what: str, share: float) -> None:
+    """Tell `progress` of a `share` of the `part` that begins at `first`."""
+    progress(what, first + part * share)
+
+
 class _Fit:
     def __init__(
         self,
@@ -180,9 +186,7 @@ class _Fit:
                 data,
                 self.folds,
                 checkpoint,
-                lambda what, share, first=first, part=part: self.monitor.progress(  # type: ignore[misc]
-                    what, first + part * share
-                ),
+                partial(within, self.monitor.progress, first, part),
             )
             found.append((verdict, data))
         best, self.data = max(found, key=lambda one: one[0].gain[0])

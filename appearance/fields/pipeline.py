@@ -14,7 +14,7 @@ import numpy as np
 
 from appearance.bsdf.maps import MappedStrands
 from appearance.fields.anchors import Grid, Places
-from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures
+from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures, within
 from appearance.fields.hits import RECORD, HitOptions, find_hits
 from appearance.fields.options import FieldRequest, Kind
 from appearance.fields.pictures import Pictures
@@ -93,15 +93,9 @@ def fit_field(
     for k, kind in enumerate(kinds):
         options = replace(request.fit, kind=kind, beta_m=rendered.beta_m)
         first, part = 0.7 + 0.3 * k / len(kinds), 0.3 / len(kinds)
-        monitor = Monitor(
-            partial(_within, progress, first, part), folder / f"{kind}.checkpoint.npz"
-        )
+        monitor = Monitor(partial(within, progress, first, part), folder / f"{kind}.checkpoint.npz")
         fits.append(fit_pictures(views, places, rendered.scale, options, monitor))
     return max(fits, key=lambda found: found.gain[0])
-
-
-def _within(progress: Progress, first: float, part: float, what: str, share: float) -> None:
-    progress(what, first + part * share)
 
 
 def _pictures(
