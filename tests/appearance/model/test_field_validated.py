@@ -19,6 +19,7 @@ from appearance import (
     fit_field_validated,
     render_olat,
 )
+from appearance.fields import pipeline
 from appearance.fields.options import FieldOptions
 from appearance.model import validated
 from appearance.model.edit import cut, restyled
@@ -114,6 +115,26 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
         fitted.with_field_of(model, "additive")
 
 
+@pytest.mark.parametrize("weak", ["turns", "modulation"])
+def test_the_kind_stays_whose_left_out_pictures_gain_more(own, monkeypatch, weak):
+    """The other is held at 0 by its ridge, so that nothing is gained by it."""
+    capture, model = own
+    right, judged, found = pipeline.fit_pictures, validated.fit_field, []
+
+    def fitted(views, places, scale, options, monitor):
+        held = (1e9,) if options.kind == weak else options.ridges
+        return right(views, places, scale, replace(options, ridges=held), monitor)
+
+    def kept(*args, **more):
+        found.append(judged(*args, **more))
+        return found[-1]
+
+    monkeypatch.setattr(pipeline, "fit_pictures", fitted)
+    monkeypatch.setattr(validated, "fit_field", kept)
+    fit_field_validated(capture, model, request=replace(REQUEST, field="best"))
+    assert {found[0].field.kind, weak} == {"turns", "modulation"}
+
+
 def test_edited_hair_keeps_its_field(own, tmp_path):
     capture, model = own
     fit_field_validated(capture, model, request=REQUEST)
@@ -165,8 +186,6 @@ def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
 
 
 def test_a_killed_fit_renders_no_view_twice_and_memory_is_refused(own, monkeypatch):
-    from appearance.fields import pipeline
-
     capture, model = own
 
     def killed(what, share):
