@@ -1,7 +1,8 @@
 """The hair BSDF of a whole fibre's width: what one pixel sees of a fibre thinner than it.
 
 Seen across, a fibre shows every offset h in [-1, 1] alike. Each lobe is a longitudinal part M_p,
-which does not depend on h, times the mean over h of A_p N_p, which is tabulated here.
+which does not depend on h, times the mean over h of A_p N_p, which is tabulated here, for the whole
+width or for parts of it.
 """
 
 from __future__ import annotations
@@ -31,20 +32,24 @@ OFFSETS = 512
 """Offsets h that the mean is taken over."""
 COSINES, TURNS = 48, 256
 """Nodes of a `FarField`, of which the nearest counts: at grazing angles it is off by up to 10 %."""
+PARTS = 2
+"""Of the width of a `FarField`, which each have a mean of their own."""
 LEAST_BETA_N = 0.1
 """Azimuthal lobes of less are as narrow as a node of a `FarField`."""
 
 
 class FarField:
-    """`lobes.evaluate` averaged over the width of a fibre that is `hair` everywhere, in Dr.Jit.
+    """`lobes.evaluate` averaged over parts of the width of a fibre that is `hair` everywhere.
 
-    A ray that meets the fibre anywhere in its width finds this in the mean, and less noise.
+    A ray that meets the fibre anywhere in its width finds this in the mean, and less noise. Parts,
+    because in dense hair light has further to go to what lies deeper in a fibre's width: the mean
+    over all of it makes light between the demo's fibres 2.7 % too bright, over halves 0.5 %.
     """
 
     def __init__(self, hair: HairAppearance) -> None:
         cosines, turns = ((np.arange(n) + 0.5) / n for n in (COSINES, TURNS))
-        table = azimuthal_table(hair, cosines, pi * turns, TURNS)
-        self._table = mi.Float(for_kernels(table.transpose(1, 2, 3, 0).ravel()))
+        table = azimuthal_table(hair, cosines, pi * turns, TURNS, PARTS)
+        self._table = mi.Float(for_kernels(table.transpose(0, 2, 3, 4, 1).ravel()))
 
     def evaluate(self, fibre: Fibre, wi: Any, wo: Any, active: Any) -> Any:
         """Mean BSDF times cosine `Color3f` from `wi` to `wo`, per steradian.
@@ -57,7 +62,9 @@ class FarField:
         v = variances(fibre.beta_m)
         m = mi.Vector4f(*(m_p(sines[p], cosines[p], wo.y, other, v[p]) for p in range(LOBES)))
         turn = dr.acos(dr.clip(x * x_o + z * z_o, -1, 1))
-        row = dr.minimum(mi.UInt32(cosine * COSINES), COSINES - 1)
+        h = dr.select(z * x_o > x * z_o, x, -x)  # of turns the other way round, the mirror image's
+        part = dr.minimum(mi.UInt32((h + 1) * (PARTS / 2)), PARTS - 1)
+        row = part * COSINES + dr.minimum(mi.UInt32(cosine * COSINES), COSINES - 1)
         column = dr.minimum(mi.UInt32(turn * (TURNS / pi)), TURNS - 1)
         node = 3 * (row * TURNS + column)
         a_n = (dr.gather(mi.Vector4f, self._table, node + k, active) for k in range(3))
@@ -65,9 +72,9 @@ class FarField:
 
 
 def azimuthal_table(
-    hair: HairAppearance, cosines: Array, turns: Array, offsets: int = OFFSETS
+    hair: HairAppearance, cosines: Array, turns: Array, offsets: int = OFFSETS, parts: int = 1
 ) -> Array:
-    """Mean over the width of A_p N_p: `(LOBES, C, T, 3)`, per radian.
+    """Means over equal `parts` of the width of A_p N_p: `(parts, LOBES, C, T, 3)`, per radian.
 
     `cosines (C,)` in (0, 1] are those of the inclination of the direction towards the eye, `turns
     (T,)` the angle about the fibre from it to the direction towards the light, radians.
@@ -79,10 +86,10 @@ def azimuthal_table(
     gamma_t = refracted_azimuth(theta, gamma, hair.eta)
     t = [transmission(theta, gamma, hair.eta, s) for s in hair.sigma_a]
     s = logistic_scale(hair.beta_n)
-    out = np.empty((LOBES, len(cosines), len(turns), 3))
+    out = np.empty((parts, LOBES, len(cosines), len(turns), 3))
     for p in range(LOBES):
-        # the sign of the turn is that of h, over which the mean is symmetric
         n = n_p(p, turns[None, :, None], gamma, gamma_t, s)
         for channel in range(3):
-            out[p, ..., channel] = (a_p(p, f, t[channel]) * n).mean(axis=-1)
+            of_parts = np.split(a_p(p, f, t[channel]) * n, parts, axis=-1)
+            out[:, p, ..., channel] = np.mean(of_parts, axis=-1)
     return out

@@ -1,6 +1,7 @@
 """OLAT images against closed forms, Mitsuba's own path integrator, and Blender Cycles."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -143,23 +144,33 @@ def test_indirect_light_is_what_direct_light_lacks(small, tufted):
     assert not render_indirect(flat, camera, lights, pixels, spp=4, max_depth=4).any()
 
 
-def test_fibres_that_answer_by_their_width_scatter_less(tufted, monkeypatch):
-    """Beside fibres that answer where they are met: the same light, from a third of the paths."""
-    scene, camera, lights = tufted
+def test_fibres_that_answer_by_their_width_scatter_less(small, monkeypatch):
+    """Beside fibres that answer where they are met: the same light, and half of the noise.
+
+    In hair as dense as this the mean over the whole width has 4 % too much light.
+    """
+    strands = small.tuft()
+    dense = replace(strands, radius=3 * strands.radius)
+    scene, camera, lights = (
+        build_scene(dense, small.plane(), hair=HAIR),
+        small.camera(),
+        small.lights(),
+    )
     pixels = covered_pixels(scene, camera)
 
     def pictures():
         return np.stack(
             [
                 render_indirect(scene, camera, lights, pixels, spp=64, max_depth=6, seed=s)
-                for s in range(4)
+                for s in range(8)
             ]
         )
 
     width = pictures()
     monkeypatch.setattr(scene.hair_bsdf.parameters, "far_field", None)
     point = pictures()
-    np.testing.assert_allclose(width.mean((0, 2)), point.mean((0, 2)), rtol=0.04)
+    assert width.mean() == pytest.approx(point.mean(), rel=0.025)
+    np.testing.assert_allclose(width.mean((0, 2)), point.mean((0, 2)), rtol=0.06)
     assert width.var(axis=0, ddof=1).mean() < 0.6 * point.var(axis=0, ddof=1).mean()
 
 
