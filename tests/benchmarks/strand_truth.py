@@ -6,14 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from reconstruction import Capture, Model, Strands, read_strands
 from reconstruction.arrays import Array
 from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
+from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.voxels import VoxelGrid
 
 STEP = 5e-4
@@ -53,6 +56,28 @@ class Ball:
         out = VoxelGrid(hull.origin + low * hull.spacing, hull.spacing, part.copy())
         out.inside[out.inside] = self.holds(out.centers(), margin)
         return out
+
+
+def write_hair_masks(capture: Capture, truth_folder: Path) -> None:
+    """Write the user's masks of a capture that has none, from its true strands.
+
+    Sun's come from a network trained for it; a patch has no background by which to tell hair.
+    """
+    strands = read_strands(truth_folder / "strands.npz")
+    points = strands.resampled(STEP).points
+    (capture.path / "masks").mkdir(exist_ok=True)
+    for camera in capture.rig.cameras:
+        file = capture.path / "masks" / f"{camera.name}.png"
+        if file.exists():
+            continue
+        pixels, depth = camera.project(points)
+        on = (depth > 0) & camera.inside(pixels)
+        x, y = np.rint(pixels[on]).astype(int).T
+        nearest = np.full((camera.height, camera.width), np.inf)
+        np.minimum.at(nearest, (y, x), depth[on])
+        nearest = ndimage.minimum_filter(nearest, 3)  # strands are two to three pixels wide
+        skin = np.inf if capture.head is None else mesh_depth(camera, capture.head)
+        cv2.imwrite(str(file), (nearest < skin).astype(np.uint8) * 255)
 
 
 class StrandTruth:

@@ -1,7 +1,8 @@
 """Line stereo with and without lightcodes, and fused, on patches of two heads.
 
 And on the capture that Cycles rendered. Captures go through the wires once and are kept. Leaves
-`light_codes/SUBJECT/` with `patch.json` and the models, and `light_codes.json`.
+`light_codes/SUBJECT/` with `patch.json` and the models, and `light_codes.json`; with `--cleaner`
+`cleaner_frames.json`.
 """
 
 from __future__ import annotations
@@ -13,17 +14,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rich.console import Console
-from scipy import ndimage
 
-from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, cycles_folder, within
+from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, cycles_folder, option, within
+from benchmarks.light_codes.cleaner_frames import compare_frames
 from benchmarks.light_codes.rig import TARGETS, Patch, patch
 from benchmarks.light_codes.study import compare_filters, study_depths
 from benchmarks.pictures import picture_strands
 from benchmarks.results import save
-from benchmarks.strand_truth import STEP, StrandTruth
+from benchmarks.strand_truth import StrandTruth, write_hair_masks
 from reconstruction import (
     Capture,
     CaptureError,
@@ -39,7 +39,6 @@ from reconstruction import (
 )
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.orientation import texture
 from reconstruction.light_codes.line_strands import build_views
 from reconstruction.masks import MaskedCapture, hair_masks
@@ -51,28 +50,9 @@ from stage_service.cli.support.tables import geometry_table
 METHODS: tuple[Method, ...] = ("lmvs", "photometric", "fused")
 CAMERAS, LIGHTS = (12, 6), (18, 9)
 OPTIONS = ReconstructOptions()
-
-
-def write_hair_masks(capture: Capture, truth_folder: Path) -> None:
-    """Write the user's masks of a capture that has none, from its true strands.
-
-    Sun's come from a network trained for it; a patch has no background by which to tell hair.
-    """
-    strands = read_strands(truth_folder / "strands.npz")
-    points = strands.resampled(STEP).points
-    (capture.path / "masks").mkdir(exist_ok=True)
-    for camera in capture.rig.cameras:
-        file = capture.path / "masks" / f"{camera.name}.png"
-        if file.exists():
-            continue
-        pixels, depth = camera.project(points)
-        on = (depth > 0) & camera.inside(pixels)
-        x, y = np.rint(pixels[on]).astype(int).T
-        nearest = np.full((camera.height, camera.width), np.inf)
-        np.minimum.at(nearest, (y, x), depth[on])
-        nearest = ndimage.minimum_filter(nearest, 3)  # strands are two to three pixels wide
-        skin = np.inf if capture.head is None else mesh_depth(camera, capture.head)
-        cv2.imwrite(str(file), (nearest < skin).astype(np.uint8) * 255)
+CLEANER = option(
+    "--cleaner", "only one small patch, by the noise of its frames", action="store_true"
+)
 
 
 def part_of(capture: Capture, cameras: int | None = None, lights: int | None = None) -> Capture:
@@ -195,6 +175,13 @@ def run_imported(
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Every patch of `TARGETS`, or one; fewer cameras and lights, and `study`, on Sintel's only."""
+    if args.cleaner:
+        found = compare_frames(
+            args.out / "cleaner_frames", seed=args.seed, quick=args.quick, progress=progress
+        )
+        Console(stderr=True).print(geometry_table(found))
+        save(args.out / "cleaner_frames.json", found)
+        return found
     if args.only not in (None, *TARGETS):
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(TARGETS)}")
     names = ["wavy"] if args.quick else [n for n in TARGETS if args.only in (None, n)]
@@ -218,4 +205,4 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     return results
 
 
-BENCHMARK = Benchmark(run, (CACHE, ONLY))
+BENCHMARK = Benchmark(run, (CACHE, ONLY, CLEANER))

@@ -32,9 +32,17 @@ class Patch:
     ball: Ball
 
 
-def rig_text(target: tuple[float, float, float], side: int = SIDE, cameras: int = CAMERAS) -> str:
-    """A rig file: cameras on the upper hemisphere, a light beside each, and half as many more."""
-    optics = Optics(target, math.degrees(2 * math.atan(SIDE * PITCH / 2 / DISTANCE)))
+def rig_text(
+    target: tuple[float, float, float],
+    side: int = SIDE,
+    cameras: int = CAMERAS,
+    width: float = SIDE * PITCH,
+) -> str:
+    """A rig file: cameras on the upper hemisphere, a light beside each, and half as many more.
+
+    Pictures of `side` pixels show `width` metres.
+    """
+    optics = Optics(target, math.degrees(2 * math.atan(width / 2 / DISTANCE)))
     devices = [
         optics.device("cameras", k, [p + t for p, t in zip(place, target, strict=True)])
         + f"width = {side}\nheight = {side}"
