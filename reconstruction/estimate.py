@@ -14,7 +14,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from reconstruction.capture.folder import Capture, MissingFrame, Step, StepKind
+from reconstruction.capture.folder import Capture, CaptureError, MissingFrame, Step, StepKind
 from reconstruction.capture.kept_frames import kept_bytes
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.orientation import responses
@@ -187,7 +187,10 @@ class _Probe:
             some = {view.a_frame(kind, n) for n in range(4 if kind == "olat" else 1)}
             image = np.sum([self.capture.frame(*f).mean(axis=-1) for f in some], axis=0)
             shares.append((image > 0.05 * np.percentile(image, 99.5)).mean())
-        return float(np.mean(shares or [0.3])) * self.shown
+        share = float(np.mean(shares or [0.3]))
+        if share == 0:
+            raise CaptureError(f"{self.capture.path}: no camera shows hair: check masks and frames")
+        return share * self.shown
 
     @cached_property
     def pixel(self) -> float:

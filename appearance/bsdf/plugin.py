@@ -77,7 +77,7 @@ def plugin() -> Any:
             return dr.select(active, mi.Color3f(value), 0), dr.select(active, pdf, 0)
 
         def eval_mean(self, si: Any, wo: Any, active: Any) -> Any:
-            """`eval` averaged over the fibre's width; `eval` itself where the hair varies."""
+            """`eval` averaged over half of the width (`FarField`); itself where the hair varies."""
             far_field = self.parameters.far_field
             if far_field is None:
                 return self.eval(mi.BSDFContext(), si, wo, active)

@@ -13,6 +13,7 @@ from appearance.fields.anchors import Grid, Places
 from appearance.fields.form import Form
 from appearance.fields.hits import HitOptions, Hits, find_hits
 from appearance.fields.options import Kind
+from appearance.fields.turns import DEGREE
 from appearance.render.harmonics import count_of
 from appearance.render.pixel_field import PixelField
 from appearance.scene.hair_scene import HairScene
@@ -113,6 +114,8 @@ class Field:
             grid = Grid(*(int(n) for n in data["grid"]))
             rows, values = data["rows"].astype(np.int64), data["values"].astype(np.float32)
             beta_m = float(data["beta_m"]) if "beta_m" in data else 0.0
+            if kind == "turns" and not (0 < beta_m <= 1 and degree == DEGREE):
+                raise ValueError(f"turns of beta_m {beta_m}, degree {degree}")
             form = Form(kind or "modulation", degree, beta_m)
             if kind is None or values.shape != (len(rows), form.count * 3):
                 raise ValueError(f"kind {data['kind']}, degree {degree}, values {values.shape}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from reconstruction.options import Count, options
 
@@ -12,8 +12,21 @@ Kind = Literal["turns", "modulation", "additive", "whole"]
 """What a field is of: a factor on inverse rendering's light and turns of its fibres, harmonics of
 such a factor, of what is added to it, or of all light."""
 Degree = Annotated[int, Field(ge=0, le=3)]
-Level = tuple[Count, Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+Positive = Annotated[float, Field(gt=0)]
 
+
+def _both_or_none(level: tuple[int, int, int]) -> tuple[int, int, int]:
+    if (level[1] == 0) != (level[2] == 0):
+        raise ValueError(f"a level is (n_c, w, h) or (n_c, 0, 0), got {level}")
+    return level
+
+
+Level = Annotated[
+    tuple[Count, Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]],
+    AfterValidator(_both_or_none),
+]
+
+RIDGES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
 NESTED: tuple[Level, ...] = ((2, 4, 4), (4, 12, 12), (8, 32, 32))
 OF_TURNS: tuple[Level, ...] = ((4, 4, 4), (8, 10, 10), (12, 24, 24))
 
@@ -38,10 +51,10 @@ class FieldOptions:
 
     kind: Kind = "modulation"
     beta_m: Annotated[float, Field(gt=0, le=1)] = 0.3
-    stiffness: tuple[Annotated[float, Field(gt=0)], ...] = (10.0, 0.1)
+    stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (10.0, 0.1)
     degree: Degree = 1
-    levels: tuple[Level, ...] | None = None
-    ridges: tuple[Annotated[float, Field(gt=0)], ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
+    levels: Annotated[tuple[Level, ...], Field(min_length=1)] | None = None
+    ridges: Annotated[tuple[Positive, ...], Field(min_length=1)] = RIDGES
     iterations: Count = 40
     tolerance: Annotated[float, Field(gt=0)] = 0.01
     folds: Annotated[int, Field(ge=2, le=16)] = 3

@@ -95,7 +95,12 @@ def fit_field(
         first, part = 0.7 + 0.3 * k / len(kinds), 0.3 / len(kinds)
         monitor = Monitor(partial(within, progress, first, part), folder / f"{kind}.checkpoint.npz")
         fits.append(fit_pictures(views, places, rendered.scale, options, monitor))
-    return max(fits, key=lambda found: found.gain[0])
+    return better(fits)
+
+
+def better(fits: Sequence[FieldFit]) -> FieldFit:
+    """The fit that gains most of those whose left-out pictures leave no doubt, or of all."""
+    return max(fits, key=lambda found: (not found.doubts(), found.gain[0]))
 
 
 def _pictures(
@@ -144,6 +149,10 @@ def _materials(scene: HairScene) -> Sequence[Any]:
 
 def memory_needed(pixels: Sequence[int], lights: int, strands: int, request: FieldRequest) -> float:
     """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
+    if request.field == "best":
+        kinds: tuple[Kind, ...] = ("turns", "modulation")
+        each = (replace(request, field=kind) for kind in kinds)
+        return max(memory_needed(pixels, lights, strands, one) for one in each)
     folds = request.fit.folds
     kind: Kind = "turns" if request.field == "turns" else "modulation"
     levels = replace(request.fit, kind=kind).grids

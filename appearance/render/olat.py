@@ -102,8 +102,8 @@ def render_indirect(
     """What `render_olat` sees of light that has met more than one surface: `(L, P, 3)`.
 
     It is the material's alone, without the scene's field. Fibres behind the first answer by the
-    mean over their width, where a ray may meet them anywhere: a third of the variance on hair that
-    is the same everywhere. Other hair answers as it does in `render_olat`.
+    mean over half of their width, where a ray may meet them anywhere: half of the variance on hair
+    that is the same everywhere. Other hair answers as it does in `render_olat`.
     """
     view = _View(scene, camera, lights, pixel_indices(camera, pixels))
     return _rendered(view, OlatOptions(**options), seed, indirect=True)

@@ -41,7 +41,7 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
 class Surface:
     """How the surfaces of `scene` answer light; made once a kernel.
 
-    With `mean_width` a fibre answers by the mean over its width, where its material allows it.
+    With `mean_width` a fibre answers by the mean over half of its width, where its material does.
     """
 
     scene: HairScene

@@ -225,7 +225,7 @@ def _smoothed_together(lines: Sequence[Array], sigma: float) -> list[Array]:
         for i in (place - k, place + k):
             turn, j = np.divmod(i, period)
             back = j > last - begin
-            there = x[begin + np.where(back, period - j, j)]
+            there = x[begin + np.where(back, np.minimum(period - j, last - begin), j)]
             there = np.where(back[:, None], 2 * x[last] - there, there)
             total += weight[:, None] * (there + (2 * turn)[:, None] * across)
     return np.split(total / weights[:, None], ends[:-1])

@@ -24,7 +24,9 @@ PULL = 0.6
 LEAST_SUPPORT = 0.5
 SPACING = 0.4
 
-_TOGETHER = 500  # strands that are traced at once; as soon as one ends another begins
+# Strands that are traced at once, as soon as one ends another begins: few of few lines, because
+# those that begin together do not yet know which lines the others will pass.
+_TOGETHER, _LINES_EACH = 500, 200
 
 
 @dataclass(frozen=True)
@@ -89,25 +91,25 @@ class LineCloud:
 
 
 class _Pool:
-    """Strands in the making: `_TOGETHER` at most, both ways from where each began.
+    """`size` strands in the making at most, both ways from where each began.
 
-    Way k and way `_TOGETHER` + k are one strand's: ahead and back.
+    Way k and way `size` + k are one strand's: ahead and back.
     """
 
-    def __init__(self, cloud: LineCloud, options: SurfaceOptions) -> None:
-        self._cloud, ways = cloud, 2 * _TOGETHER
+    def __init__(self, cloud: LineCloud, options: SurfaceOptions, size: int) -> None:
+        self._cloud, self._size, ways = cloud, size, 2 * size
         self._most = int(options.longest / cloud.step)
         self._rows = np.zeros((ways, self._most + 1, 3))
         self._counts = np.zeros(ways, np.int64)
         self._goes = np.zeros(ways, bool)
         self._p, self._d = np.zeros((ways, 3)), np.zeros((ways, 3))
-        self.busy = np.zeros(_TOGETHER, bool)
+        self.busy = np.zeros(size, bool)
 
     def begin(self, starts: Array, along: Array) -> None:
         """Set out from `starts (N, 3)` along `along (N, 3)`; N places at least must be free."""
         k = np.flatnonzero(~self.busy)[: len(starts)]
         self.busy[k] = True
-        for ways, sign in ((k, 1.0), (k + _TOGETHER, -1.0)):
+        for ways, sign in ((k, 1.0), (k + self._size, -1.0)):
             self._p[ways], self._d[ways] = starts, sign * along
             self._rows[ways, 0] = starts
             self._counts[ways] = 1
@@ -125,10 +127,11 @@ class _Pool:
         self._rows[ways, self._counts[ways]] = self._p[ways]
         self._counts[ways] += 1
         self._goes[ways[self._counts[ways] > self._most]] = False
-        ended = np.flatnonzero(self.busy & ~self._goes[:_TOGETHER] & ~self._goes[_TOGETHER:])
+        ahead, back = np.split(self._goes, 2)
+        ended = np.flatnonzero(self.busy & ~ahead & ~back)
         self.busy[ended] = False
-        both = ((self._way(_TOGETHER + k), self._way(k)) for k in ended.tolist())
-        return [np.concatenate([back[:0:-1], ahead]) for back, ahead in both]
+        both = ((self._way(self._size + k), self._way(k)) for k in ended.tolist())
+        return [np.concatenate([first[:0:-1], then]) for first, then in both]
 
     def _way(self, k: int) -> Array:
         return self._rows[k, : self._counts[k]]
@@ -144,7 +147,7 @@ def surface_strands(
     if not len(lines.points):
         return []
     cloud = LineCloud(lines, options)
-    pool = _Pool(cloud, options)
+    pool = _Pool(cloud, options, min(_TOGETHER, -(-len(lines.points) // _LINES_EACH)))
     order = np.random.default_rng(seed).permutation(len(lines.points))
     found: list[Array] = []
     while len(order) or pool.busy.any():

@@ -321,6 +321,14 @@ def test_what_cannot_be_done_without_is_named(
         reconstruct(unswept, Model(tmp_path), method="guess")  # type: ignore[arg-type]
 
 
+def test_an_estimate_of_no_hair_names_the_masks(
+    unswept: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Capture, "mask", lambda self, name: np.zeros((96, 96), bool))
+    with pytest.raises(CaptureError, match="no camera shows hair: check masks and frames"):
+        estimate(unswept, options=QUICK)
+
+
 def test_no_strand_is_an_error_that_says_what_to_do(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

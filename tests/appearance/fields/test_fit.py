@@ -9,14 +9,15 @@ import pytest
 
 from appearance.fields.anchors import Grid, Places, nested
 from appearance.fields.basis import ViewBasis
-from appearance.fields.fit import Monitor, fit_pictures
+from appearance.fields.fit import FieldFit, Monitor, fit_pictures
 from appearance.fields.form import Form
 from appearance.fields.grams import Gram, Samples
 from appearance.fields.options import FieldOptions
+from appearance.fields.pipeline import better
 from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conjugate_gradients
-from appearance.fields.validation import Folds
+from appearance.fields.validation import GROUPS, Folds
 from appearance.render.harmonics import harmonics
-from reconstruction import Light
+from reconstruction import BadOptions, Light, parse_options
 
 LEVELS = ((2, 3, 3), (4, 6, 6))
 EXACT = FieldOptions(
@@ -265,6 +266,24 @@ def per_view(planted, seed, noise=0.05):
         frames = view.halves[0] * factor * (1 + noise * rng.normal(size=factor.shape))
         out.append(replace(view, captured=np.maximum(frames, 0).astype(np.float32)))
     return out
+
+
+def test_of_two_kinds_one_without_doubt_is_better_than_one_that_gains_more():
+    def judged(gain, spread):
+        groups = {g: {"without": 20.0, "with": 20 + gain, "spread": spread} for g in GROUPS}
+        return FieldFit(None, 0.1, groups, (gain, spread), [], 0.0)
+
+    sure, unsure = judged(0.45, 0.05), judged(0.5, 0.4)
+    assert better([unsure, sure]) is sure
+    assert better([unsure, judged(0.3, 0.4)]) is unsure
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"ridges": []}, {"stiffness": []}, {"levels": []}, {"levels": [[4, 0, 3]]}], ids=str
+)
+def test_options_that_no_fit_could_have_are_refused_before_it(wrong):
+    with pytest.raises(BadOptions):
+        parse_options(FieldOptions, wrong, "fit")
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

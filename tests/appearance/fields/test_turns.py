@@ -18,7 +18,7 @@ from appearance.fields.pictures import Pictures
 from appearance.fields.turns import turning_features
 from appearance.render.coverage import coverage
 from appearance.render.harmonics import harmonics
-from reconstruction import Camera, Light, Model
+from reconstruction import Camera, Light, Model, ModelError
 from reconstruction.geometry.lights import dome_positions
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.3, 0.3)
@@ -107,3 +107,7 @@ def test_a_field_of_turns_is_read_as_it_was_written(turned, tmp_path):
     assert (again.kind, again.beta_m) == ("turns", OPTIONS.beta_m)
     hits = views[1].hits
     np.testing.assert_array_equal(field.at(hits).coefficients, again.at(hits).coefficients)
+    for wrong in (np.nan, 0.0, 2.0):
+        replace(field, beta_m=wrong).save(model)
+        with pytest.raises(ModelError, match="turns of beta_m"):
+            Field.load(model)

@@ -45,7 +45,9 @@ def test_smoothing_keeps_the_ends_and_takes_the_jitter() -> None:
 def test_lines_that_are_smoothed_together_know_nothing_of_one_another() -> None:
     """Straight ones stay as they are, however short; a wave loses what a Gaussian takes of it."""
     rng = np.random.default_rng(5)
-    straight = [np.arange(n)[:, None] * [2e-4, 1e-4, 0] + rng.normal(size=3) for n in (2, 3, 5, 60)]
+    straight = [
+        np.arange(n)[:, None] * [2e-4, 1e-4, 0] + rng.normal(size=3) for n in (1, 2, 3, 5, 60)
+    ]
     x = np.arange(400) * 1e-4
     wave = np.stack([x, 1e-5 * np.sin(2 * np.pi * x / 5e-3), 0 * x], axis=1)
     *found, waved = smoothed([*straight, wave], 1e-3)
