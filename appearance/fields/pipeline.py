@@ -150,8 +150,7 @@ def _materials(scene: HairScene) -> Sequence[Any]:
 def memory_needed(pixels: Sequence[int], lights: int, strands: int, request: FieldRequest) -> float:
     """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
     if request.field == "best":
-        kinds: tuple[Kind, ...] = ("turns", "modulation")
-        each = (replace(request, field=kind) for kind in kinds)
+        each = replace(request, field="turns"), replace(request, field="modulation")
         return max(memory_needed(pixels, lights, strands, one) for one in each)
     folds = request.fit.folds
     kind: Kind = "turns" if request.field == "turns" else "modulation"

@@ -18,7 +18,6 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import (
     NoSilhouette,
     background_noise,
-    light_response,
     lit_image,
 )
 
@@ -59,7 +58,7 @@ def gather_shading(
             for name in lights if len(pixels) else ():
                 if not capture.has_light(name, c.name):
                     continue
-                image, saturated = light_response(capture, name, c.name)
+                image, saturated = capture.light(name, c.name)
                 x, y = pixels.T
                 ok = ~saturated[y, x]
                 values = image[y, x][ok].astype(np.float64)
@@ -87,7 +86,7 @@ def glints_of(
     out = []
     for (number, capture), c, name in product(enumerate(captures), cameras, lights):
         if capture.has_light(name, c.name):
-            image, saturated = light_response(capture, name, c.name)
+            image, saturated = capture.light(name, c.name)
             highlight = find_highlight(image.mean(axis=-1), saturated)
             if highlight is not None:
                 out.append(Glint(name, c, number, highlight))

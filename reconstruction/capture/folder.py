@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats
+from reconstruction.capture.stray_light import stray_light
 from reconstruction.containment import NotContained, inside, plain_file
 from reconstruction.files.exr import read_exr
 from reconstruction.files.masks import read_mask
@@ -138,6 +139,7 @@ class Capture:
         self._lenses: dict[str, Lens] = {}
         self._by = 1
         self._kept: KeptFrames | None = None
+        self._stray: tuple[tuple[str, tuple[int, ...]], Floats | None] | None = None
 
     def view(
         self,
@@ -158,6 +160,7 @@ class Capture:
         """
         out = copy.copy(self)
         out.__dict__.pop("_of_light", None)
+        out._stray = None
         chosen = list(self.rig.cameras)
         if cameras is not None:
             names = self._known("camera", cameras, [c.name for c in chosen])
@@ -309,27 +312,53 @@ class Capture:
     def light(self, light: str, camera: str) -> tuple[Floats, Bools]:
         """Response `(H, W, 3)` to one light alone, and where `(H, W)` it is saturated.
 
-        Where the light was shot with several exposures, their mean with the weight of exposure
-        (the photons counted), without saturated pixels; saturated is what even the shortest
-        exposure saturates. Raises `MissingFrame` where none of them came.
+        Light that the dark frames of the nearest exposure hold is taken off (`stray_light`). Where
+        the light was shot with several exposures, their mean with the weight of exposure (the
+        photons counted), without saturated pixels; saturated is what even the shortest exposure
+        saturates. Raises `MissingFrame` where none of them came.
         """
         steps = self._of_light.get(light)
         if steps is None:
             raise MissingFrame(f"{self.path}: the plan has no frame for the light {light!r}")
         steps = [s for s in steps if self.has(s, camera)] or steps[:1]
         if len(steps) == 1:
-            return self.response_and_saturated(steps[0], camera)
+            return self._answer(steps[0], camera)
         total = np.zeros((*self._shape(camera), 3), np.float32)
         weight = np.zeros(self._shape(camera), np.float32)
         by_exposure = sorted(steps, key=lambda s: s.exposure)
-        shortest, clipped = self.response_and_saturated(by_exposure[0], camera)
+        shortest, clipped = self._answer(by_exposure[0], camera)
         for step in by_exposure:
-            image, saturated = self.response_and_saturated(step, camera)
+            image, saturated = self._answer(step, camera)
             used = np.float32(step.exposure) * ~saturated
             total += used[..., None] * image
             weight += used
         merged = total / np.maximum(weight, np.finfo(np.float32).tiny)[..., None]
         return np.where(weight[..., None] > 0, merged, shortest), clipped
+
+    def _answer(self, step: Step, camera: str) -> tuple[Floats, Bools]:
+        """`response_and_saturated` without the light of dark frames."""
+        image, saturated = self.response_and_saturated(step, camera)
+        stray = self._stray_light(camera, step.exposure)
+        if stray is not None:
+            image = image - stray / np.float32(step.level or 1.0)
+        return image, saturated
+
+    def _stray_light(self, camera: str, exposure: float) -> Floats | None:
+        """Kept of one camera: frames are read camera by camera."""
+        steps = self.dark_steps(camera, exposure)
+        key = camera, tuple(s.index for s in steps)
+        if self._stray is None or self._stray[0] != key:
+            dark = [self.frame(s, camera) for s in steps]
+            self._stray = key, stray_light(np.mean(dark, axis=0)) if dark else None
+        return self._stray[1]
+
+    def dark_steps(self, camera: str, exposure: float | None = None) -> list[Step]:
+        """The dark frames that `camera` wrote; with `exposure` those at the nearest one."""
+        steps = [s for s in self.of_kind("dark") if self.has(s, camera)]
+        if exposure is None or not steps:
+            return steps
+        nearest = min((s.exposure for s in steps), key=lambda e: abs(e - exposure))
+        return [s for s in steps if s.exposure == nearest]
 
     @cached_property
     def _of_light(self) -> dict[str, list[Step]]:

@@ -26,10 +26,7 @@ def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> Fl
 
     With `exposure`, only the dark frames at the nearest exposure count.
     """
-    steps = [s for s in capture.of_kind("dark") if capture.has(s, camera)]
-    if exposure is not None and steps:
-        nearest = min((s.exposure for s in steps), key=lambda e: abs(e - exposure))
-        steps = [s for s in steps if s.exposure == nearest]
+    steps = capture.dark_steps(camera, exposure)
     c = capture.rig.camera(camera)
     if not steps:
         return np.zeros((c.height, c.width, 3), np.float32)
@@ -44,19 +41,8 @@ def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> 
 def dark_response(capture: Capture, step: Step, camera: str) -> tuple[Floats, Bools]:
     """The frame less the dark one, at full level `(H, W, 3)`, and where it is saturated."""
     image, saturated = capture.response_and_saturated(step, camera)
-    return image - _dark_of(capture, step, camera), saturated
-
-
-def light_response(capture: Capture, light: str, camera: str) -> tuple[Floats, Bools]:
-    """`Capture.light` less the dark frame, at full level `(H, W, 3)`, and where it is saturated."""
-    image, saturated = capture.light(light, camera)
-    step = next(s for s in capture.of_kind("olat") if s.light == light)
-    return image - _dark_of(capture, step, camera), saturated
-
-
-def _dark_of(capture: Capture, step: Step, camera: str) -> Floats:
-    level = step.level if step.level > 0 else 1.0
-    return dark_rgb(capture, camera, step.exposure) / np.float32(level)
+    dark = dark_rgb(capture, camera, step.exposure)
+    return image - dark / np.float32(step.level or 1.0), saturated
 
 
 def background_noise(image: AnyFloats) -> float:

@@ -15,7 +15,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import orientations
-from reconstruction.images.silhouettes import dark_frame, noise_of_frames
+from reconstruction.images.silhouettes import noise_of_frames
 from reconstruction.light_codes.codes import CodeMap, along_lines, code_map
 from reconstruction.reconstruct_options import LogGaborBank
 from reconstruction.report.report import Progress, Stage, silent
@@ -144,7 +144,6 @@ def _view(
     shot = np.array([capture.has_light(n, camera.name) for n in names])
     if not shot.any():
         raise CaptureError(f"{capture.path}: {camera.name} has no frame of a single light")
-    dark = dark_frame(capture, camera.name)
     for i, (name, light) in enumerate(zip(names, lights, strict=True)):
         if not shot[i]:
             continue
@@ -156,7 +155,7 @@ def _view(
                 f"{capture.path}: the light {name} sends nothing towards {at.tolist()}: check its "
                 "intensity and aim in rig.json"
             )
-        images[i] = (grey(image) - dark) / irradiance
+        images[i] = grey(image) / irradiance
     noise = noise_of_frames(images[shot])
     found = orientations(images[shot], mask, bank, known=~clipped[shot])
     away = [np.linalg.norm(x.position - camera.center) for x in lights]

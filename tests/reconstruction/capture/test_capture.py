@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,14 @@ from reconstruction import (
     Rig,
     Step,
 )
+from reconstruction.capture.stray_light import stray_light
 
 RIG = Rig(
     "one",
     (Camera.look_at("cam_0", 8, 6, [0, -1, 0], [0, 0, 0], 20),),
     tuple(Light(f"light_{i}", np.array([i, 1, 1]), np.ones(3)) for i in range(4)),
 )
+SHARP = Camera.look_at("cam_0", 80, 60, [0, -1, 0], [0, 0, 0], 20)
 # Shot in another order than the rig's, and without light_1.
 STEPS = (
     Step(0, "dark", 0.02, 0.0),
@@ -69,6 +72,43 @@ def test_missing_frames_say_why(capture):
 
 def test_a_dark_frame_is_its_own_response(capture):
     np.testing.assert_array_equal(capture.response(STEPS[0], "cam_0"), 0.0)
+
+
+def lit_beside(folder: Path, stray: float, noise: float) -> Capture:
+    """A quarter of each frame has `stray` light; light_0 sends 0.3 at half level on top of it."""
+    rng, rig = np.random.default_rng(0), replace(RIG, cameras=(SHARP,))
+    there = np.zeros((60, 80, 3))
+    there[:30, :40] = stray
+    steps = (
+        Step(0, "dark", 0.02, 0.0),
+        Step(1, "dark", 0.5, 0.0),
+        Step(2, "olat", 0.02, 0.5, light="light_0"),
+    )
+    writer = CaptureWriter.create(folder, rig, {"steps": steps})
+    for step, light in zip(steps, (there, 9 * there, there + 0.15), strict=True):
+        image = light + noise * rng.standard_normal(there.shape)
+        writer.write_frame(step, "cam_0", image.astype(np.float32))
+    writer.finish("completed", {})
+    return Capture(folder)
+
+
+@pytest.mark.parametrize(("stray", "noise"), [(0.05, 0.0), (0.05, 0.01), (5.0, 0.01)])
+def test_light_in_dark_frames_of_the_same_exposure_is_taken_off(tmp_path, stray, noise):
+    image, _ = lit_beside(tmp_path / "c", stray, noise).light("light_0", "cam_0")
+    for part in (image[4:26, 4:36], image[34:, 44:]):
+        assert part.mean() == pytest.approx(0.3, abs=0.2 * noise + 1e-6)
+
+
+def test_noise_in_dark_frames_is_not(tmp_path):
+    capture = lit_beside(tmp_path / "c", 0.0, 0.01)
+    image, _ = capture.light("light_0", "cam_0")
+    np.testing.assert_array_equal(image, capture.response(capture.steps[2], "cam_0"))
+
+
+def test_a_dark_frame_that_is_no_picture_is_refused():
+    with pytest.raises(ValueError, match="not numbers"):
+        stray_light(np.full((8, 8, 3), np.nan, np.float32))
+    assert stray_light(np.zeros((1, 1, 3), np.float32)) is None
 
 
 def test_a_mask_of_the_wrong_size_is_named(capture):
