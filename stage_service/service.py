@@ -343,10 +343,17 @@ class Service:
         return self._control.blackout(by, self._captures.blackout)
 
     def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:
-        """Take a person's word that the lamps are off. Raises `CannotAcknowledge`."""
-        work, detail = self._captures.stage.latch.acknowledge, f"{request.name}: {request.note}"
-        self._control.do(by, "acknowledge", work, detail=detail)
-        return self._captures.stage.darkness()
+        """Take a person's word that the lamps are off. They may still be at the stage: what waits
+        begins when somebody says so, as after a blackout. Raises `CannotAcknowledge`, `Leased`."""
+        stage, said = self._captures.stage, f"{request.name}: {request.note}"
+
+        def work() -> None:
+            stage.latch.check_acknowledge()
+            self.queue.hold(f"lamps acknowledged as off by {by}")
+            stage.acknowledge(said)
+
+        self._control.do(by, "acknowledge", work, detail=said)
+        return self._captures.safety()
 
     def record_login(self, name: str, address: tuple[str, int] | None) -> None:
         """Note in the audit log who logged in, and from where."""

@@ -31,6 +31,8 @@ def run_status(_args: argparse.Namespace, output: Output, service: ServiceClient
     doing = f"capture {health['capture']} runs" if health["capture"] else "no capture runs"
     worker = "a worker is there" if health["worker"] else "no worker is there"
     lines = [f"{health['status']}: lamps {health['lamps']}, {doing}, {worker}", *health["problems"]]
+    if health["latch"] is None and health["lamps"] not in ("dark", "in use"):
+        lines.append(health["lamps_detail"])
     output.result(health, "\n".join(lines))
 
 
