@@ -21,7 +21,8 @@ class Queueing:
 
     `prepare(request, armed_by)` is what starts a capture. Nothing begins by itself while another
     capture runs, the stage is latched or not known to be dark, or somebody holds the lease; after a
-    blackout, an abort, or a capture that did not complete, somebody has to say that it may go on.
+    blackout, an acknowledgement, an abort, or a capture that did not complete, somebody has to say
+    that it may go on.
     """
 
     def __init__(

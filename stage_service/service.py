@@ -343,10 +343,17 @@ class Service:
         return self._control.blackout(by, self._captures.blackout)
 
     def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:
-        """Take a person's word that the lamps are off. Raises `CannotAcknowledge`."""
-        work, detail = self._captures.stage.latch.acknowledge, f"{request.name}: {request.note}"
-        self._control.do(by, "acknowledge", work, detail=detail)
-        return self._captures.stage.darkness()
+        """Take a person's word that the lamps are off. They may still be at the stage: what waits
+        begins when somebody says so, as after a blackout. Raises `CannotAcknowledge`, `Leased`."""
+        stage, said = self._captures.stage, f"{request.name}: {request.note}"
+
+        def work() -> None:
+            stage.latch.check_acknowledge()
+            self.queue.hold(f"lamps acknowledged as off by {by}")
+            stage.acknowledge(said)
+
+        self._control.do(by, "acknowledge", work, detail=said)
+        return self._captures.safety()
 
     def record_login(self, name: str, address: tuple[str, int] | None) -> None:
         """Note in the audit log who logged in, and from where."""
@@ -359,14 +366,14 @@ class Service:
 
     def health(self) -> Health:
         """How service, lamps and jobs are; asks no device and no database."""
-        lamps = self._captures.safety()
+        lamps, latched = self._captures.safety(), self._captures.stage.latch.latched
         problems = [p for p in (self._queue.set_aside, self._queue.problem) if p is not None]
         if damaged := self._verifier.damaged:
             problems.append(f"damaged when they were last read again: {', '.join(damaged[:5])}")
-        if lamps["latched"] is not None:
-            problems.insert(0, lamps["detail"])
+        if latched is not None:
+            problems.insert(0, latched.detail)
         return Health(
-            status="unsafe" if lamps["latched"] else "degraded" if problems else "ok",
+            status="unsafe" if latched else "degraded" if problems else "ok",
             version=version("hairstage"),
             rig=self.rig_file.rig.name,
             root=str(self.root),
@@ -375,7 +382,7 @@ class Service:
             unread=self.unread,
             lamps=lamps["state"],
             lamps_detail=lamps["detail"],
-            latch=LatchView.of(self._captures.stage.latch.latched),
+            latch=LatchView.of(latched),
             disk_free_bytes=self.watching.free_bytes(),
             problems=problems,
         )

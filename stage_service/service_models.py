@@ -233,11 +233,13 @@ class LatchView(BaseModel):
 class Health(BaseModel):
     """How the service is, as far as it knows without asking a device or the job database.
 
-    `status`: "unsafe" while nobody knows whether the lamps are off, "degraded" where something else
-    is wrong; `problems` has a sentence for each. `worker`: whether one runs; `unread`: captures on
-    the disk that are not listed yet; `lamps`: "dark", "in use" or "unknown, unsafe", `lamps_detail`
-    how that is known. `latch` is there while nothing may be lit. `disk_free_bytes` is the root
-    folder's, None where the disk does not answer.
+    `status`: "unsafe" while `latch` is there: a blackout has failed, and nothing may be lit until
+    that is over; "degraded" where something else is wrong; `problems` has a sentence for each. What
+    is known of the lamps now is `lamps`: "dark", "said to be dark" (by somebody who looked), "in
+    use" or "unknown, unsafe", `lamps_detail` how that is known. Beside "ok" they are unknown before
+    the first blackout, during one, and after each of a bank that is accepted without read-back.
+    `worker`: whether one runs; `unread`: captures on the disk that are not listed yet;
+    `disk_free_bytes` is the root folder's, None where the disk does not answer.
     """
 
     status: Literal["ok", "degraded", "unsafe"]

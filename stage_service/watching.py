@@ -63,8 +63,8 @@ class Watching:
 
     def problems(self) -> list[str]:
         """Why no capture could begin, a sentence each; one that runs is no reason."""
-        safety, disk = self.captures.safety(), self._disk.get()
-        found = [safety["detail"]] if safety["state"] == "unknown, unsafe" else []
+        not_dark, disk = self.captures.not_dark(), self._disk.get()
+        found = [] if not_dark is None else [not_dark]
         free = disk["free"]
         if disk["gone"]:
             found.append(disk["gone"])
@@ -80,7 +80,8 @@ class Watching:
         captures, disk, jobs = self.captures, self._disk.get(), self.follower.waiting
         safety, running = captures.safety(), captures.running_state
         yield _one("start_time_seconds", "when the service started", self._started)
-        yield _one("latched", "1 while nobody knows whether the lamps are off", _latched(safety))
+        latched = "1 while a blackout has failed and nothing may be lit"
+        yield _one("latched", latched, _latched(safety))
         yield _per("lamps", "1 for what is known of the lamps", "state", {safety["state"]: 1.0})
         yield _per("capture", "1 for the state that the capture is in", "state", {running: 1.0})
         yield _one("captures_unread", "on the disk and not listed yet", captures.catalogue.unread)

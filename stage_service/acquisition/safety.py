@@ -25,7 +25,7 @@ from stage_service.devices.trigger.interface import TriggerStatus
 ATTEMPTS = 3
 WITHIN_S = 30.0
 """A device that has not answered by then is not waited for any longer."""
-Darkness = Literal["dark", "unknown, unsafe"]
+Darkness = Literal["dark", "said to be dark", "unknown, unsafe"]
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,21 @@ class Blackout:
     """What a blackout came to: `safe` only if every lamp and projector was read back dark.
 
     `accepted`: off was sent, nothing failed, and the rig file accepts that the light bank cannot
-    read it back (`accept_unverified_blackout`).
+    read it back (`accept_unverified_blackout`); or somebody has looked, and `said` that it is dark
+    where no link can tell.
     """
 
     safe: bool
     detail: str
     accepted: bool = False
+    said: bool = False
 
     @property
     def state(self) -> Darkness:
         """What is known of the lamps."""
-        return "dark" if self.safe else "unknown, unsafe"
+        if self.safe:
+            return "dark"
+        return "said to be dark" if self.said else "unknown, unsafe"
 
     @property
     def blocks(self) -> bool:

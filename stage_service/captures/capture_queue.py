@@ -1,7 +1,7 @@
 """Captures that wait for the stage: kept on disk, begun one after the other, never against anybody.
 
-Nothing begins by itself that would need somebody to arm it, nor after a blackout, an abort or a
-capture that failed, until a person says that it may go on.
+Nothing begins by itself that would need somebody to arm it, nor after a blackout, somebody's word
+that it is dark, an abort or a capture that failed, until a person says that it may go on.
 """
 
 from __future__ import annotations

@@ -86,16 +86,20 @@ class Latch:
                 return "cleared"
         return None
 
+    def check_acknowledge(self) -> None:
+        """Raise `CannotAcknowledge` where it is not for a person to clear it."""
+        if (latched := self.latched) is None:
+            raise CannotAcknowledge("nothing is latched: there is nothing to acknowledge")
+        if latched.reads_back:
+            raise CannotAcknowledge(
+                "this light bank says itself whether its lamps are off: ask for a blackout "
+                "(POST /devices/blackout) once it answers"
+            )
+
     def acknowledge(self) -> None:
         """Clear it on a person's word. Raises `CannotAcknowledge`."""
         with self._lock:
-            if self.latched is None:
-                raise CannotAcknowledge("nothing is latched: there is nothing to acknowledge")
-            if self.latched.reads_back:
-                raise CannotAcknowledge(
-                    "this light bank says itself whether its lamps are off: ask for a blackout "
-                    "(POST /devices/blackout) once it answers"
-                )
+            self.check_acknowledge()
             self._clear()
 
     def _clear(self) -> None:

@@ -352,13 +352,24 @@ class CaptureManager:
                 return "nobody knows yet whether the stage is dark"
         return None
 
+    def not_dark(self) -> str | None:
+        """What is not known of the lamps and keeps every capture from beginning; None: nothing.
+
+        Behind a bank that cannot read back, where that is accepted, they may always begin.
+        """
+        known = self.safety()
+        if known["state"] != "unknown, unsafe":
+            return None
+        free = known["latched"] is None and not self._unread and self.stage.known_dark
+        return None if free else str(known["detail"])
+
     def safety(self) -> dict[str, Any]:
         """What is known of the lamps now: {"state", "detail", "latched"}."""
         run = self._running
         if self._unread:
             latched = self.stage.darkness()["latched"]
             return {"state": "unknown, unsafe", "detail": UNREAD, "latched": latched}
-        if run is None:
+        if run is None or self.stage.latch.latched is not None:  # then it is one that hangs
             return self.stage.darkness()
         return {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
 

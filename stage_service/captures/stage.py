@@ -93,7 +93,17 @@ class Stage:
         lamps = self.devices.lights.capabilities.reads_back
         reads_back = lamps and (beams is None or beams.capabilities.reads_back)
         self._last = result
-        change = self.latch.learn(result, reads_back)
+        self._tell(self.latch.learn(result, reads_back), result)
+
+    def acknowledge(self, said: str) -> None:
+        """Unlatch on the word of a person who has looked, until a blackout says otherwise; `said`:
+        who they are and what they saw. Raises `CannotAcknowledge`."""
+        self.latch.acknowledge()
+        self._last = Blackout(False, f"somebody has looked: {said}", accepted=True, said=True)
+        self._tell("cleared", self._last)
+
+    def _tell(self, change: str | None, result: Blackout) -> None:
+        """Record and publish what `result` did to the latch, and what is known of the lamps."""
         if change is not None:
             self._audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
             self._events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})
@@ -108,7 +118,7 @@ class Stage:
 
     @property
     def known_dark(self) -> bool:
-        """Whether a blackout has come to something that a capture may begin after."""
+        """Whether a blackout, or somebody's look, came to what a capture may begin after."""
         return self._last is not None and not self._last.blocks
 
     def asked(self) -> dict[str, Any]:

@@ -24,13 +24,16 @@ def add(commands: Commands) -> None:
 def run_status(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Show how service, lamps and jobs are.
 
-    As `GET /health` has it: "ok", "degraded" (with what is wrong) or "unsafe": nobody knows whether
-    the lamps are off.
+    As `GET /health` has it: "ok", "degraded" (with what is wrong) or "unsafe": a blackout has
+    failed, and nothing may be lit until that is over. What is known of the lamps stands beside it:
+    unknown, too, during a blackout and where the light bank cannot read back.
     """
     health = service.get("/health")
     doing = f"capture {health['capture']} runs" if health["capture"] else "no capture runs"
     worker = "a worker is there" if health["worker"] else "no worker is there"
     lines = [f"{health['status']}: lamps {health['lamps']}, {doing}, {worker}", *health["problems"]]
+    if health["latch"] is None and health["lamps"] not in ("dark", "in use"):
+        lines.append(health["lamps_detail"])
     output.result(health, "\n".join(lines))
 
 

@@ -8,6 +8,7 @@ import { dot, sub, unit } from "./space.js";
 
 const NEAREST = 3;
 const TERMS = 9;
+const MOST_KEPT = 24;  // lights of which it is kept what they see; more than are shaded at once
 const TRACED_PIXELS = 50000;  // of a view in which light between fibres is traced
 
 // Real spherical harmonics of degree 2, in the order of appearance/render/harmonics.py.
@@ -208,12 +209,7 @@ export class Relight {
     const { viewer } = this, { picture, gl } = viewer, hair = picture.sets.model;
     const lights = await net.json(net.ofModel("/few"), body);
     const points = hair.count * hair.points, vertices = picture.head?.vertices ?? 0;
-    const missing = lights.filter((l) => !this.kept.has(l.number));
-    if (missing.length) viewer.status("casting shadows");
-    for (const { number } of missing) {
-      this.kept.set(number, new Uint8Array(await net.bytes(`/seen/${number}`)));
-      if (this.kept.size > 24) this.kept.delete(this.kept.keys().next().value);
-    }
+    await this.keep(lights.map((l) => l.number));
     const groups = [0, 1].map((g) => {
       const some = lights.slice(4 * g, 4 * g + 4);
       const strands = new Uint8Array(4 * points), head = new Uint8Array(4 * vertices);
@@ -231,6 +227,20 @@ export class Relight {
     viewer.draw();
     viewer.status("");
     this.traced = this.indirect(body).catch((error) => viewer.status(error.message));
+  }
+
+  // Have what these lights see in `kept`, of the others those that were shaded last.
+  async keep(numbers) {
+    if (numbers.some((n) => !this.kept.has(n))) this.viewer.status("casting shadows");
+    for (const number of numbers) {
+      const data = this.kept.get(number) ?? new Uint8Array(await net.bytes(`/seen/${number}`));
+      this.kept.delete(number);  // a Map has its keys in the order in which they came
+      this.kept.set(number, data);
+    }
+    for (const old of this.kept.keys()) {
+      if (this.kept.size <= MOST_KEPT) break;
+      this.kept.delete(old);
+    }
   }
 
   // --- the panel

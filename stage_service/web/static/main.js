@@ -56,7 +56,7 @@ function bar() {
   );
   return () => {
     const c = S.capture;
-    const word = S.connected === null ? "connecting" : S.connected === false ? "no connection" : S.health?.latch ? "unsafe" : busy() ? STATES[c.state] : S.health?.lamps === "dark" ? "dark" : "unknown";
+    const word = S.connected === null ? "connecting" : S.connected === false ? "no connection" : S.health?.latch ? "unsafe" : busy() ? STATES[c.state] : ["dark", "said to be dark"].includes(S.health?.lamps) ? S.health.lamps : "unknown";
     say(state, word);
     state.className = `state ${{ shooting: "on", dark: "calm", connecting: "", unsafe: "bad", unknown: "bad", "no connection": "bad" }[word] ?? "warn"}`;
     const rig = S.rig?.name ?? "";

@@ -113,7 +113,7 @@ export function open(view) {
     }
     const dark = S.health?.lamps === "dark";
     word.classList.toggle("bad", !dark);
-    say(word, S.health?.latch ? "UNSAFE" : dark ? "Dark, verified" : "Not known to be dark");
+    say(word, S.health?.latch ? "UNSAFE" : dark ? "Dark, verified" : S.health?.lamps === "said to be dark" ? "Said to be dark" : "Not known to be dark");
     const how = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" }[c.outcome];
     say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`);
   }
@@ -147,7 +147,7 @@ export function open(view) {
     const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
     const answered = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have answered` : "";
-    say(lit, busy() ? what + answered : S.health?.lamps === "dark" ? "nothing is lit" : "nobody knows what is lit");
+    say(lit, busy() ? what + answered : ["dark", "said to be dark"].includes(S.health?.lamps) ? "nothing is lit" : "nobody knows what is lit");
   }
 
   function waitsAt(step) {

@@ -206,6 +206,26 @@ def test_while_the_disk_hangs(rig_file, world, tmp_path, monkeypatch):
         assert time.monotonic() - start < manager_module.STOP_WITHIN_S
 
 
+def test_a_blackout_that_fails_over_a_run_that_hangs_is_told(
+    rig_file, world, tmp_path, monkeypatch
+):
+    with (
+        serving(rig_file, tmp_path) as http,
+        stuck(monkeypatch, CaptureWriter, "commit") as waiting,
+    ):
+        http.post("/captures", json=LONG)
+        until(lambda: waiting() > 0)
+        world.lit, world.stuck_lamps = {5}, True
+        assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
+        health = http.get("/health").json()
+        assert health["capture"] is not None, "it hangs"
+        assert (health["status"], health["lamps"]) == ("unsafe", "unknown, unsafe")
+        assert health["problems"][0] == health["latch"]["detail"]
+        assert http.get("/devices").json()["safety"]["latched"] == health["latch"]["since"]
+        assert http.get("/ready").status_code == 503
+        world.stuck_lamps = False
+
+
 def test_a_capture_that_is_being_prepared_does_not_begin_after_a_blackout(
     rig_file, world, tmp_path, monkeypatch
 ):

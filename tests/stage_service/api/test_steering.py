@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 import pytest
 from serving import Client, serving
+from waiting import until
 
 from reconstruction import verify
 from stage_service.cli import main
@@ -158,6 +159,43 @@ def test_a_stage_that_is_not_dark_is_latched_and_stays_so_over_a_restart(rig_fil
         assert done(http, capture)["outcome"] == "completed"
         latch = [a for _, a, _ in audit(http) if a.startswith("latch")]
         assert latch == ["latch.set", "latch.cleared"]
+
+
+def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
+    unread_rig, world, tmp_path, capsys
+):
+    with serving(unread_rig, tmp_path / "root") as http:
+        world.deaf_lights = True
+        assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
+        entry = http.post("/queue", json={"plan": SHORT}).json()["id"]
+        assert "until somebody has looked" in http.get("/queue").json()["waits_for"]
+        world.deaf_lights = False
+        before = http.service.events.last
+        word = {"name": "Ada", "note": "all dark, I looked"}
+        looked = "somebody has looked: Ada: all dark, I looked"
+        dark = {"state": "said to be dark", "detail": looked, "latched": None}
+        assert http.post("/devices/acknowledge", json=word).json() == dark
+        assert http.get("/devices").json()["safety"] == dark
+        told = {e.kind: e.data for e in http.service.events.after(before, 99)}
+        assert told["stage.lamps"] == dark
+        unlatched = {"latched": False, "safe": False, "state": dark["state"], "detail": looked}
+        assert told["stage.latch"] == unlatched
+        recorded = [(a["action"], a["detail"]) for a in http.get("/audit").json()[-2:]]
+        assert recorded == [("latch.cleared", looked), ("acknowledge", "Ada: all dark, I looked")]
+        main(["stage", "status", "--url", str(http.base_url)])
+        first, second = capsys.readouterr().out.splitlines()
+        assert first.startswith("ok: lamps said to be dark, no capture runs")
+        assert second == looked
+
+        # Whoever looked may still be there: it begins when somebody says so, and then by itself.
+        assert "acknowledged" in http.get("/queue").json()["waits_for"]
+        assert http.post("/queue:go-on").is_success
+        capture = until(lambda: http.get("/captures").json())[0]
+        assert capture["request"] == {"queue": entry}
+        assert done(http, capture["id"])["outcome"] == "completed"
+        lamps = http.get("/health").json()["lamps"]
+        assert lamps == "unknown, unsafe", "nobody has looked since"
+        refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
 
 
 def test_a_capture_that_cannot_end_dark_latches(http, world):

@@ -132,6 +132,19 @@ def test_it_is_not_ready_while_nobody_knows_whether_it_is_dark(rig_file, world, 
         assert http.get("/ready").status_code == 200
 
 
+def test_a_bank_that_is_accepted_without_read_back_is_no_fault(unread_rig, world, tmp_path):
+    with serving(unread_rig, tmp_path) as http:
+        for _ in range(2):  # after the start, and after a blackout
+            health = http.get("/health").json()
+            assert (health["status"], health["lamps"]) == ("ok", "unknown, unsafe")
+            assert http.get("/ready").status_code == 200
+            assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
+        world.deaf_lights = True
+        http.post("/devices/blackout")
+        assert http.get("/health").json()["status"] == "unsafe"
+        assert http.get("/ready").status_code == 503
+
+
 def test_the_log_as_json_has_what_it_is_about(capsys, monkeypatch):
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])

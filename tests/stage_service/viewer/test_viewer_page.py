@@ -209,3 +209,33 @@ AT_REST = """async (ambient) => {
     while (picture.samples < picture.enough()) for (const _ of picture.oneSample(viewer.view));
     return Array.from(picture.radiance());
 }"""
+
+
+def test_a_light_that_is_shaded_keeps_its_shadows_when_another_comes(seen):
+    """24 lights one after the other, then the first of them beside a new one."""
+    told = seen.page.evaluate(SHADE_25)
+    assert told == {"error": "", "latest": [23, 0, 24], "size": 24}
+
+
+SHADE_25 = """async () => {
+    const { Relight } = await import("/view/page/relight.js");
+    const hair = { count: 1, points: 1, none: {}, perPoint: () => ({}) };
+    const gl = { deleteTexture() {} }, picture = { sets: { model: hair } };
+    const relight = Object.create(Relight.prototype);
+    Object.assign(relight, {
+        viewer: { gl, picture, status() {}, draw() {} }, kept: new Map(), indirect: async () => {},
+    });
+    const asked = window.fetch;
+    let shaded, error = "";
+    window.fetch = async (path, ...more) => {
+        if (path.endsWith("/few")) return Response.json(shaded.map((number) => ({ number })));
+        if (path.includes("/seen/")) return new Response(new Uint8Array([1]));
+        return asked(path, ...more);
+    };
+    try {
+        for (let n = 0; n < 24; n++) { shaded = [n]; await relight.shade({}); }
+        shaded = [0, 24];
+        await relight.shade({});
+    } catch (e) { error = e.message; }
+    return { error, latest: [...relight.kept.keys()].slice(-3), size: relight.kept.size };
+}"""
