@@ -77,7 +77,7 @@ def compare(
         figures[name] = {
             **_judged("", whole, row.whole, exposure, hair),
             **_judged("direct_", direct, row.direct, exposure, hair),
-            "direct_share": _mean(row.direct)[hair].sum() / _mean(row.whole)[hair].sum(),
+            "direct_share": float(_mean(row.direct)[hair].sum() / _mean(row.whole)[hair].sum()),
         }
         drawn = (_mean(row.whole), whole, _mean(row.direct), direct)
         pictures.append(np.hstack([exposure(x) for x in drawn]))

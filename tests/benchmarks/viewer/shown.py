@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.command import Benchmark, option, within
+from benchmarks.command import ONLY, Benchmark, LeftOut, option, within
 from benchmarks.renderers.cost import with_count
 from benchmarks.results import save
 from benchmarks.subjects import simulated
@@ -29,7 +29,9 @@ GOALS = {"psnr_db": 24, "direct_over_path_tracer": (0.98, 1.02), "frames_a_secon
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Agreement of each groom under four lights, then frames a second at each number of strands."""
-    grooms, counts = GROOMS, COUNTS
+    if args.only not in (None, *GROOMS):
+        raise LeftOut(f"no subject {args.only!r}; there are {', '.join(GROOMS)}")
+    grooms, counts = tuple(n for n in GROOMS if args.only in (None, n)), COUNTS
     effort, seconds = Effort(args.size, args.spp, args.over, args.samples), args.seconds
     if args.quick:
         grooms, counts, effort, seconds = ("straight",), (2000,), Effort(32, 8, 1, 3), 1.0
@@ -60,6 +62,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 OPTIONS = (
+    ONLY,
     option("--size", "pixels a side of the pictures that are compared", type=int, default=128),
     option("--spp", "paths a pixel of the path tracer's", type=int, default=1024),
     option("--over", "of the viewer's pixels a side are one of those", type=int, default=4),
