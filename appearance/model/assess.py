@@ -142,7 +142,8 @@ class _Comparison:
         exposure = self.fitted.appearance.exposure
         progress("fitting the baselines", 0.0)
         training = self._observed()
-        colour = np.mean([o.radiance[o.valid].mean(axis=0) for o in training], axis=0)
+        seen = [o.radiance[o.valid] for o in training if o.valid.any()]
+        colour = np.mean([x.mean(axis=0) for x in seen], axis=0)
         scene = self.fitted.scene()
         albedo = fit_diffuse(scene, training, seed=self.seed)
         both = FittedModel.alternatives(self.model, self.capture)
@@ -159,7 +160,7 @@ class _Comparison:
             groups[group] = []
             for i, (camera, lights) in enumerate(views):
                 progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
-                for image in self._rendered(camera, lights, lit):
+                for image in self._rendered(camera, lights, lit, stage):
                     if "ours" not in lit:
                         image.frames["ours"] = image.frames[rendered]
                     image.frames["mean_colour"] = np.broadcast_to(colour, (*image.mask.shape, 3))
@@ -207,7 +208,11 @@ class _Comparison:
         return views
 
     def _rendered(
-        self, name: str, lights: Sequence[str], lit: Mapping[str, tuple[HairScene, FittedModel]]
+        self,
+        name: str,
+        lights: Sequence[str],
+        lit: Mapping[str, tuple[HairScene, FittedModel]],
+        stage: Stage,
     ) -> list[_Compared]:
         """The frames of one camera under `lights`: captured, and of each scene under its lights."""
         capture, camera = self.capture, self.capture.rig.camera(name)
@@ -225,8 +230,10 @@ class _Comparison:
             captured, saturated = capture.light(n, name)
             frames: dict[str, AnyFloats] = {"captured": captured}
             frames |= {method: rendered[i] for method, rendered in images.items()}
-            if (judged := mask & ~saturated).any():
+            if captured[judged := mask & ~saturated].any():
                 out.append(_Compared(camera, capture.rig.light(n), frames, judged))
+            else:
+                stage.warn(f"{name}, {n}: the hair is black or saturated: not compared")
         return out
 
     def _interpolate(self, images: Sequence[_Compared], scene: HairScene, *, own: bool) -> None:

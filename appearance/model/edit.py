@@ -135,7 +135,8 @@ def _cut(strands: Strands, length: float) -> Strands:
     counts = np.bincount(strands.strand_of_point[keep], minlength=len(strands))
     radius = strands.radius[keep] if isinstance(strands.radius, np.ndarray) else strands.radius
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    return Strands(points[keep].astype(np.float32), offsets, radius)
+    confidence = None if strands.confidence is None else strands.confidence[keep]
+    return Strands(points[keep].astype(np.float32), offsets, radius, confidence)
 
 
 def _root_part(table: Array, kept: Array) -> Array:

@@ -17,13 +17,15 @@ Attributes = Mapping[str, float | str]
 
 
 def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
-    """Read an RGB image `(H, W, 3)` and the header attributes that `write_exr` was given.
+    """Read R, G and B `(H, W, 3)` and the header attributes that `write_exr` was given.
 
     Raises `ValueError` that names the file when it is missing, broken or not RGB.
     """
     try:
         file = OpenEXR.File(str(path))
-        pixels = file.channels()["RGB"].pixels
+        channels = file.channels()
+        together = channels["RGB"] if "RGB" in channels else channels["RGBA"]
+        pixels = together.pixels[..., :3]
     except KeyError:
         raise ValueError(f"{path}: expected the channels R, G and B") from None
     except Exception as error:  # the binding raises bare RuntimeError and MemoryError alike

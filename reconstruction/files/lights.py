@@ -139,7 +139,7 @@ def _vertices(path: Path) -> list[dict[str, Any]]:
 
 
 def _table(path: Path) -> list[dict[str, Any]]:
-    text = plain_file(path).read_text()
+    text = plain_file(path).read_text(encoding="utf-8-sig")  # as spreadsheets write it
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows = (
         list(csv.reader(lines, skipinitialspace=True))
@@ -164,10 +164,22 @@ def _named_row(row: dict[str, str], path: Path) -> dict[str, Any]:
     return out
 
 
+def _fraction(word: str) -> bool:
+    try:
+        return not float(word).is_integer()
+    except (ValueError, OverflowError):
+        return False
+
+
 def _row(words: list[str], path: Path, line: int) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if len(words) in (4, 7):
         name = words[0].strip()
+        if len(words) == 4 and _fraction(name):
+            raise LightFileError(
+                f"{path}: row {line} begins with {name}: a light's name, or x before an intensity? "
+                "Name the columns in a first line: x, y, z, intensity"
+            )
         out["name"], words = int(name) if name.isdecimal() else name, words[1:]
     if len(words) not in (3, 6):
         raise LightFileError(

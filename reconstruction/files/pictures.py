@@ -6,7 +6,7 @@ size is looked at before a pixel is read: a header may claim what memory cannot 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,6 +35,7 @@ MOSAICS = {
     "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
 }
 LOSSY = {".jpg", ".jpeg"}
+_AVIF_HEAD = 1 << 16  # bytes that hold an AVIF's boxes
 FULL = 0.99
 """Of the way from black to white from which on a channel of whole numbers counts as saturated:
 sensors bend before they end, and a developed picture's white is not sharp."""
@@ -48,10 +49,10 @@ class PictureError(ValueError):
 class Sensor:
     """How the numbers in a picture become light.
 
-    `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: "srgb" for 8 bits
-    and JPEG, "linear" for all else. `black` and `white` in the file's own numbers: without light,
-    and where a channel is full; None: what a RAW file says, 0 and the largest of its type (1 in
-    EXR, which never saturates unless its attribute `fullScale` or `white` says so). `bayer`: the
+    `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: "srgb" for 8 bits,
+    JPEG and AVIF, "linear" for all else. `black` and `white` in the file's own numbers: without
+    light, and where a channel is full; None: what a RAW file says, 0 and the largest of its type (1
+    in EXR, which never saturates unless its attribute `fullScale` or `white` says so). `bayer`: the
     colours of the first two rows of a picture that is a sensor's mosaic.
     """
 
@@ -139,7 +140,8 @@ def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
     if suffix in RAW:
         return _raw(path, sensor)
     if suffix == ".avif":
-        return _counts(path, _avif(path), sensor)
+        white, response = sensor.white or _avif_white(path), sensor.response or "srgb"
+        return _counts(path, _avif(path), replace(sensor, white=white, response=response))
     source = _opened(path)
     values = source.read_image(oiio.UNKNOWN)
     if values is None or source.geterror(False):
@@ -153,6 +155,14 @@ def _avif(path: Path) -> NDArray[Any]:
     if values is None:
         raise PictureError(_broken(path, "OpenCV cannot read it"))
     return np.asarray(values)
+
+
+def _avif_white(path: Path) -> float:
+    """Largest count of a file, by its `av1C` box ("AV1 Codec ISO Media File Format", 2.3.3)."""
+    head = path.read_bytes()[:_AVIF_HEAD]
+    at = head.find(b"av1C")
+    flags = head[at + 6] if 0 <= at < len(head) - 6 else 0
+    return float(2 ** (8 + 2 * (flags >> 6 & 1) + 2 * (flags >> 5 & 1)) - 1)
 
 
 def _opened(path: Path) -> Any:

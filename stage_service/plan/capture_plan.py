@@ -32,11 +32,14 @@ class KindLevels(Strict):
 
 
 class Rows(Strict):
-    """Scanlines `first`, `first + step`, … up to and including `last` (None: the last row)."""
+    """Scanlines `first` up to and including `last` (None: the last row).
+
+    Every one of them: a line is found by the lines beside it, so a `step` is 1.
+    """
 
     first: Annotated[int, Field(ge=0, le=MOST_ROWS)] = 0
     last: Annotated[int, Field(ge=0, le=MOST_ROWS)] | None = None
-    step: Annotated[int, Field(ge=1, le=MOST_ROWS)] = 1
+    step: Literal[1] = 1
 
 
 class CapturePlan(Strict):

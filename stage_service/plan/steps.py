@@ -65,4 +65,4 @@ def no_controller(rig_file: RigFile) -> bool:
 def rows_of(rows: Rows, projector: Projector) -> range:
     """The rows that this projector shows."""
     last = projector.height - 1 if rows.last is None else rows.last
-    return range(rows.first, min(last, projector.height - 1) + 1, rows.step)
+    return range(rows.first, min(last, projector.height - 1) + 1)

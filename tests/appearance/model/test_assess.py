@@ -135,6 +135,20 @@ def test_a_group_with_nothing_held_out_is_left_out(made):
     assert "held_out_camera" not in found
 
 
+def test_a_black_frame_is_told_and_not_compared(made, monkeypatch):
+    capture, model, _ = made
+    right = Capture.light
+
+    def light(self, name, camera):
+        image, saturated = right(self, name, camera)
+        return image * (name != "l4"), saturated
+
+    monkeypatch.setattr(Capture, "light", light)
+    found = assess(capture, model, held_out=HeldOut((), ("l4", "l9")), options=OPTIONS)
+    assert np.isfinite(found["held_out_lights"]["ours"]["relative_error"])
+    assert "cam_0, l4: the hair is black" in " ".join(model.report()["images"].warnings)
+
+
 def test_with_nothing_held_out_the_model_is_relit_and_it_is_said(made, tmp_path):
     capture, model, _ = made
     copy = Model(tmp_path / "copy")

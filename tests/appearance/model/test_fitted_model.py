@@ -132,7 +132,11 @@ def mapped_of(fitted, scene):
 
 def test_cut_strands_end_where_they_were_cut_and_keep_their_colours_in_place(fitted):
     length = 0.035
-    short = cut(fitted, length)
+    known = np.linspace(0, 1, len(fitted.strands.points), dtype=np.float32)
+    short = cut(replace(fitted, strands=replace(fitted.strands, confidence=known)), length)
+    np.testing.assert_array_equal(
+        short.strands.confidence[short.strands.offsets[:-1]], known[fitted.strands.offsets[:-1]]
+    )
     assert (fitted.strands.lengths() > length).all()
     np.testing.assert_allclose(short.strands.lengths(), length, rtol=1e-4)
     np.testing.assert_array_equal(short.strands.roots, fitted.strands.roots)

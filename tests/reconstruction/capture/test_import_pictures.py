@@ -112,6 +112,20 @@ def test_a_format_is_read_as_linear_light(folder, tmp_path, name, kind, error):
     assert any("JPEG" in note for note in said["notes"]) == name.endswith("jpg")
 
 
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_avif_of_any_depth_is_the_same_light(tmp_path, bits):
+    kind, white = (np.uint8 if bits == 8 else np.uint16), 2**bits - 1
+    light = light_of(0, 1)
+    light[:4] = 2.0  # more than the file can say
+    counts = np.round(np.clip(srgb(light), 0, 1) * white).astype(kind)[..., ::-1]
+    how = [cv2.IMWRITE_AVIF_DEPTH, bits, cv2.IMWRITE_AVIF_QUALITY, 100]
+    assert cv2.imwrite(str(tmp_path / "a.avif"), counts, how)
+    found = read_picture(tmp_path / "a.avif", Sensor(), (SIZE, SIZE))
+    np.testing.assert_allclose(found.light[6:], light[6:], atol=0.02)
+    assert found.saturated[:2].all()
+    assert not found.saturated[6:].any()
+
+
 def test_brackets_are_merged_and_saturation_is_kept(folder, tmp_path):
     """Three noisy exposures of 8 bits tell more than the best one; what all clip is saturated."""
     rng = np.random.default_rng(0)

@@ -58,6 +58,13 @@ def test_half_floats_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again, image.astype(np.float32))
 
 
+def test_an_alpha_channel_is_no_colour(tmp_path: Path) -> None:
+    image = np.arange(32, dtype=np.float32).reshape(2, 4, 4)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGBA": image}).write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], image[..., :3])
+
+
 def test_broken_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "x.exr"
     with pytest.raises(ValueError, match=r"x\.exr: cannot be read"):

@@ -115,6 +115,11 @@ def test_what_the_rig_cannot_do_is_refused_before_anything_lights(demo, plan, pr
     assert problem in str(error.value)
 
 
+def test_rows_that_no_line_could_be_found_in_are_refused():
+    with pytest.raises(ValidationError, match=r"rows.step\n  Input should be 1"):
+        CapturePlan(rows={"step": 2})
+
+
 class Counted(str):
     """A name that counts how often it is compared."""
 

@@ -1,0 +1,29 @@
+"""Tables of lights as spreadsheets write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reconstruction.files.lights import LightFileError, read_lights
+
+
+def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "lights.csv"
+    path.write_text("\ufeffname,x,y,z\nlight_005,0,1,2\nlight_002,3,4,5\n", encoding="utf-8")
+    found = read_lights(path).lights
+    assert [light.name for light in found] == ["light_005", "light_002"]
+    np.testing.assert_array_equal(found[1].position, (3, 4, 5))
+
+
+def test_four_numbers_are_a_name_and_a_place_only_where_the_first_may_be_a_name(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "lights.txt"
+    path.write_text("5 1.0 1.2 0.3\n")
+    assert read_lights(path).lights[0].name == "light_005"
+    path.write_text("0.5 1.0 1.2 300\n")
+    with pytest.raises(LightFileError, match=r"row 1 begins with 0.5: .*x, y, z, intensity"):
+        read_lights(path)
