@@ -426,6 +426,8 @@ class CaptureManager:
             run.thread.join(STOP_WITHIN_S)
             if run.thread.is_alive():  # it is stuck somewhere
                 self.stage.learn(result)
+            else:  # `darken` may have opened links after the run had closed them
+                self.stage.devices.close_lit()
         self._stay_on_exit()
         self.catalogue.close()
         self.stage.release()
