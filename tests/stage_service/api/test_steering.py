@@ -198,6 +198,25 @@ def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
         refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
 
 
+def test_a_person_ends_what_a_damaged_latch_began_where_the_link_cannot_tell(
+    unread_rig, world, tmp_path
+):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "unsafe.json").write_text("{")
+    with serving(unread_rig, root) as http:
+        problem = refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+        assert "could not be read" in problem["detail"]
+        assert "until somebody has looked" in problem["detail"]
+        assert http.get("/health").json()["latch"]["ended_by"] == "acknowledge"
+        http.post("/devices/blackout")
+        refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+        word = {"name": "Ada", "note": "all dark, I looked"}
+        assert http.post("/devices/acknowledge", json=word).json()["state"] == "said to be dark"
+        capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
+        assert done(http, capture)["outcome"] == "completed"
+
+
 def test_a_capture_that_cannot_end_dark_latches(http, world):
     world.stuck_lamps = True
     capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
