@@ -19,6 +19,12 @@ from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 
 
+def unknown(detail: str, latched: str | None) -> dict[str, Any]:
+    """What `Stage.darkness` tells where nobody knows, and nobody accepts that."""
+    state = {"state": "unknown, unsafe", "detail": detail}
+    return {**state, "latched": latched, "accepted": False}
+
+
 class Stage:
     """All who connect to the devices outside a capture go through here, one after the other.
 
@@ -121,11 +127,14 @@ class Stage:
         self._events.publish("stage.lamps", self.darkness())
 
     def darkness(self) -> dict[str, Any]:
-        """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
+        """What is known of the lamps when no capture runs: {"state", "detail", "latched",
+        "accepted"}; accepted: off was sent, and the rig file accepts that no more is known."""
         last, latched = self._last or Blackout(False, "no blackout yet"), self.latch.latched
         if latched is not None:
-            return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
-        return {"state": last.state, "detail": last.detail, "latched": None}
+            return unknown(latched.detail, latched.since)
+        accepted = last.accepted and not last.said
+        known = {"state": last.state, "detail": last.detail}
+        return {**known, "latched": None, "accepted": accepted}
 
     @property
     def known_dark(self) -> bool:
