@@ -382,6 +382,7 @@ class Service:
             unread=self.unread,
             lamps=lamps["state"],
             lamps_detail=lamps["detail"],
+            lamps_accepted=lamps["accepted"],
             latch=LatchView.of(latched),
             disk_free_bytes=self.watching.free_bytes(),
             problems=problems,

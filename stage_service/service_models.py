@@ -237,7 +237,8 @@ class Health(BaseModel):
     that is over; "degraded" where something else is wrong; `problems` has a sentence for each. What
     is known of the lamps now is `lamps`: "dark", "said to be dark" (by somebody who looked), "in
     use" or "unknown, unsafe", `lamps_detail` how that is known. Beside "ok" they are unknown before
-    the first blackout, during one, and after each of a bank that is accepted without read-back.
+    the first blackout, during one, and after each of a bank that is accepted without read-back:
+    the last is `lamps_accepted`, off was sent and no blackout can tell more.
     `worker`: whether one runs; `unread`: captures on the disk that are not listed yet;
     `disk_free_bytes` is the root folder's, None where the disk does not answer.
     """
@@ -251,6 +252,7 @@ class Health(BaseModel):
     unread: int
     lamps: str
     lamps_detail: str
+    lamps_accepted: bool
     latch: LatchView | None
     disk_free_bytes: int | None
     problems: list[str]

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
@@ -34,13 +34,14 @@ class Blackout:
 
     `accepted`: off was sent, nothing failed, and the rig file accepts that the light bank cannot
     read it back (`accept_unverified_blackout`); or somebody has looked, and `said` that it is dark
-    where no link can tell.
+    where no link can tell. `known_at`: when, in monotonic seconds.
     """
 
     safe: bool
     detail: str
     accepted: bool = False
     said: bool = False
+    known_at: float = field(default_factory=time.monotonic, compare=False)
 
     @property
     def state(self) -> Darkness:

@@ -163,11 +163,14 @@ class Sequencer:
         """Stop at once and put everything off, whatever the run's thread is stuck in.
 
         Returns the blackout with which the run ends in order, or else one of the caller's own,
-        after which the run lights nothing any more. Takes `ORDERLY_S` + `within_s` seconds at most;
-        off is sent before a lamp is waited for that the run is just putting on.
+        after which the run lights nothing any more. Where the run's own was over before, it says
+        nothing of now: the caller's is made, on links that are opened anew. Takes `ORDERLY_S` +
+        `within_s` seconds at most; off is sent before a lamp is waited for that the run is just
+        putting on.
         """
+        over = self._dark.is_set()
         self.stop_now()
-        if self._dark.wait(ORDERLY_S) and self.blackout is not None:
+        if not over and self._dark.wait(ORDERLY_S) and self.blackout is not None:
             return self.blackout
         deadline = time.monotonic() + within_s
         blackout(self.devices, attempts=1, within_s=0.0)  # what hears it goes dark now

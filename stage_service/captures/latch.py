@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -50,7 +50,9 @@ class Latch:
     """ "Unknown, unsafe", kept in `path` until a blackout was read back dark.
 
     A link that cannot read back never clears it: a person does, by `acknowledge`. A file that is
-    there and cannot be read counts as latched.
+    there and cannot be read counts as latched. Which of the two ends it, the stage's devices say,
+    not the file, which may be damaged or of another light bank: until the first blackout, with
+    which a service starts, no person can.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,7 +64,7 @@ class Latch:
         except FileNotFoundError:
             pass
         except (OSError, ValueError) as error:
-            self.latched = Latched(utc_now(), f"{path} cannot be read: {error}", True)
+            self.latched = Latched(utc_now(), f"{path} could not be read: {error}", True)
 
     def check(self) -> None:
         """Raise `Unsafe` while it is set."""
@@ -72,18 +74,17 @@ class Latch:
     def learn(self, result: Blackout, reads_back: bool) -> str | None:
         """Take a blackout's result; returns "set" or "cleared" when that changes the latch."""
         with self._lock:
+            was = self.latched
             if result.blocks:
-                was = self.latched
-                since = was.since if was else utc_now()
-                self.latched = Latched(since, result.detail, reads_back)
-                try:
-                    write_whole(self._path, json.dumps(asdict(self.latched)).encode())
-                except OSError:  # a full disk must not keep anybody from a blackout
-                    log.exception("%s cannot be written: it ends with this process", self._path)
+                self._set(Latched(was.since if was else utc_now(), result.detail, reads_back))
                 return None if was else "set"
-            if result.safe and self.latched is not None:
+            if was is None:
+                return None
+            if result.safe:
                 self._clear()
                 return "cleared"
+            if was.reads_back != reads_back:
+                self._set(replace(was, reads_back=reads_back))
         return None
 
     def check_acknowledge(self) -> None:
@@ -101,6 +102,13 @@ class Latch:
         with self._lock:
             self.check_acknowledge()
             self._clear()
+
+    def _set(self, latched: Latched) -> None:
+        self.latched = latched
+        try:
+            write_whole(self._path, json.dumps(asdict(latched)).encode())
+        except OSError:  # a full disk must not keep anybody from a blackout
+            log.exception("%s cannot be written: it ends with this process", self._path)
 
     def _clear(self) -> None:
         try:

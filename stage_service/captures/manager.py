@@ -26,7 +26,7 @@ from stage_service.captures.capture_run import CaptureRun, Tally, plan_of
 from stage_service.captures.catalogue import Catalogue
 from stage_service.captures.latch import Unsafe
 from stage_service.captures.snapshots import APART_S, SNAPSHOT
-from stage_service.captures.stage import Stage
+from stage_service.captures.stage import Stage, unknown
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
@@ -360,18 +360,17 @@ class CaptureManager:
         known = self.safety()
         if known["state"] != "unknown, unsafe":
             return None
-        free = known["latched"] is None and not self._unread and self.stage.known_dark
-        return None if free else str(known["detail"])
+        return None if known["accepted"] else str(known["detail"])
 
     def safety(self) -> dict[str, Any]:
-        """What is known of the lamps now: {"state", "detail", "latched"}."""
+        """What is known of the lamps now: {"state", "detail", "latched", "accepted"}."""
         run = self._running
         if self._unread:
-            latched = self.stage.darkness()["latched"]
-            return {"state": "unknown, unsafe", "detail": UNREAD, "latched": latched}
+            return unknown(UNREAD, self.stage.darkness()["latched"])
         if run is None or self.stage.latch.latched is not None:  # then it is one that hangs
             return self.stage.darkness()
-        return {"state": "in use", "detail": f"capture {run.id} runs", "latched": None}
+        known = {"state": "in use", "detail": f"capture {run.id} runs"}
+        return {**known, "latched": None, "accepted": False}
 
     def blackout(self) -> dict[str, Any]:
         """Put every lamp and projector off and read it back; a running capture ends as aborted.
@@ -426,6 +425,8 @@ class CaptureManager:
             run.thread.join(STOP_WITHIN_S)
             if run.thread.is_alive():  # it is stuck somewhere
                 self.stage.learn(result)
+            else:  # `darken` may have opened links after the run had closed them
+                self.stage.devices.close_lit()
         self._stay_on_exit()
         self.catalogue.close()
         self.stage.release()

@@ -19,6 +19,12 @@ from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 
 
+def unknown(detail: str, latched: str | None) -> dict[str, Any]:
+    """What `Stage.darkness` tells where nobody knows, and nobody accepts that."""
+    state = {"state": "unknown, unsafe", "detail": detail}
+    return {**state, "latched": latched, "accepted": False}
+
+
 class Stage:
     """All who connect to the devices outside a capture go through here, one after the other.
 
@@ -44,6 +50,7 @@ class Stage:
             self._ownership = Ownership(rig_file.devices.lights, root, take_over)
         self.latch = Latch(root / "unsafe.json")
         self._last: Blackout | None = None
+        self._learning = threading.Lock()
         self._one = threading.Lock()
 
     @property
@@ -88,19 +95,29 @@ class Stage:
                 self.learn(blackout(devices, attempts=1))
 
     def learn(self, result: Blackout) -> None:
-        """Keep what a blackout came to, and latch or unlatch."""
+        """Keep what a blackout came to, and latch or unlatch.
+
+        What is older than what is known counts for nothing: a run that hung tells its last blackout
+        when it ends, and others, or a person who has looked, may have found out more meanwhile.
+        """
         beams = self.devices.projectors
         lamps = self.devices.lights.capabilities.reads_back
         reads_back = lamps and (beams is None or beams.capabilities.reads_back)
-        self._last = result
-        self._tell(self.latch.learn(result, reads_back), result)
+        with self._learning:
+            if self._last is not None and result.known_at < self._last.known_at:
+                return
+            self._last = result
+            change = self.latch.learn(result, reads_back)
+        self._tell(change, result)
 
     def acknowledge(self, said: str) -> None:
         """Unlatch on the word of a person who has looked, until a blackout says otherwise; `said`:
         who they are and what they saw. Raises `CannotAcknowledge`."""
-        self.latch.acknowledge()
-        self._last = Blackout(False, f"somebody has looked: {said}", accepted=True, said=True)
-        self._tell("cleared", self._last)
+        with self._learning:
+            self.latch.acknowledge()
+            word = Blackout(False, f"somebody has looked: {said}", accepted=True, said=True)
+            self._last = word
+        self._tell("cleared", word)
 
     def _tell(self, change: str | None, result: Blackout) -> None:
         """Record and publish what `result` did to the latch, and what is known of the lamps."""
@@ -110,11 +127,14 @@ class Stage:
         self._events.publish("stage.lamps", self.darkness())
 
     def darkness(self) -> dict[str, Any]:
-        """What is known of the lamps when no capture runs: {"state", "detail", "latched"}."""
+        """What is known of the lamps when no capture runs: {"state", "detail", "latched",
+        "accepted"}; accepted: off was sent, and the rig file accepts that no more is known."""
         last, latched = self._last or Blackout(False, "no blackout yet"), self.latch.latched
         if latched is not None:
-            return {"state": "unknown, unsafe", "detail": latched.detail, "latched": latched.since}
-        return {"state": last.state, "detail": last.detail, "latched": None}
+            return unknown(latched.detail, latched.since)
+        accepted = last.accepted and not last.said
+        known = {"state": last.state, "detail": last.detail}
+        return {**known, "latched": None, "accepted": accepted}
 
     @property
     def known_dark(self) -> bool:

@@ -63,7 +63,7 @@ export async function blackout() {
 export function left(c) {
   if (c.state === "aborting") return "ends after this step";
   if (c.state === "finishing") return "nothing more is lit";
-  if (c.state === "paused") return "dark";
+  if (c.state === "paused") return "lights off";
   const s = c.progress?.seconds_left;
   return s === null || s === undefined ? "time left: not known yet" : `${seconds(s)} left`;
 }

@@ -3,6 +3,7 @@
 import { abort, askName, attempt, blackout, darkening, left } from "./acts.js";
 import { ask, login } from "./ask.js";
 import { button, clock, h, say } from "./dom.js";
+import { lampWords } from "./lamps.js";
 import { S, begin, busy, changed, load, mine, onChange, releaseLease, takeLease } from "./state.js";
 import { blackScreen } from "./black.js";
 import * as now from "./now.js";
@@ -43,7 +44,7 @@ function bar() {
     else await takeLease(await askName());
   }), { kind: "quiet" });
   const stop = button("Abort", abort, { kind: "abort", "aria-keyshortcuts": "F8", title: "end at the next step, keep the frames (F8)" });
-  const dark = button("", blackout, { kind: "blackout", "aria-keyshortcuts": "F9", title: "every lamp and projector off at once, read back (F9)" });
+  const dark = button("", blackout, { kind: "blackout", "aria-keyshortcuts": "F9", title: "every lamp and projector off at once, read back where that can be (F9)" });
   const black = button("", blackScreen, { kind: "quiet", "aria-keyshortcuts": "F7", title: "nothing on this screen shines (F7)" });
   say(black, "Black", h("kbd", "F7"));
   say(stop, "Abort", h("kbd", "F8"));
@@ -56,9 +57,10 @@ function bar() {
   );
   return () => {
     const c = S.capture;
-    const word = S.connected === null ? "connecting" : S.connected === false ? "no connection" : S.health?.latch ? "unsafe" : busy() ? STATES[c.state] : ["dark", "said to be dark"].includes(S.health?.lamps) ? S.health.lamps : "unknown";
+    const lamps = lampWords(S.health);
+    const [word, tone] = S.connected === null ? ["connecting", ""] : S.connected === false ? ["no connection", "bad"] : busy() && !S.health?.latch ? [STATES[c.state], c.state === "running" ? "on" : "warn"] : [lamps.bar, lamps.tone];
     say(state, word);
-    state.className = `state ${{ shooting: "on", dark: "calm", connecting: "", unsafe: "bad", unknown: "bad", "no connection": "bad" }[word] ?? "warn"}`;
+    state.className = `state ${tone}`;
     const rig = S.rig?.name ?? "";
     say(detail, busy() ? `${c.step} of ${c.steps} steps · ${left(c)}` : rig);
     document.title = `${{ bad: "⚠ ", on: "● " }[state.className.split(" ")[1]] ?? ""}${word}${busy() ? ` ${c.step}/${c.steps}` : ""} · ${rig || "hairstage"}`;
@@ -82,9 +84,10 @@ function alarmBox() {
   return () => {
     const told = [];
     const latch = S.health?.latch;
+    const { state, alarm } = lampWords(S.health);
     if (S.connected === false) told.push(h(".alarm", h("strong", "No connection to the service. "), `What is shown here is of ${clock(S.lostAt)}; the stage may be lit. It is tried again by itself; `, h("b", "Blackout"), " is, too."));
     if (latch) told.push(unsafe(latch));
-    else if (S.health?.lamps === "unknown, unsafe") told.push(h(".alarm", h("strong", "Nobody knows whether the lamps are off. "), `${S.health.lamps_detail} A blackout (F9) finds out.`));
+    else if (alarm) told.push(h(`.alarm.${state}`, h("strong", alarm[0]), alarm[1]));
     if (S.failed) told.push(h(".alarm", h("strong", `Capture ${S.failed.id} failed. `), latch ? (S.failed.error ?? "").split("; blackout: ")[0] : S.failed.error ?? "", " ", button("seen", () => {
       sessionStorage.setItem("seen", S.failed.id);
       S.failed = null;

@@ -4,15 +4,16 @@ import { left, steering } from "./acts.js";
 import { ask, get } from "./ask.js";
 import { bytes, clock, h, keyed, number, say, seconds } from "./dom.js";
 import { dome } from "./dome.js";
+import { lampWords } from "./lamps.js";
 import { S, busy, load } from "./state.js";
 
 const SAID = {
   idle: "The capture is about to begin.",
   running: "",
   pausing: "It pauses at the end of this step, and puts the lights off.",
-  paused: "Paused. The stage is dark.",
+  paused: "Paused. Lamps and projectors were put off.",
   aborting: "Aborting: it stops at the end of this step. Blackout (F9) does not wait.",
-  finishing: "Lights are put off and read back; the last frames are written.",
+  finishing: "Lights are put off; the last frames are written.",
 };
 
 const SLOW_MS = 1000; // a step that takes longer says how many cameras it still waits for
@@ -63,7 +64,7 @@ export function open(view) {
     goOn.element.hidden = S.queue.held === null;
     queueOf();
     if (!c) {
-      say(word, S.health?.lamps === "dark" ? "Dark, verified" : "Ready");
+      say(word, lampWords(S.health).headline);
       say(said, "No capture has been made here yet.");
       meter.hidden = true;
       tell([lamps(), disk()]);
@@ -106,19 +107,23 @@ export function open(view) {
 
   function headline(c) {
     if (busy()) {
-      word.classList.remove("bad");
+      word.className = "big";
       say(word, { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" }[c.state]);
       say(said, SAID[c.state]);
       return;
     }
-    const dark = S.health?.lamps === "dark";
-    word.classList.toggle("bad", !dark);
-    say(word, S.health?.latch ? "UNSAFE" : dark ? "Dark, verified" : S.health?.lamps === "said to be dark" ? "Said to be dark" : "Not known to be dark");
+    const { headline: text, tone } = lampWords(S.health);
+    word.className = `big ${tone === "calm" ? "" : tone}`;
+    say(word, text);
     const how = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" }[c.outcome];
     say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`);
   }
 
-  const lamps = () => ["Lamps", h(S.health?.lamps === "unknown, unsafe" ? "b.bad" : "span", { title: S.health?.lamps_detail }, S.health?.lamps === "dark" ? "dark, verified" : S.capture?.state === "paused" && S.health?.lamps === "in use" ? "off for the pause" : S.health?.lamps ?? "–")];
+  function lamps() {
+    const { state, fact, detail } = lampWords(S.health);
+    const kind = { latched: "b.bad", unknown: "b.bad", accepted: "b.warn" }[state] ?? "span";
+    return ["Lamps", h(kind, { title: detail }, state === "use" && S.capture?.state === "paused" ? "put off for the pause" : fact)];
+  }
   function disk() {
     const free = S.health?.disk_free_bytes;
     return ["Disk", free === null ? h("b.bad", "does not answer") : `${bytes(free)} free`];
@@ -147,7 +152,7 @@ export function open(view) {
     const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
     const answered = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have answered` : "";
-    say(lit, busy() ? what + answered : ["dark", "said to be dark"].includes(S.health?.lamps) ? "nothing is lit" : "nobody knows what is lit");
+    say(lit, busy() ? what + answered : lampWords(S.health).lit);
   }
 
   function waitsAt(step) {

@@ -3,6 +3,7 @@
 import { attempt } from "./acts.js";
 import { ask, get } from "./ask.js";
 import { button, bytes, clock, h, keyed, number, say, words } from "./dom.js";
+import { doubt, lampState, lampWords } from "./lamps.js";
 import { S, events, load } from "./state.js";
 
 const TOLD = ["capture.state", "stage.lamps", "stage.lease", "stage.blackout", "fresh", "queue.held"];
@@ -34,7 +35,7 @@ export function open(view) {
   }
 
   // A link that answers does not make its lamps dark.
-  const doubtful = (kind) => LIT.includes(kind) && (S.health?.latch || S.health?.lamps === "unknown, unsafe");
+  const doubts = (kind) => (LIT.includes(kind) ? doubt(S.health, kind) : null);
 
   function tellDevices() {
     keyed(devices, all, ([k]) => k, () => {
@@ -43,10 +44,11 @@ export function open(view) {
       const figures = h("dl.facts");
       const element = h("article.device", name, state, figures);
       return { element, tell([kind, d]) {
-        const bad = d.state === "unreachable" || doubtful(kind);
+        const but = doubts(kind);
+        const bad = d.state === "unreachable" || (but && lampState(S.health) !== "accepted");
         element.className = `device ${bad ? "unreachable" : d.state === "ok" ? "" : "asked"}`;
         say(name, kind);
-        say(state, h(bad ? "b.bad" : "span", doubtful(kind) ? `${d.state === "ok" ? "answers" : d.state}, but unsafe` : d.state), d.error ? ` ${d.error}` : "");
+        say(state, h(bad ? "b.bad" : "span", but ? `${d.state === "ok" ? "answers" : d.state}, ${but}` : d.state), d.error ? ` ${d.error}` : "");
         const told = { ...d, ...d.since_start };
         say(figures, ...Object.entries(told).filter(([k]) => !["name", "state", "error", "since_start"].includes(k)).map(([k, v]) => h("div", h("dt", words(k)), h("dd", Array.isArray(v) ? v.map((x) => (typeof x === "object" ? JSON.stringify(x) : x)).join(", ") : String(v)))));
       } };
@@ -69,7 +71,8 @@ export function open(view) {
     const x = S.health;
     if (!x) return;
     tellDevices();
-    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait", "Lamps": x.problems.includes(x.lamps_detail) ? x.lamps : `${x.lamps}: ${x.lamps_detail}`, "Root folder": x.root };
+    const lamps = lampWords(x);
+    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait", "Lamps": x.problems.includes(x.lamps_detail) ? lamps.fact : `${lamps.fact}: ${lamps.detail}`, "Root folder": x.root };
     say(health, ...Object.entries(facts).map(([k, v]) => h(v.length > 40 ? "div.long" : "div", h("dt", k), h("dd", v))));
     say(problems, ...x.problems.map((text) => h("li", text)));
     const held = S.lease.holder;

@@ -28,6 +28,7 @@ from stage_service.devices.lights.modbus import ModbusLightBank
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
 LONG = {"plan": {"projectors": []}}
+SHORT = {"plan": {"lights": ["light_003"], "projectors": []}}
 
 
 def flood(http: Client, *request: Any, count: int = THREADS, **more: Any) -> None:
@@ -224,6 +225,54 @@ def test_a_blackout_that_fails_over_a_run_that_hangs_is_told(
         assert http.get("/devices").json()["safety"]["latched"] == health["latch"]["since"]
         assert http.get("/ready").status_code == 503
         world.stuck_lamps = False
+
+
+@contextmanager
+def finishing(
+    http: Client, world: Any, monkeypatch: pytest.MonkeyPatch, *, dark: bool
+) -> Iterator[str]:
+    """The id of a capture that hangs on the disk after its own last blackout, which came to dark
+    or not; goes on after it, to its end."""
+    world.stuck_lamps = not dark
+    with stuck(monkeypatch, CaptureWriter, "finish") as waiting:
+        capture: str = http.post("/captures", json=SHORT).json()["id"]
+        until(waiting)
+        yield capture
+    until(lambda: http.get("/health").json()["capture"] is None)
+
+
+def test_over_a_run_that_hangs_after_its_own_blackout_another_one_is_made(
+    rig_file, world, tmp_path, monkeypatch
+):
+    """What was dark then may be lit now; and what has come to light since is not forgotten when
+    the run goes on."""
+    with serving(rig_file, tmp_path) as http:
+        with finishing(http, world, monkeypatch, dark=True) as capture:
+            for lamp in (5, 6):
+                world.lit, world.show = {lamp}, "ON 65535"
+                assert_it_can_be_darkened(http, world, capture)
+            world.lit, world.stuck_lamps = {7}, True
+            assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
+        ended = http.get(f"/captures/{capture}").json()
+        assert (ended["state"], ended["outcome"]) == ("done", "completed")
+        assert http.get("/health").json()["status"] == "unsafe", "its end says nothing newer"
+        world.stuck_lamps = False
+        assert_it_can_be_darkened(http, world, None)
+
+
+def test_a_blackout_that_failed_at_a_run_s_end_is_not_repeated_when_all_is_well(
+    rig_file, world, tmp_path, monkeypatch
+):
+    with serving(rig_file, tmp_path) as http:
+        with finishing(http, world, monkeypatch, dark=False) as capture:
+            assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
+            assert http.get("/health").json()["status"] == "unsafe"
+            world.stuck_lamps = False
+            assert_it_can_be_darkened(http, world, capture)
+            assert http.get("/health").json()["status"] == "ok"
+        assert http.get(f"/captures/{capture}").json()["outcome"] == "failed"
+        health = http.get("/health").json()
+        assert (health["status"], health["lamps"]) == ("ok", "dark"), "known since is what counts"
 
 
 def test_a_capture_that_is_being_prepared_does_not_begin_after_a_blackout(

@@ -173,7 +173,7 @@ def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
         before = http.service.events.last
         word = {"name": "Ada", "note": "all dark, I looked"}
         looked = "somebody has looked: Ada: all dark, I looked"
-        dark = {"state": "said to be dark", "detail": looked, "latched": None}
+        dark = {"state": "said to be dark", "detail": looked, "latched": None, "accepted": False}
         assert http.post("/devices/acknowledge", json=word).json() == dark
         assert http.get("/devices").json()["safety"] == dark
         told = {e.kind: e.data for e in http.service.events.after(before, 99)}
@@ -193,9 +193,30 @@ def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
         capture = until(lambda: http.get("/captures").json())[0]
         assert capture["request"] == {"queue": entry}
         assert done(http, capture["id"])["outcome"] == "completed"
-        lamps = http.get("/health").json()["lamps"]
-        assert lamps == "unknown, unsafe", "nobody has looked since"
+        health = http.get("/health").json()
+        assert health["lamps"] == "unknown, unsafe", "nobody has looked since"
+        assert health["lamps_accepted"], "off was sent"
         refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
+
+
+def test_a_person_ends_what_a_damaged_latch_began_where_the_link_cannot_tell(
+    unread_rig, world, tmp_path
+):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "unsafe.json").write_text("{")
+    with serving(unread_rig, root) as http:
+        problem = refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+        assert "could not be read" in problem["detail"]
+        assert "until somebody has looked" in problem["detail"]
+        health = http.get("/health").json()
+        assert (health["latch"]["ended_by"], health["lamps_accepted"]) == ("acknowledge", False)
+        http.post("/devices/blackout")
+        refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
+        word = {"name": "Ada", "note": "all dark, I looked"}
+        assert http.post("/devices/acknowledge", json=word).json()["state"] == "said to be dark"
+        capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
+        assert done(http, capture)["outcome"] == "completed"
 
 
 def test_a_capture_that_cannot_end_dark_latches(http, world):
@@ -223,6 +244,7 @@ def test_the_service_starts_dark_and_starts_without_its_devices(rig_file, world,
             "state": "dark",
             "detail": "every lamp and projector was read back dark",
             "latched": None,
+            "accepted": False,
         }
 
 

@@ -107,10 +107,35 @@ def test_where_the_link_cannot_read_back_a_person_clears_the_latch(tmp_path):
         latch.acknowledge()
 
 
-def test_a_damaged_latch_is_a_set_one(tmp_path):
-    (tmp_path / "unsafe.json").write_text("{")
-    with pytest.raises(Unsafe, match="cannot be read"):
-        Latch(tmp_path / "unsafe.json").check()
+@pytest.mark.parametrize("text", ["", "{", "{}", "[]", '{"since": 1}', "\0"])
+def test_a_damaged_latch_is_a_set_one(tmp_path, text):
+    (tmp_path / "unsafe.json").write_text(text)
+    latch = Latch(tmp_path / "unsafe.json")
+    with pytest.raises(Unsafe, match="could not be read"):
+        latch.check()
+    with pytest.raises(CannotAcknowledge, match="ask for a blackout"):
+        latch.acknowledge()
+    assert latch.learn(LIT, reads_back=True) is None
+    with pytest.raises(CannotAcknowledge, match="ask for a blackout"):
+        latch.acknowledge()
+    assert latch.learn(DARK, reads_back=True) == "cleared"
+    Latch(tmp_path / "unsafe.json").check()
+
+
+OTHER_BANK = '{"since": "2026-01-01T00:00:00+00:00", "detail": "still lit", "reads_back": true}'
+
+
+@pytest.mark.parametrize("text", ["{", OTHER_BANK], ids=["damaged", "of another bank"])
+def test_the_bank_says_who_can_end_a_latch_not_the_file(tmp_path, text):
+    """Behind a bank that cannot read back no blackout ever comes to dark: a person ends it."""
+    (tmp_path / "unsafe.json").write_text(text)
+    latch = Latch(tmp_path / "unsafe.json")
+    assert latch.learn(UNREAD, reads_back=False) is None, "as the service starts"
+    for again in (latch, Latch(tmp_path / "unsafe.json")):
+        with pytest.raises(Unsafe, match="until somebody has looked"):
+            again.check()
+    latch.acknowledge()
+    Latch(tmp_path / "unsafe.json").check()
 
 
 def test_a_torn_line_spoils_no_other(tmp_path):

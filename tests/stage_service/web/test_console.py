@@ -15,6 +15,7 @@ from waiting import until
 
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
+from stage_service.acquisition.safety import Blackout
 from stage_service.acquisition.states import CaptureStatus
 
 pytestmark = pytest.mark.slow  # a browser costs some seconds of processor time a page
@@ -149,6 +150,48 @@ def test_a_lamp_that_stays_lit_cannot_be_missed(console):
     card = page.wait_for_selector(".device:has(h3:text-is('lights'))")
     assert "answers, but unsafe" in card.text_content()
     assert "unreachable" in card.get_attribute("class"), "it is marked as what needs somebody"
+
+
+UNREAD = """[devices.lights.registers]
+lit = "none"
+[devices.lights]
+accept_unverified_blackout = true"""
+"""A light bank that cannot say whether its lamps are off."""
+
+
+def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
+    http, pages = console(rig=small_rig.replace("[devices.lights]", UNREAD))
+    page = pages.open()
+
+    def told(headline: str, bar: str, lit: str) -> str:
+        """What stands above the view, once the rest is as it should be."""
+        says(page, headline)
+        page.wait_for_selector(f"#top .state:text-is({bar!r})")
+        page.wait_for_selector(f"p.lit:text-is({lit!r})")
+        return str(page.text_content("#alarms"))
+
+    says(page, "Off was sent, not read back")
+    http.post("/captures", json={"plan": {**PACED, "lights": ["light_003"]}})
+    until(lambda: http.service.captures(1)[0].state == "done")
+    sent = "off was sent; the light bank cannot say what is lit"
+    alarm = told("Off was sent, not read back", "off was sent", sent)
+    assert "nothing says that the lamps are off" in alarm
+    assert "No blackout finds out: look before anybody goes in." in alarm
+    page.click("nav >> text=Stage")
+    page.wait_for_selector(".device:has-text('answers, but cannot say whether its lamps are off')")
+    assert "safe" not in page.text_content("#view .grid")
+    page.click("nav >> text=Now")
+
+    stage = http.service._captures.stage
+    stage.learn(Blackout(False, "unknown, unsafe: lights: no answer."))
+    alarm = told("UNSAFE", "unsafe", "nobody knows what is lit")
+    assert "This light bank cannot say whether its lamps are off" in alarm
+    page.fill("[name=name]", "Ada")
+    page.fill("[name=note]", "all dark")
+    page.click("text=I looked")
+    assert not told("Said to be dark", "said to be dark", "nothing is lit, says who has looked")
+    page.keyboard.press("F9")
+    assert "No blackout finds out" in told("Off was sent, not read back", "off was sent", sent)
 
 
 def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
