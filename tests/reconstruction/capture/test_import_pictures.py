@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -375,11 +376,48 @@ def test_what_was_understood_is_said_and_drawn(folder, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_steps_of_all_kinds(folder, tmp_path):
+@pytest.fixture
+def beamed(folder):
+    """The folder with pictures of single lights, and a projector."""
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
     pose = {"K": [[30, 0, 11.5], [0, 30, 11.5], [0, 0, 1]], "R": np.eye(3).tolist()}
     beam = {"name": "proj_0", "width": 8, "height": 4, **pose, "t": [0, 0, 1]}
     (folder / "projectors.json").write_text(json.dumps({"projectors": [beam]}))
+    return folder
+
+
+def test_rows_that_nothing_places_between_tracking_frames(beamed):
+    """All would come before the first, and no motion would be taken off them."""
+    tracking = 'pictures.tracking = "{camera}/track_{number}.png"\n'
+    rows = 'pictures.scanline = "{camera}/{projector}_{row}.png"\n'
+    for camera in CAMERAS:
+        for name in ("track_1", "proj_0_2"):
+            save(beamed / camera / f"{name}.png", light_of(0, 0), np.uint16)
+    settings(beamed, tracking + rows)
+    assert Import.of(beamed).counts()["steps"] == {"olat": 3, "tracking": 1, "scanline": 1}
+    for camera in CAMERAS:
+        save(beamed / camera / "track_4.png", light_of(0, 0), np.uint16)
+    with pytest.raises(ImportProblem, match=r"scanline.*without {number} nothing says between"):
+        Import.of(beamed)
+    settings(beamed, rows)
+    assert Import.of(beamed).counts()["steps"] == {"olat": 3, "scanline": 1}
+    settings(beamed, tracking)
+    assert Import.of(beamed).counts()["steps"] == {"olat": 3, "tracking": 2}
+
+
+def test_the_documented_example_places_rows_between_tracking_frames(beamed):
+    text = (Path(__file__).parents[3] / "docs" / "importing.md").read_text()
+    said = dict(re.findall(r"^(tracking|scanline) = (.*)$", text, re.MULTILINE))
+    for camera in CAMERAS:
+        for name in ("track_00001", "proj_0_00002_2", "proj_0_00003_3", "track_00004"):
+            save(beamed / camera / f"{name}.png", light_of(0, 0), np.uint16)
+    settings(beamed, "".join(f"pictures.{role} = {name}\n" for role, name in said.items()))
+    kinds = [s.kind for s in Import.of(beamed).found.steps]
+    assert kinds[3:] == ["tracking", "scanline", "scanline", "tracking"]
+
+
+def test_steps_of_all_kinds(beamed, tmp_path):
+    folder = beamed
     for camera in CAMERAS:
         for name in ("dark", "full", "track_00001", "track_00004", "row_00002_2", "row_00003_3"):
             save(folder / camera / f"{name}.png", light_of(0, 0), np.uint16)
