@@ -129,7 +129,8 @@ class Import:
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
         found = find(folder, settings, given) if found is None else found
-        found = replace(found, notes=(*found.notes, *origin.notes))
+        alone = _plates_alone(found, settings.pictures.clean_plate)
+        found = replace(found, notes=(*found.notes, *alone, *origin.notes))
         cameras = {c.name: _sized(c, found) for c in given.cameras}
         lenses = {n: Lens.of(c) for n, c in cameras.items() if isinstance(c, LensModelCamera)}
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
@@ -318,15 +319,12 @@ class Import:
         """The subject's pixels, of the user or else by clean plates, in those of the pictures."""
         out = {n: _mask(p, self.shot[n]) for n, p in self.found.subjects.items()}
         for camera in {c for _, c in self.found.plates} - set(out):
-            told = Unchanged()
-            for step in self.found.steps:
-                light = step.light if step.kind == "olat" else None
-                picture = self.found.frames.get((step.index, camera))
-                plate = self.found.plates.get((light, camera))
-                if picture and plate and step.kind in ("olat", "all_on"):
-                    told.add(self.frame(picture, camera), self.frame(plate, camera))
-                progress("comparing with clean plates", step.index / len(self.found.steps))
-            out[camera] = told.subject()
+            pairs, told = _with_plates(self.found, camera), Unchanged()
+            for k, (picture, plate) in enumerate(pairs):
+                told.add(self.frame(picture, camera), self.frame(plate, camera))
+                progress("comparing with clean plates", (k + 1) / len(pairs))
+            if pairs:
+                out[camera] = told.subject()
         return out
 
     def _undistorted(self, masks: Mapping[str, Bools]) -> dict[str, Bools]:
@@ -344,6 +342,29 @@ class Import:
             "noise": lens.undistort(merged.noise),
         }
         return Merged(**vars(merged) | images)
+
+
+def _with_plates(found: Found, camera: str) -> list[tuple[Bracket, Bracket]]:
+    """The camera's frames that a clean plate is of the same light as, and these plates."""
+    out = []
+    for step in found.steps:
+        light = step.light if step.kind == "olat" else None
+        picture, plate = found.frames.get((step.index, camera)), found.plates.get((light, camera))
+        if picture and plate and step.kind in ("olat", "all_on"):
+            out.append((picture, plate))
+    return out
+
+
+def _plates_alone(found: Found, pattern: str | None) -> list[str]:
+    """A note on the cameras whose clean plates can be held against no frame."""
+    cameras = sorted({c for _, c in found.plates if not _with_plates(found, c)})
+    if not cameras:
+        return []
+    return [
+        f"{', '.join(cameras)}: the clean plates (pictures.clean_plate = {pattern!r}) are under no "
+        "light of a frame, and tell nothing: name single lights by {light}; plates without it go "
+        "with `all_on`"
+    ]
 
 
 def _sized(camera: Camera, found: Found) -> Camera:

@@ -247,6 +247,29 @@ def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
     np.testing.assert_allclose(image[inside], 0.6, atol=2e-3)
 
 
+def test_clean_plates_that_match_no_frame_are_told(folder, tmp_path):
+    """Plates without a light, where no frame has all lights on; one camera's are as they should."""
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    save(folder / "plate/right.png", light_of(1, 0), np.uint16)
+    settings(folder, 'pictures.clean_plate = "plate/{camera}.png"')
+    (note,) = [n for n in Import.of(folder).found.notes if "clean" in n]
+    assert note.startswith("right: the clean plates (pictures.clean_plate = 'plate/{camera}.png')")
+    capture = import_folder(folder, tmp_path / "out")
+    assert note in capture.plan["import"]["notes"]
+    assert not list(capture.path.glob("subjects/*"))
+    plates = folder / "plate"
+    (plates / "right").mkdir()
+    (plates / "right.png").rename(plates / "right" / "all.png")
+    save(plates / "left" / "1.png", 0 * light_of(0, 0), np.uint16)
+    save(plates / "right" / "1.png", 0 * light_of(0, 0), np.uint16)
+    (folder / "images/right/1.png").unlink()
+    settings(folder, 'pictures.clean_plate = "plate/{camera}/{light}.png"')
+    capture = import_folder(folder, tmp_path / "other")
+    (note,) = [n for n in capture.plan["import"]["notes"] if "clean" in n]
+    assert note.startswith("right: ")
+    assert [p.name for p in capture.path.glob("subjects/*")] == ["left.png"]
+
+
 def test_a_flat_field_evens_the_lens(folder, tmp_path):
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     falls = (1 - 0.4 * (x**2 + y**2) / (x**2 + y**2).max())[..., None].astype(np.float32)
