@@ -39,7 +39,8 @@ class Origin:
         try:
             sight = Sight.of(cameras)
         except PlacementError:
-            return cls(notes=(_unknown("they all look the same way"),))
+            alone = "there is but one" if len(cameras) == 1 else "they all look the same way"
+            return cls(notes=(_unknown(alone),))
         point = np.round(sight.point, 3) + 0.0  # no -0
         if np.linalg.norm(point) <= NEAR:
             return cls()

@@ -134,6 +134,7 @@ def test_cameras_that_do_not_say_where_the_subject_is() -> None:
         Camera.look_at(str(e), 8, 6, np.add([0, 0, 2], e), np.add([0, 0, 2], 2 * np.array(e)), 30)
         for e in EYES
     ]
+    assert "there is but one" in Origin.of(pair[:1]).notes[0]
     for stage, why in ((parallel, "the same way"), (pair, "nearly the same"), (apart, "one place")):
         origin = Origin.of(stage)
         assert not origin.moved
