@@ -107,5 +107,5 @@ class Unchanged:
         self._same = self._same + (told & (np.abs(a - b) <= np.maximum(noise, AGREES * larger)))
 
     def subject(self) -> Bools:
-        """The subject's pixels `(H, W)`."""
+        """The subject's pixels `(H, W)`, after one `add` or more."""
         return np.asarray((self._told > 0) & (2 * self._same <= self._told))

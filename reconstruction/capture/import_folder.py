@@ -9,6 +9,7 @@ folder/
   masks/<camera>.png             hair masks, optional
   subjects/<camera>.png          masks of hair, head and body, optional
   head.obj                       the head's mesh in the same frame, optional
+  scalp.obj                      digitised points of the scalp in the same frame, optional
 
 Conventions are those of `Camera` and `Light`: OpenCV, metres, pixel centres at integers, W/sr. An
 `id` may be a string, which then is the name of folder or file, or a number n, which stands for
@@ -20,7 +21,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from reconstruction.capture.exposures import Merged, Unchanged, flattened, merge
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.grey_ball import PlacedBall, Scale
 from reconstruction.capture.import_geometry import Geometry
+from reconstruction.capture.import_origin import Origin
 from reconstruction.capture.import_settings import (
     SETTINGS,
     Bracket,
@@ -44,7 +46,9 @@ from reconstruction.capture.import_settings import (
 )
 from reconstruction.capture.import_tables import cameras_of, lights_of, projectors_of
 from reconstruction.capture.writer import CaptureWriter
+from reconstruction.files.durable import write_whole
 from reconstruction.files.pictures import PictureError, picture_size, read_picture
+from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
@@ -85,6 +89,7 @@ class Import:
 
     `shot` are the cameras of the pictures, by name; `lenses` of those whose pictures are resampled,
     as a rig cannot hold their lens; `rig` is the capture's; `ball` is grey and tells W/(sr m²).
+    All of them, `head` and `scalp` (the text of scalp.obj) are about `origin`.
     """
 
     folder: Path
@@ -95,6 +100,8 @@ class Import:
     found: Found
     head: Mesh | None
     ball: PlacedBall | None = None
+    scalp: str | None = None
+    origin: Origin = field(default_factory=Origin)
 
     @classmethod
     def of(
@@ -119,13 +126,17 @@ class Import:
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
+        origin = Origin.of(given.cameras)
+        given = origin.rig(given)
         found = find(folder, settings, given) if found is None else found
+        alone = _plates_alone(found, settings.pictures.clean_plate)
+        found = replace(found, notes=(*found.notes, *alone, *origin.notes))
         cameras = {c.name: _sized(c, found) for c in given.cameras}
         lenses = {n: Lens.of(c) for n, c in cameras.items() if isinstance(c, LensModelCamera)}
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
         lit = {s.light for s in found.steps}
-        rig = Rig(folder.name, kept, tuple(x for x in lights if x.name in lit), projectors)
-        head = _head(folder / "head.obj")
+        rig = replace(given, cameras=kept, lights=tuple(x for x in given.lights if x.name in lit))
+        head, scalp = _head(folder / "head.obj"), _scalp(folder / "scalp.obj")
         ball = None
         if settings.grey_ball is not None:
             if settings.units == "relative" or settings.scale != 1:
@@ -134,7 +145,10 @@ class Import:
                 ball = PlacedBall.of(settings.grey_ball, cameras)
             except ValueError as error:
                 raise ImportProblem(f"grey_ball.{error}") from error
-        return cls(folder, settings, rig, cameras, lenses, found, head, ball)
+        return cls(
+            folder, settings, rig, cameras, lenses, found, origin.head(head), ball,
+            None if scalp is None else origin.obj(scalp), origin,
+        )  # fmt: skip
 
     @property
     def missing(self) -> list[tuple[Step, str]]:
@@ -207,14 +221,19 @@ class Import:
         """
         subjects = self._subjects(progress)
         masks = {n: _mask(p, self.shot[n]) for n, p in self.found.hair.items()}
-        notes = {"notes": [*self.found.notes, *self._ball_says], "relative": self.relative}
-        plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": notes}
+        said: dict[str, Any] = {"notes": [*self.found.notes, *self._ball_says]}
+        said["relative"] = self.relative
+        if self.origin.moved:
+            said["origin"] = self.origin.point.tolist()
+        plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": said}
         writer = CaptureWriter.create(
             out, self.rig, plan, masks=self._undistorted(masks), head=self.head,
             subjects=self._undistorted(subjects),
         )  # fmt: skip
         frames = [(s, c) for s in self.found.steps for c in self.shot]
         try:
+            if self.scalp is not None:
+                write_whole(out / "scalp.obj", self.scalp.encode())
             for k, (step, camera) in enumerate(frames):
                 if bracket := self.found.frames.get((step.index, camera)):
                     merged = self.frame(bracket, camera)
@@ -300,15 +319,12 @@ class Import:
         """The subject's pixels, of the user or else by clean plates, in those of the pictures."""
         out = {n: _mask(p, self.shot[n]) for n, p in self.found.subjects.items()}
         for camera in {c for _, c in self.found.plates} - set(out):
-            told = Unchanged()
-            for step in self.found.steps:
-                light = step.light if step.kind == "olat" else None
-                picture = self.found.frames.get((step.index, camera))
-                plate = self.found.plates.get((light, camera))
-                if picture and plate and step.kind in ("olat", "all_on"):
-                    told.add(self.frame(picture, camera), self.frame(plate, camera))
-                progress("comparing with clean plates", step.index / len(self.found.steps))
-            out[camera] = told.subject()
+            pairs, told = _with_plates(self.found, camera), Unchanged()
+            for k, (picture, plate) in enumerate(pairs):
+                told.add(self.frame(picture, camera), self.frame(plate, camera))
+                progress("comparing with clean plates", (k + 1) / len(pairs))
+            if pairs:
+                out[camera] = told.subject()
         return out
 
     def _undistorted(self, masks: Mapping[str, Bools]) -> dict[str, Bools]:
@@ -326,6 +342,29 @@ class Import:
             "noise": lens.undistort(merged.noise),
         }
         return Merged(**vars(merged) | images)
+
+
+def _with_plates(found: Found, camera: str) -> list[tuple[Bracket, Bracket]]:
+    """The camera's frames that a clean plate is of the same light as, and these plates."""
+    out = []
+    for step in found.steps:
+        light = step.light if step.kind == "olat" else None
+        picture, plate = found.frames.get((step.index, camera)), found.plates.get((light, camera))
+        if picture and plate and step.kind in ("olat", "all_on"):
+            out.append((picture, plate))
+    return out
+
+
+def _plates_alone(found: Found, pattern: str | None) -> list[str]:
+    """A note on the cameras whose clean plates can be held against no frame."""
+    cameras = sorted({c for _, c in found.plates if not _with_plates(found, c)})
+    if not cameras:
+        return []
+    return [
+        f"{', '.join(cameras)}: the clean plates (pictures.clean_plate = {pattern!r}) are under no "
+        "light of a frame, and tell nothing: name single lights by {light}; plates without it go "
+        "with `all_on`"
+    ]
 
 
 def _sized(camera: Camera, found: Found) -> Camera:
@@ -360,3 +399,14 @@ def _head(path: Path) -> Mesh | None:
         return read_obj(path) if path.is_file() else None
     except ValueError as error:
         raise ImportProblem(str(error)) from error
+
+
+def _scalp(path: Path) -> str | None:
+    """The text of a file of points, once it could be read as such."""
+    if not path.is_file():
+        return None
+    try:
+        read_points(path)
+    except ValueError as error:
+        raise ImportProblem(str(error)) from error
+    return path.read_text()

@@ -38,7 +38,8 @@ class Patterns:
 
     `{camera}`, `{light}` and `{projector}` are names, or the number that a name ends in;
     `{exposure}` is seconds (`0.02`, `1-50`) or a name of `exposures`; `{row}` a projector's row;
-    `{number}` counts what else there is several of, in the order of shooting; `*` is any text.
+    `{number}` counts what else there is several of, in the order of shooting: tracking frames and
+    rows in one count; `*` is any text.
     `clean_plate` shows the stage without the subject, `flat` an evenly lit field.
     """
 
@@ -133,7 +134,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     """Match the names of all files in `folder` with the patterns, and these with `rig`.
 
     Raises `ImportProblem`: a pattern that cannot be used, no picture of a single light, two files
-    for one frame.
+    for one frame, rows that cannot be placed between tracking frames.
     """
     files = sorted(p for p in folder.rglob("*") if p.is_file())
     names = {p.relative_to(folder).as_posix(): p for p in files}
@@ -143,6 +144,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     for role in (f for f in vars(patterns) if getattr(patterns, f)):
         matches[role] = reader.matching(role, getattr(patterns, role), names)
         used |= {m.path for m in matches[role]}
+    _check_order(patterns, matches)
     steps: list[Step] = []
     frames: dict[tuple[int, str], Bracket] = {}
     kinds: list[tuple[StepKind, tuple[Any, ...], list[_Match]]] = []
@@ -177,6 +179,23 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
         tuple(left), (*_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
+
+
+def _check_order(patterns: Patterns, matches: Mapping[str, Sequence[_Match]]) -> None:
+    """Raises `ImportProblem` where rows have no place among several tracking frames.
+
+    They would all come before the first one, whose pose is the reference: no motion would be taken
+    off them, though one is solved and reported.
+    """
+    several = len({m.shot for m in matches.get("tracking", [])}) > 1
+    rows = patterns.scanline if matches.get("scanline") else None
+    if several and rows is not None and "{number}" not in rows:
+        raise ImportProblem(
+            f"pictures.scanline = {rows!r}: without {{number}} nothing says between which tracking "
+            f"frames ({patterns.tracking!r}) a row was shot, and the subject's motion could not be "
+            "taken off: give rows the {number} of the same count, or, where the subject kept "
+            "still, leave `tracking` out"
+        )
 
 
 def _brackets(matches: Sequence[_Match]) -> dict[str, Bracket]:

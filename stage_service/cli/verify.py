@@ -123,7 +123,8 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
         of_set = PresetFiles(args.folder, args.take, args.cameras, args.lights)
         take = read_preset(args.preset, of_set, mean_light, given)
         settings, found = understood(take)
-        return Import.of(args.folder, take.geometry, settings, found), take.geometry.notes
+        seen = Import.of(args.folder, take.geometry, settings, found)
+        return seen, [*take.geometry.notes, *seen.found.notes]
     settings = settings_of(args.folder, args.settings)
     said = settings.geometry
     asked = {f: getattr(args, f) for f in ("cameras", "lights")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -260,6 +261,29 @@ def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
     np.testing.assert_allclose(image[inside], 0.6, atol=2e-3)
 
 
+def test_clean_plates_that_match_no_frame_are_told(folder, tmp_path):
+    """Plates without a light, where no frame has all lights on; one camera's are as they should."""
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    save(folder / "plate/right.png", light_of(1, 0), np.uint16)
+    settings(folder, 'pictures.clean_plate = "plate/{camera}.png"')
+    (note,) = [n for n in Import.of(folder).found.notes if "clean" in n]
+    assert note.startswith("right: the clean plates (pictures.clean_plate = 'plate/{camera}.png')")
+    capture = import_folder(folder, tmp_path / "out")
+    assert note in capture.plan["import"]["notes"]
+    assert not list(capture.path.glob("subjects/*"))
+    plates = folder / "plate"
+    (plates / "right").mkdir()
+    (plates / "right.png").rename(plates / "right" / "all.png")
+    save(plates / "left" / "1.png", 0 * light_of(0, 0), np.uint16)
+    save(plates / "right" / "1.png", 0 * light_of(0, 0), np.uint16)
+    (folder / "images/right/1.png").unlink()
+    settings(folder, 'pictures.clean_plate = "plate/{camera}/{light}.png"')
+    capture = import_folder(folder, tmp_path / "other")
+    (note,) = [n for n in capture.plan["import"]["notes"] if "clean" in n]
+    assert note.startswith("right: ")
+    assert [p.name for p in capture.path.glob("subjects/*")] == ["left.png"]
+
+
 def test_a_flat_field_evens_the_lens(folder, tmp_path):
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     falls = (1 - 0.4 * (x**2 + y**2) / (x**2 + y**2).max())[..., None].astype(np.float32)
@@ -389,11 +413,48 @@ def test_what_was_understood_is_said_and_drawn(folder, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_steps_of_all_kinds(folder, tmp_path):
+@pytest.fixture
+def beamed(folder):
+    """The folder with pictures of single lights, and a projector."""
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
     pose = {"K": [[30, 0, 11.5], [0, 30, 11.5], [0, 0, 1]], "R": np.eye(3).tolist()}
     beam = {"name": "proj_0", "width": 8, "height": 4, **pose, "t": [0, 0, 1]}
     (folder / "projectors.json").write_text(json.dumps({"projectors": [beam]}))
+    return folder
+
+
+def test_rows_that_nothing_places_between_tracking_frames(beamed):
+    """All would come before the first, and no motion would be taken off them."""
+    tracking = 'pictures.tracking = "{camera}/track_{number}.png"\n'
+    rows = 'pictures.scanline = "{camera}/{projector}_{row}.png"\n'
+    for camera in CAMERAS:
+        for name in ("track_1", "proj_0_2"):
+            save(beamed / camera / f"{name}.png", light_of(0, 0), np.uint16)
+    settings(beamed, tracking + rows)
+    assert Import.of(beamed).counts()["steps"] == {"olat": 3, "tracking": 1, "scanline": 1}
+    for camera in CAMERAS:
+        save(beamed / camera / "track_4.png", light_of(0, 0), np.uint16)
+    with pytest.raises(ImportProblem, match=r"scanline.*without {number} nothing says between"):
+        Import.of(beamed)
+    settings(beamed, rows)
+    assert Import.of(beamed).counts()["steps"] == {"olat": 3, "scanline": 1}
+    settings(beamed, tracking)
+    assert Import.of(beamed).counts()["steps"] == {"olat": 3, "tracking": 2}
+
+
+def test_the_documented_example_places_rows_between_tracking_frames(beamed):
+    text = (Path(__file__).parents[3] / "docs" / "importing.md").read_text()
+    said = dict(re.findall(r"^(tracking|scanline) = (.*)$", text, re.MULTILINE))
+    for camera in CAMERAS:
+        for name in ("track_00001", "proj_0_00002_2", "proj_0_00003_3", "track_00004"):
+            save(beamed / camera / f"{name}.png", light_of(0, 0), np.uint16)
+    settings(beamed, "".join(f"pictures.{role} = {name}\n" for role, name in said.items()))
+    kinds = [s.kind for s in Import.of(beamed).found.steps]
+    assert kinds[3:] == ["tracking", "scanline", "scanline", "tracking"]
+
+
+def test_steps_of_all_kinds(beamed, tmp_path):
+    folder = beamed
     for camera in CAMERAS:
         for name in ("dark", "full", "track_00001", "track_00004", "row_00002_2", "row_00003_3"):
             save(folder / camera / f"{name}.png", light_of(0, 0), np.uint16)
