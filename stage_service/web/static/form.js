@@ -15,7 +15,7 @@ export function formOf(schema, defs, { hints = {}, skip = [], onchange }) {
       const here = [...path, name];
       if (skip.includes(here.join("."))) continue;
       const kind = resolved(given);
-      if ("const" in kind) continue;  // nothing to choose
+      if ("const" in given) continue;  // nothing to choose
       if (kind.type === "object" && kind.properties) {
         const own = h(".fields");
         groups.push(h("fieldset", h("legend", words(name)), own));
