@@ -72,7 +72,7 @@ class HairParameters:
 
     @cached_property
     def far_field(self) -> FarField | None:
-        """The BSDF of a whole width; None where hair varies or lobes are narrower than a node."""
+        """The mean over the width; None where hair varies or lobes are narrower than a node."""
         varies = [
             self._constant[name] is None if dr.is_tensor_v(value) else dr.width(value) > 1
             for name, value in self.values.items()

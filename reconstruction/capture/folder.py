@@ -139,7 +139,7 @@ class Capture:
         self._lenses: dict[str, Lens] = {}
         self._by = 1
         self._kept: KeptFrames | None = None
-        self._stray: tuple[tuple[str, tuple[int, ...]], Floats | None] | None = None
+        self._stray: tuple[str, dict[tuple[int, ...], Floats | None]] = "", {}
 
     def view(
         self,
@@ -160,7 +160,7 @@ class Capture:
         """
         out = copy.copy(self)
         out.__dict__.pop("_of_light", None)
-        out._stray = None
+        out._stray = "", {}
         chosen = list(self.rig.cameras)
         if cameras is not None:
             names = self._known("camera", cameras, [c.name for c in chosen])
@@ -344,13 +344,15 @@ class Capture:
         return image, saturated
 
     def _stray_light(self, camera: str, exposure: float) -> Floats | None:
-        """Kept of one camera: frames are read camera by camera."""
+        """Kept of one camera, at all its exposures: frames are read camera by camera."""
         steps = self.dark_steps(camera, exposure)
-        key = camera, tuple(s.index for s in steps)
-        if self._stray is None or self._stray[0] != key:
+        if self._stray[0] != camera:
+            self._stray = camera, {}
+        key, kept = tuple(s.index for s in steps), self._stray[1]
+        if key not in kept:
             dark = [self.frame(s, camera) for s in steps]
-            self._stray = key, stray_light(np.mean(dark, axis=0)) if dark else None
-        return self._stray[1]
+            kept[key] = stray_light(np.mean(dark, axis=0)) if dark else None
+        return kept[key]
 
     def dark_steps(self, camera: str, exposure: float | None = None) -> list[Step]:
         """The dark frames that `camera` wrote; with `exposure` those at the nearest one."""

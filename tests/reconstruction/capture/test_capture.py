@@ -99,6 +99,22 @@ def test_light_in_dark_frames_of_the_same_exposure_is_taken_off(tmp_path, stray,
         assert part.mean() == pytest.approx(0.3, abs=0.2 * noise + 1e-6)
 
 
+def test_dark_frames_are_read_once_a_camera_and_exposure(tmp_path, monkeypatch):
+    capture, read = lit_beside(tmp_path / "c", 0.05, 0.0), []
+    right = Capture.frame
+
+    def frame(self, step, camera):
+        read.append(step.index)
+        return right(self, step, camera)
+
+    monkeypatch.setattr(Capture, "frame", frame)
+    for exposure in (0.02, 0.5, 0.02, 0.4):
+        assert capture._stray_light("cam_0", exposure).max() == pytest.approx(
+            0.05 if exposure < 0.1 else 0.45
+        )
+    assert read == [0, 1]
+
+
 def test_noise_in_dark_frames_is_not(tmp_path):
     capture = lit_beside(tmp_path / "c", 0.0, 0.01)
     image, _ = capture.light("light_0", "cam_0")
