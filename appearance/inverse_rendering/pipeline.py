@@ -58,8 +58,7 @@ def fit_maps(
     "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
     fit and of what was found; "doubts" are warnings for whoever renders what was found.
     "fibre_beta_m" is the roughness without the scatter of the strands' directions that Sun's fit
-    measured, its range that by two of the scatter's standard errors; None where none was, or it is
-    most of it.
+    measured, its range an interval of about 95 %; None where none was, or it is most of it.
     What is rendered keeps the scatter: it belongs to these strands. Raises `CaptureError` or
     `ModelError` naming what is missing.
     """

@@ -6,9 +6,15 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 from pydantic import TypeAdapter
 
-from appearance.bsdf.longitudinal import roughness_without_scatter
+from appearance.bsdf.longitudinal import (
+    LEAST_VARIANCE,
+    roughness_of_variance,
+    roughness_without_scatter,
+    variance_of_roughness,
+)
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
@@ -77,17 +83,23 @@ class FittedAppearance:
         return roughness_without_scatter(beta_m, math.radians(self.uncertainty.tangents_deg))
 
     def fibre_beta_m_range(self, beta_m: float) -> tuple[float, float] | None:
-        """`fibre_beta_m` with the scatter two standard errors more, and less.
+        """The ends of an interval of about 95 % about `fibre_beta_m`.
 
-        The low end is 0 where more scatter would be too much of the lobe to tell. None where the
-        scatter's error is not known; what `beta_m` is off by comes on top.
+        Two standard errors of the fibres' variance to both sides, from those of the scatter and of
+        `beta_m`, taken to be known as well as Sun's fit knows it. The low end is 0 where nothing of
+        the lobe need be the fibres'. None where the errors, or the fibres' β_M, are not known.
         """
-        known = self.uncertainty
-        if known is None or known.tangents_deg is None or known.tangents_error_deg is None:
+        known, fibre = self.uncertainty, self.fibre_beta_m(beta_m)
+        if known is None or fibre is None or known.tangents_error_deg is None:
             return None
-        ends = (known.tangents_deg + k * known.tangents_error_deg for k in (2, -2))
-        low, high = (roughness_without_scatter(beta_m, math.radians(max(e, 0.0))) for e in ends)
-        return None if high is None else (low or 0.0, high)
+        rougher, smoother = (min(beta_m * math.exp(k * known.beta_m), 1.0) for k in (1, -1))
+        whole = variance_of_roughness([fibre, rougher, smoother])
+        scatter = math.radians(known.tangents_deg or 0.0)
+        error = math.radians(known.tangents_error_deg)
+        off = 2 * math.hypot(0.5 * (whole[1] - whole[2]), 8 * scatter * error)
+        ends = np.maximum(whole[0] + np.array([-off, off]), LEAST_VARIANCE)
+        low, high = roughness_of_variance(ends).tolist()
+        return (low if ends[0] > LEAST_VARIANCE else 0.0), high
 
     def save(self, model: Model) -> None:
         """Write `appearance.json`."""
