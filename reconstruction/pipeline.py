@@ -278,7 +278,7 @@ class _Stages:
         o, olat = self.options, masked.capture.olat_lights()
         mesh = None if head is None else head.mesh
         envelope, depths = self.envelope(masked, cloud, mesh)
-        pixel = pixel_size(masked.cameras, envelope)
+        pixel = pixel_size(masked.cameras, envelope.centers().mean(axis=0))
         measured, seen = Measured.none(), list[AnyFloats]()
         if olat:
             measured = self.tangents(masked, cloud, depths)

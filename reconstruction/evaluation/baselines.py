@@ -1,4 +1,4 @@
-"""Strands that no method made: what any reconstruction has to beat.
+"""Strands to compare with: two that no method made, and what exact directions would score.
 
 A table of precision and recall says little beside an empty page. These two baselines know the masks
 and the head and nothing else, and fill the hull so densely that a true point in it always has a
@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruction.arrays import Array, Bools
+from reconstruction.evaluation.oriented_points import STEP
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import inside_mesh, mesh_depth, mesh_silhouette
@@ -85,4 +86,26 @@ def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
     direction, there = field.sample(lattice, np.broadcast_to(DOWN, lattice.shape))
     center, half = lattice[there], direction[there] * SPACING / 2
     ends = np.stack([center - half, center + half], axis=1)
+    return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)
+
+
+def with_true_directions(strands: Strands, true: Strands, width: float) -> Strands:
+    """`strands` in pieces, each with the mean direction of `true` in its cube of `width` metres.
+
+    No baseline: the truth goes in. What directions would score at these places that are exact, but
+    no finer than `width`. Where no true strand is in the cube a piece keeps its direction.
+    """
+    pieces, dense = strands.resampled(STEP), true.resampled(STEP)
+    cell = np.concatenate([np.floor(s.points / width) for s in (dense, pieces)]).astype(np.int64)
+    cell -= cell.min(axis=0)
+    flat = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    cell = np.unique(flat, return_inverse=True)[1]
+    of_true, of_piece = np.split(cell, [len(dense.points)])
+    t, count = dense.tangents().astype(float), int(cell.max()) + 1
+    sums = [np.bincount(of_true, t[:, i] * t[:, j], count) for i, j in np.ndindex(3, 3)]
+    tensors = np.stack(sums, axis=1).reshape(-1, 3, 3)
+    known = np.trace(tensors, axis1=1, axis2=2)[of_piece] > 0
+    mean = np.linalg.eigh(tensors)[1][of_piece, :, -1]
+    half = np.where(known[:, None], mean, pieces.tangents()) * STEP / 2
+    ends = np.stack([pieces.points - half, pieces.points + half], axis=1)
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)

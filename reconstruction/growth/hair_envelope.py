@@ -109,10 +109,9 @@ def build_hull(
     }
 
 
-def pixel_size(cameras: Sequence[Camera], envelope: VoxelGrid) -> float:
-    """Metres that one pixel spans at the envelope's middle, the median over the cameras."""
-    middle = envelope.centers().mean(axis=0)[None]
-    return float(np.median([c.project(middle)[1][0] / c.K[0, 0] for c in cameras]))
+def pixel_size(cameras: Sequence[Camera], middle: Array) -> float:
+    """Metres that one pixel spans at `middle (3,)`, the median over the cameras."""
+    return float(np.median([c.project(middle[None])[1][0] / c.K[0, 0] for c in cameras]))
 
 
 def _holding(grid: VoxelGrid, points: Array) -> Bools:

@@ -19,16 +19,23 @@ def evaluate_geometry(
     seed: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Score `model`'s strands and both hull baselines against the strand file `truth`.
+    """Score `model`'s strands and what they are compared with against the strand file `truth`.
 
-    Returns `{visible, all}` of ours and `baselines.{hull_vertical, hull_smooth_field}` with the
-    same two. The true strands stand where the subject stood during the OLAT pass. The baselines get
-    the masks that the reconstruction had: those of the cameras that are not held out.
+    Returns `{visible, all}` of ours and `baselines.{true_directions, hull_vertical,
+    hull_smooth_field}` with the same two. The true strands stand where the subject stood during the
+    OLAT pass. The hulls get the masks that the reconstruction had: those of the cameras that are
+    not held out. `true_directions` are ours with the truth's over a pixel.
     """
     from reconstruction import read_strands
-    from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
+    from reconstruction.evaluation.baselines import (
+        baseline_hull,
+        hull_smooth_field,
+        hull_vertical,
+        with_true_directions,
+    )
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
+    from reconstruction.growth.hair_envelope import pixel_size
 
     true = read_strands(truth)
     cameras, head = capture.rig.cameras, model.head(capture)
@@ -39,12 +46,19 @@ def evaluate_geometry(
         return compare_strands(strands, true, seed=seed, visibility=visibility)
 
     progress("our strands against the true ones", 0.2)
-    figures = score(model.strands())
-    progress("baseline: the hull filled with vertical lines", 0.3)
+    ours = model.strands()
+    figures = score(ours)
+    progress("our strands with the true directions over a pixel", 0.3)
     used = [c for c in cameras if c.name not in held_out_cameras]
+    pixel = pixel_size(used, true.points.mean(axis=0, dtype=float))
+    turned = score(with_true_directions(ours, true, pixel))
+    # pieces: that they are many and lie on no one strand says nothing
+    turned = {key: turned[key] for key in ("visible", "all", "equal_length")}
+    baselines = {"true_directions": turned}
+    progress("baseline: the hull filled with vertical lines", 0.4)
     masks = {c.name: model.mask(c.name, "hair", capture) for c in used}
     hull = baseline_hull(used, masks, head)
-    baselines = {"hull_vertical": score(hull_vertical(hull))}
+    baselines["hull_vertical"] = score(hull_vertical(hull))
     progress("baseline: the hull filled with the smooth field of its surface", 0.6)
     baselines["hull_smooth_field"] = score(hull_smooth_field(hull, head))
     progress("judged", 1.0)

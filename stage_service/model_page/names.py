@@ -9,6 +9,7 @@ THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 GROUPS = ("held_out_lights", "held_out_camera")
 STRANDS = {
     "ours": "ours",
+    "true_directions": "ours, turned as the truth is over a pixel",
     "hull_smooth_field": "hull + smooth field",
     "hull_vertical": "hull + vertical",
 }

@@ -1,4 +1,4 @@
-"""What strands are scored against, and the baselines that use no method."""
+"""What strands are scored against, and what they are compared with."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ from scipy import ndimage
 
 from reconstruction import Capture, Model, Strands, read_strands
 from reconstruction.arrays import Array
-from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
+from reconstruction.evaluation.baselines import (
+    baseline_hull,
+    hull_smooth_field,
+    hull_vertical,
+    with_true_directions,
+)
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.growth.hair_envelope import pixel_size
 
 STEP = 5e-4
 """Metres between the points at which strands are cut at a ball's surface."""
@@ -101,13 +107,20 @@ class StrandTruth:
         )
 
     def baselines(self, model: Model, spacing: float = 2e-3) -> dict[str, dict[str, Any]]:
-        """Scores of what uses no method, in the masks that `model`'s reconstruction had."""
+        """Scores of what uses no method, in the masks that `model`'s reconstruction had.
+
+        And of its strands as the truth turns them over a pixel.
+        """
         capture = self._capture
         masks = {c.name: model.mask(c.name, "hair", capture) for c in capture.rig.cameras}
         hull = baseline_hull(capture.rig.cameras, masks, capture.head, spacing=spacing)
         if self._ball is not None:  # cameras that see a patch bound no hull elsewhere
             hull = self._ball.within(hull, spacing)
+        pixel = pixel_size(capture.rig.cameras, self.strands.points.mean(axis=0, dtype=float))
+        ours = model.strands() if self._ball is None else self._ball.cut(model.strands())
+        turned = with_true_directions(ours, self.strands, pixel)
         return {
+            "true_directions": self.score(turned),
             "hull_vertical": self.score(hull_vertical(hull)),
             "hull_smooth_field": self.score(hull_smooth_field(hull, capture.head)),
         }

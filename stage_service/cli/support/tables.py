@@ -156,17 +156,20 @@ def _cell(figures: Sequence[Mapping[str, float]], parts: Sequence[_Part]) -> Ite
 
 def _f(results: Mapping[str, Any], at: str, over: str, name: str) -> float | None:
     scores = _scores_of(results, name)
-    if at and at not in scores:
+    if scores is None or (at and at not in scores):
         return None  # of an earlier version
     return 100 * float((scores[at] if at else scores)[over][THRESHOLDS[0]]["f"])
 
 
 def _strand_figure(results: Mapping[str, Any], place: Sequence[str], name: str) -> float | None:
-    return strand_figure(_scores_of(results, name), place)
+    scores = _scores_of(results, name)
+    return None if scores is None else strand_figure(scores, place)
 
 
-def _scores_of(results: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = results["geometry"] if name == "ours" else results["baselines"][name]
+def _scores_of(results: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+    found: Mapping[str, Any] | None = {"ours": results["geometry"], **results["baselines"]}.get(
+        name
+    )
     return found
 
 

@@ -11,6 +11,7 @@ from reconstruction.evaluation.baselines import (
     baseline_hull,
     hull_smooth_field,
     hull_vertical,
+    with_true_directions,
 )
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.lights import dome_positions
@@ -168,3 +169,29 @@ def test_smooth_field_falls_from_the_crown_of_a_dome() -> None:
     some = slope > 0.4
     angle = np.abs((pieces.tangents()[::2] * down).sum(axis=1)[some] / slope[some])
     assert np.quantile(angle, 0.05) > 0.97
+
+
+def test_true_directions_are_the_mean_over_a_cube() -> None:
+    # in one cube of 4 mm two strands 30° to either side of z, in the next one along y, then none
+    slope = np.tan(np.radians(30)) * 2e-3
+    true = Strands.from_list(
+        [
+            np.array([[0.001, 0.002 - slope, 0], [0.001, 0.002 + slope, 0.004]]),
+            np.array([[0.002, 0.002 + slope, 0], [0.002, 0.002 - slope, 0.004]]),
+            np.array([[0.006, 0.0, 0.002], [0.006, 0.004, 0.002]]),
+        ]
+    )
+    ours = Strands.from_list([np.array([[0.0005, 0.002, 0.002], [0.0125, 0.002, 0.002]])])
+    pieces = with_true_directions(ours, true, 4e-3)
+    middle, tangent = pieces.points.reshape(-1, 2, 3).mean(axis=1), np.abs(pieces.tangents()[::2])
+    assert np.allclose(middle, ours.resampled(1e-3).points, atol=1e-6), "they stay in their places"
+    assert pieces.lengths() == pytest.approx(1e-3, rel=1e-3)
+    for cube, axis in ((0, 2), (1, 1), (2, 0)):
+        there = np.floor(middle[:, 0] / 4e-3) == cube
+        assert there.sum() >= 4
+        assert tangent[there, axis] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_true_directions_of_no_strands_are_none() -> None:
+    true = Strands.from_list([np.array([[0, 0, 0], [0, 0, 0.1]])])
+    assert len(with_true_directions(Strands.from_list([]), true, 1e-3)) == 0
