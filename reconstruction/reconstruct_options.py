@@ -71,7 +71,7 @@ class MeasureOptions:
     reflection_radius: Length = 4e-3
     neighbours: Count = 48
     thin: Length = 2e-3
-    reflection_weight: Factor = 12.0
+    reflection_weight: Factor = 6.0
     tolerance: Length = 4e-3
 
 

@@ -21,11 +21,12 @@ from reconstruction.tangents.line_evidence import Tangents
 
 FEWEST_LIGHTS = 60  # under about one light for each 15 degrees the highlight falls between them
 
-_SUMS, _AZIMUTHS, _TILTS, _FACINGS = 9, 4, 2, 8
+_SUMS, _AZIMUTHS, _TILTS, _FACINGS = 18, 4, 2, 8
 _LARGEST_SUM = 1.4
 _GRAZING = 0.1
 _BRIGHTEST = 6.0
 _BLOCK = 0.03
+_MOST_ALIKE = 0.99  # correlation: the table itself is off by that much
 _TRUSTED = 0.4  # of the points, the most confident ones
 
 
@@ -135,8 +136,8 @@ class Reflection:
     """How the hair of this capture reflects: a table over geometry, mean 1 in front of the light.
 
     `lit (8,)` is the mean answer over the cosine of the light to the surface, what shading and
-    shadow leave; `lobe (9·4·2,)` the mean of what remains over |sin θ_i + sin θ_r| (0 on the mirror
-    cone), cos φ between light and camera around the fibre, and |sin θ_r|.
+    shadow leave; `lobe (18·4·2,)` the mean of what remains over |sin θ_i + sin θ_r| (0 on the
+    mirror cone), cos φ between light and camera around the fibre, and |sin θ_r|.
     """
 
     lit: Array
@@ -172,14 +173,15 @@ class Reflection:
     def contrast(self) -> float:
         """Lobe on the mirror cone over lobe far from it: 1 says that directions cannot be read."""
         sums = self.lobe.reshape(_SUMS, -1)
-        return float(sums[:2].mean() / max(float(sums[4:].mean()), 1e-9))
+        return float(sums[:4].mean() / max(float(sums[8:].mean()), 1e-9))
 
     def scores(self, o: Observations, points: Array, candidates: Array) -> Floats:
-        """Correlation `(P, D)` of the answers with the table's for each of `candidates (D, 3)`.
+        """Log-likelihoods `(P, D)`, an answer's, of `candidates (D, 3)`: 0 says nothing.
 
-        Weighted by `lit`, so that lights behind the surface, in shadow, hardly count; on square
-        roots, so that a single bright light does not decide. Points of one cell of 3 cm share
-        the directions to lights and camera.
+        -½ log(1 - ρ²), of answers whose scale and noise are not known, where they have the
+        correlation ρ with the table's; 0 where that is negative. Weighted by `lit`, so that lights
+        behind the surface, in shadow, hardly count; on square roots, so that a single bright light
+        does not decide. Points of one cell of 3 cm share the directions to lights and camera.
         """
         out = np.zeros((len(o.index), len(candidates)), np.float32)
         model = np.sqrt(self.lobe).astype(np.float32)
@@ -205,7 +207,8 @@ class Reflection:
             mean = (w @ predicted) / total
             variance = w @ (predicted * predicted) - total * mean**2
             spread = variance * (w * y * y).sum(axis=1, keepdims=True)
-            out[m] = ((w * y) @ predicted) / np.sqrt(np.maximum(spread, 1e-9))
+            alike = ((w * y) @ predicted) / np.sqrt(np.maximum(spread, 1e-9))
+            out[m] = -0.5 * np.log1p(-(np.clip(alike, 0, _MOST_ALIKE) ** 2))
         return out
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.command import Benchmark, option
+from benchmarks.command import Benchmark, option, within
 from benchmarks.importing.painted import PaintedCapture
 from benchmarks.results import save
 from reconstruction import Camera, Model, Progress, Rig, reconstruct
@@ -65,8 +65,9 @@ def measure(size: Size, folder: Path, seed: int, progress: Progress) -> dict[str
         folder / "capture", size.rig(), sweep=size.sweep, all_on=size.sweep, seed=seed
     )
     capture = painted.view(reduced=size.reduced)
-    told = estimate(capture, progress=progress)
-    report = reconstruct(capture, Model(folder / "model"), method="auto", progress=progress)
+    told = estimate(capture, progress=within(progress, "estimate", 0.0, 0.05))
+    tell = within(progress, "reconstruct", 0.05, 0.9)  # where it ends, bars say no more
+    report = reconstruct(capture, Model(folder / "model"), method="auto", progress=tell)
     taken = {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb or 0.0} for s in report.stages}
     seconds = sum(s["seconds"] for s in taken.values())
     peak = max(s["peak_gb"] for s in taken.values())
