@@ -244,9 +244,7 @@ def write_animation(path: Path, frames: Floats, seconds: float = SECONDS) -> Non
         raise ValueError(f"{path}: an animation is a .webp file")
     if not np.isfinite(frames).all():
         raise ValueError(f"{path}: an animation wants finite radiance, and this has NaN or inf")
-    lit = frames[frames.sum(axis=-1) > 0]
-    exposed = Exposure.of([lit])(frames) if len(lit) else frames
-    values = np.rint(np.clip(exposed, 0, 1) * 255).astype(np.uint8)
+    values = np.rint(Exposure.of_picture(frames)(frames) * 255).astype(np.uint8)
     film = cv2.Animation()
     film.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in values]
     film.durations = [round(1000 * seconds / len(values))] * len(values)

@@ -43,10 +43,11 @@ def relight(
     radiance = environment_smoothed(scene, camera, envmap, replace(SHOWN, spp=spp, seed=seed))
     share = coverage(scene, camera)
     subject = share["hair"] + share["head"] > 0.5
+    seen = radiance[subject] if subject.any() else radiance  # sparse hair fills no pixel
     with model.writing("relit.exr") as part:
         write_exr(part, radiance)
     with model.writing("relit.png") as part:
-        write_png(part, Exposure.of([radiance[subject]])(radiance))
+        write_png(part, Exposure.of_picture(seen)(radiance))
     return radiance
 
 

@@ -57,7 +57,8 @@ def render_mixed(
     Raises `ValueError` naming the fault.
     """
     weight = np.broadcast_to(np.asarray(weights, float), (len(lights), 3))
-    if not np.isfinite(weight).all():
+    of_maps = [np.broadcast_to(np.asarray(e.weight, float), 3) for e in environments]
+    if not all(np.isfinite(w).all() for w in (weight, *of_maps)):
         raise ValueError("weights must be finite")
     maps = [check_environment(e.envmap, f"environment {i}") for i, e in enumerate(environments)]
     image = np.zeros((camera.height * camera.width, 3), np.float32)
@@ -71,8 +72,8 @@ def render_mixed(
             PackedLights.of(lights, weight / choice[:, None]) if lights else None,
             mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if lights else None,
             [
-                (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
-                for m, e in zip(maps, environments, strict=True)
+                (Sky.of(m, e.rotation_deg), w)
+                for m, e, w in zip(maps, environments, of_maps, strict=True)
             ],
             factor_of(field),
         )
@@ -80,8 +81,8 @@ def render_mixed(
         radiance = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
         if field is not None and field.additive:
             integrals = [
-                projected(m, e.rotation_deg, field.degree) * np.asarray(e.weight, float)
-                for m, e in zip(maps, environments, strict=True)
+                projected(m, e.rotation_deg, field.degree) * w
+                for m, e, w in zip(maps, environments, of_maps, strict=True)
             ]
             added = field.added(lights, weight, integrals)
             radiance = np.maximum(added if field.alone else radiance + added, 0)

@@ -193,7 +193,9 @@ class _Plan:
         # the mean of fewer still, with every shadow ray, is enough to spare most in the rest
         sparing = replace(self, dim=pilot(self, few[::8], 0).mean(1))
         one, other = np.split(pilot(sparing, np.concatenate([few, few]), 1), 2, axis=1)
-        return np.asarray(np.sqrt(((one - other) ** 2).mean(1) / 2), np.float32)
+        # squares of bright light overflow in float32, of dim light they vanish
+        squares = (one.astype(float) - other) ** 2
+        return np.asarray(np.sqrt(squares.mean(1) / 2), np.float32)
 
 
 def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan:

@@ -14,7 +14,7 @@ from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
-from appearance.model.relight import environment_map, three_quarter_view
+from appearance.model.relight import environment_map, relight, three_quarter_view
 from appearance.render.coverage import coverage
 from appearance.render.smoothed import olat_smoothed, smoothed, without_rare
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -31,6 +31,7 @@ from reconstruction import (
     Step,
     Strands,
     read_exr,
+    write_exr,
 )
 from reconstruction.geometry.lights import dome_positions
 
@@ -348,6 +349,20 @@ def test_relighting_names_and_views():
     assert (depth > 0).all()
     with pytest.raises((ValueError, FileNotFoundError), match="nowhere"):
         environment_map("nowhere.hdr")
+
+
+@pytest.mark.parametrize(("strands", "level"), [(3, 1.0), (300, 0.0)])
+def test_sparse_hair_and_a_black_room_are_relit(small, tmp_path, strands, level):
+    """Three strands fill half of no pixel; a black room lights none."""
+    hair, skin = HairAppearance((0.1, 0.1, 0.1), 0.3, 0.3), (0.3, 0.3, 0.3)
+    model = Model(tmp_path / "model").create()
+    model.write_strands(replace(small.tuft(strands), radius=4e-5))
+    FittedAppearance(hair, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()).save(model)
+    write_exr(tmp_path / "room.exr", np.full((2, 4, 3), level, np.float32))
+    image = relight(FittedModel.load(model), model, str(tmp_path / "room.exr"), size=64, spp=4)
+    shown = cv2.imread(str(model.file("relit.png")))
+    assert (image.max() > 0) == (level > 0)
+    assert (shown.max() == 255) == (level > 0)
 
 
 def test_nothing_held_out_is_an_error_that_says_so(tmp_path):
