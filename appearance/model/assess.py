@@ -100,6 +100,7 @@ def assess(
     every baseline that is not beaten.
     """
     options = options or AssessOptions()
+    envmap = environment_map(environment)
     training = held_out.training(capture)
     fitted = FittedModel.load(model, capture)
     result: dict[str, Any] = {}
@@ -112,10 +113,10 @@ def assess(
             stage.warn("no camera and no light is held out: nothing is compared")
         progress("relighting", 0.8)
         size, spp = options.relit_size, options.relit_spp
-        relight(fitted, model, environment, size=size, spp=spp, seed=seed)
+        relight(fitted, model, envmap, size=size, spp=spp, seed=seed)
         if options.turning_frames:
             progress("relighting under light that turns", 0.9)
-            room = Environment(environment_map(environment))
+            room = Environment(envmap)
             sampling = Sampling(TURNING_SPP, MAX_DEPTH, seed)
             turning = turning_light(fitted, room, options.turning_frames, TURNING_SIZE, sampling)
             write_animation(model.file("relit.webp"), turning)

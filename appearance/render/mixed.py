@@ -39,6 +39,16 @@ class Environment:
     rotation_deg: float = 0.0
     weight: ArrayLike = 1.0
 
+    def shown(self) -> Floats:
+        """The map as it shines `(h, w, 3)`: weighed, and turned by whole columns.
+
+        Raises `ValueError` where that is no map.
+        """
+        envmap = check_environment(self.envmap, "environment")
+        columns = round(envmap.shape[1] * self.rotation_deg / 360)
+        weighed = np.roll(envmap, -columns, axis=1) * np.asarray(self.weight, np.float32)
+        return check_environment(weighed, "environment times its weight")
+
 
 def render_mixed(
     scene: HairScene,

@@ -175,6 +175,19 @@ def test_a_bad_option_is_one_sentence_with_its_place(capsys, command, options, p
     assert "\n" not in data["error"]["detail"]
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--environment", "nowhere.hdr"), "nowhere.hdr: no such environment map"),
+        (("--field-options", '{"spp": 4}'), "say which with --field"),
+    ],
+)
+def test_a_fit_says_what_it_cannot_use_before_it_begins(capsys, words, said):
+    code, data = run(capsys, "fit", "c", "m", "--hold-out-light", "l3", *words)
+    assert code == 3
+    assert said in data["error"]["detail"]
+
+
 def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
     code, data = run(capsys, "rig", "check", tmp_path / "none.toml")
     assert code == 3
