@@ -36,7 +36,7 @@ _TURNS, _ESTIMATES = 16, 4
 """Most draws of paths; the result is the mean of so many estimates within a width of each other."""
 _DARKENS, _CLEARLY = 32, 0.25
 """Most steps of absorption alone, and the width from which they count."""
-_FEWEST = 32
+FEWEST = 32
 """Paths a pixel of a draw."""
 _BEGINS = (-1.8, 0.4)
 """Roughness begins between 0.15 and 0.6: a much narrower lobe is met by too few paths."""
@@ -203,7 +203,7 @@ class _System:
         patch = self.patches[k]
         seed = self.seed + turn * len(self.patches) + k
         # the first step need not be exact
-        spp = max(_FEWEST, self.effort.spp * (2 if turn else 1))
+        spp = max(FEWEST, self.effort.spp * (2 if turn else 1))
         effort = replace(self.effort, spp=spp)
         pictures = self.problem.linearised(raw, gain, patch, effort, seed)
         halves = pictures.picture()

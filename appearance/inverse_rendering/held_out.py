@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from appearance.metrics.pictures import Row, comparison_picture
+from appearance.metrics.pictures import Row, comparison_picture, small
 from appearance.metrics.scores import Exposure, mean_scores, relative_error, scores
 from appearance.observations import HeldOut, Observed, observe
 from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Capture, Model, Rig
-from reconstruction.arrays import Array, Bools, Floats
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats
 
 MAGNIFIED = 4.0
 """Factor on the differences of displayed values in error maps."""
@@ -57,6 +57,8 @@ def judge(
 ) -> dict[str, dict[str, float]]:
     """Mean `metrics.scores` and "relative_error" of each of `fits` over lit `frames`; {} of none.
 
+    Pixels that are saturated in a frame say nothing there.
+
     Writes the model's `inverse_rendering.png`: each frame as captured, as each fit renders it, and
     the last one's error map.
     """
@@ -77,19 +79,22 @@ def judge(
         mask = np.zeros((o.camera.height, o.camera.width), bool)
         mask.reshape(-1)[o.pixels] = True
         for i, light in enumerate(o.lights):
-            true = _image(o.radiance[i], mask)
-            if not true[mask].max() > 0:
+            true, judged = _image(o.radiance[i], mask), mask.copy()
+            judged[mask] = o.valid[i]
+            if not true[judged].any():
                 continue
             wanted = exposure(true)
-            shown, captions = {"captured": wanted}, {}
+            shown: dict[str, AnyFloats] = {"captured": wanted}
+            captions = {}
             for name, values in rendered.items():
                 image = _image(values[i], mask)
                 shown[name] = exposure(image)
-                score = scores(shown[name], wanted, mask)
+                score = scores(shown[name], wanted, judged)
                 captions[name] = f"{score['psnr']:.1f} dB"
-                found[name].append({**score, "relative_error": relative_error(image, true, mask)})
+                found[name].append({**score, "relative_error": relative_error(image, true, judged)})
             shown["error"] = MAGNIFIED * np.abs(shown[name] - wanted)
             captions["error"] = f"of {name}, x {MAGNIFIED:g}"
+            shown = {name: small(picture) for name, picture in shown.items()}
             rows.append((f"{o.camera.name}, {light.name}", shown, captions))
     if not rows:
         return {}

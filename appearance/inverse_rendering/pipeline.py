@@ -13,8 +13,9 @@ from appearance.inverse_rendering.found_lights import lights_as_found, save_ligh
 from appearance.inverse_rendering.global_parameters import FOUND
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import SURE, Monitor, Outcome, run
+from appearance.inverse_rendering.memory import Sizes, memory_needed
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
-from appearance.inverse_rendering.problem import FitProblem, memory_needed
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
 from appearance.observations import HeldOut, observe_hair
@@ -24,7 +25,7 @@ from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, Strands, silent
 from reconstruction.arrays import Array
-from reconstruction.report.report import Series, free_memory
+from reconstruction.report.report import Series, free_memory, resident_memory
 
 JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
@@ -67,7 +68,7 @@ def fit_maps(
     fitted, strands, head = FittedAppearance.load(model), model.strands(), model.head(capture)
     report = model.report()
     with report.stage("inverse_rendering") as stage:
-        _check_memory(training, model, request, stage, progress)
+        _check_memory(capture, model, strands, held_out, request, stage, progress)
         progress("reading hair pixels", 0.0)
         rng = np.random.default_rng(seed)
         views = observe_hair(training, model, training.olat_lights(), request.hair_pixels, rng)
@@ -161,18 +162,26 @@ def _flat(left_open: Mapping[str, float]) -> list[str]:
 
 
 def _check_memory(
-    training: Capture,
+    capture: Capture,
     model: Model,
+    strands: Strands,
+    held_out: HeldOut,
     request: InverseRenderingRequest,
     stage: Stage,
     progress: Progress,
 ) -> None:
-    """Say what the fit will take, and refuse where that is more than there is."""
+    """Say what the process will hold, and refuse where it needs more than there is."""
+    training = held_out.training(capture)
     hair = [int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras]
     pixels, lights = [min(n, request.hair_pixels) for n in hair], len(training.olat_lights())
-    needed, free = memory_needed(pixels, lights, request.fit.effort), free_memory()
-    stage.figures["memory_needed_gb"] = needed
-    progress(f"will take about {needed:.1f} GB of memory beside the scene", 0.0)
+    sizes = Sizes(pixels, lights, len(strands.points))
+    if held_out.cameras or held_out.lights:
+        frame = max(c.width * c.height for c in capture.rig.cameras)
+        judged = min(len(held_out.lights) or lights, JUDGED_IMAGES)
+        sizes = replace(sizes, hair=max(hair), frame=frame, judged=judged)
+    needed, free = memory_needed(sizes, request.fit), free_memory()
+    stage.figures["memory_needed_gb"] = whole = (resident_memory() or 0.0) + needed
+    progress(f"will take about {whole:.1f} GB of memory", 0.0)
     if free is not None and needed > free:
         raise ModelError(
             f"{model}: inverse rendering of {sum(pixels)} pixels under {lights} lights takes about "

@@ -29,11 +29,6 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 ValidationSet = Sequence[tuple[Patch, Array]]
 """Patches, and the share `(k, P, 3)` of its weight that each value keeps."""
 
-
-_FRAME_BYTES, _PICTURE_BYTES, _PATH_BYTES = 25, 96, 3000
-"""Of a captured pixel under a light, of a rendered one, and of a kept path, about."""
-_LIT_BYTES = 30
-"""Of a light and a kept path of one vertex, about: three in ten reach it."""
 _DIRECT_PATHS, _FEWEST, _MOST = 400_000, 4, 16
 """Kept paths of one vertex of all views together, and a pixel."""
 _ALL = 1e-9
@@ -74,15 +69,6 @@ class DirectLight:
     def linearised(self, maps: HairMaps, names: Sequence[str]) -> LinearisedPictures:
         """With `maps` on the hair, and derivatives by `names`, in exposure units."""
         return LinearisedPictures(self.paths, self.mapped, maps, self.intensities, names)
-
-
-def memory_needed(pixels: Sequence[int], lights: int, effort: Effort) -> float:
-    """GB that a fit takes beside its scene, about: views of so many `pixels` under `lights`."""
-    frames = sum(pixels) * lights * _FRAME_BYTES
-    picture = max(pixels, default=0) * lights * _PICTURE_BYTES
-    paths = min(max(pixels, default=0), effort.pixels) * 2 * effort.spp * _PATH_BYTES
-    direct = sum(pixels) * direct_spp(sum(pixels)) * lights * _LIT_BYTES
-    return (frames + max(picture, paths, direct)) / 1e9
 
 
 def direct_spp(pixels: int) -> int:

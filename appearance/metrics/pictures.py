@@ -8,11 +8,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from reconstruction.arrays import AnyFloats
+from reconstruction.arrays import AnyFloats, Floats
+from reconstruction.geometry.blocks import block_means
 
 GROUND, INK = "#08090a", "#c3c8cd"
 """The console's: the pictures are looked at beside the stage, in the dark."""
+LARGEST = 640
+"""Pixels on a side of what a comparison shows, at most."""
 Row = tuple[str, Mapping[str, AnyFloats], Mapping[str, str]]
+
+
+def small(picture: AnyFloats) -> Floats:
+    """Picture values `(H, W, 3)` as large as a comparison shows them: whole frames fill memory."""
+    return block_means(picture, -(-max(picture.shape[:2]) // LARGEST))
 
 
 def comparison_picture(

@@ -46,6 +46,12 @@ class Exposure:
             raise ValueError("no training hair pixel is lit: the exposure cannot be set")
         return cls(1.0 / float(np.percentile(values, 99)))
 
+    @classmethod
+    def of_picture(cls, radiance: AnyFloats) -> Exposure:
+        """The exposure by the lit pixels of `radiance (…, 3)` alone; 1 where there are none."""
+        lit = radiance[radiance.sum(axis=-1) > 0]
+        return cls.of([lit]) if len(lit) else cls(1.0)
+
     def __call__(self, radiance: ArrayLike) -> Array:
         """Picture values in [0, 1] of `radiance`, any shape."""
         return srgb(np.asarray(radiance, float) * self.scale)

@@ -14,7 +14,6 @@ from appearance.metrics.scores import Exposure
 from appearance.model.fitted_model import FittedModel
 from appearance.model.relight import three_quarter_view
 from appearance.render.coverage import coverage, covered_pixels
-from appearance.render.environment_maps import check_environment
 from appearance.render.mixed import Environment
 from appearance.render.olat import render_indirect, render_olat, spread_out
 from appearance.render.smoothed import (
@@ -96,16 +95,14 @@ def moving(
     paths: else noise changes more from frame to frame than the hair does. Raises `ValueError` for
     poses of another topology.
     """
-    out, parts = [], []
+    out, parts, maps = [], [], [x.shown() for x in lit[1]]
     for k, pose in enumerate(poses):
         progress(f"frame {k + 1} of {len(poses)}", k / len(poses))
         scene, own = fitted.scene(pose), replace(sampling, seed=sampling.seed * len(poses) + k)
         out.append(np.zeros((camera.height, camera.width, 3), np.float32))
         for light in lit[0]:
             out[-1] += olat_smoothed(scene, camera, [light], sampling)[0]
-        parts.append(
-            [environment_parts(scene, camera, x.envmap, own, MOVING_DIRECT) for x in lit[1]]
-        )
+        parts.append([environment_parts(scene, camera, x, own, MOVING_DIRECT) for x in maps])
     for of_map in zip(*parts, strict=True):
         share = {kind: np.stack([x.share[kind] for x in of_map]) for kind in of_map[0].share}
         smooth = smoothed(
@@ -129,12 +126,11 @@ def turntable(
     """
     if frames < 1:
         raise ValueError(f"a turntable needs a frame, got {frames}")
-    scene, out = fitted.scene(), []
+    scene, envmap, out = fitted.scene(), room.shown(), []
     for k in range(frames):
         progress(f"frame {k + 1} of {frames}", k / frames)
         camera = three_quarter_view(fitted.strands, size, 360 * k / frames)
         # in the model's frame the room goes round twice while the camera goes round once
-        envmap = np.asarray(room.envmap, np.float32)
         turned = np.roll(envmap, -round(2 * envmap.shape[1] * k / frames), axis=1)
         out.append(environment_smoothed(scene, camera, turned, sampling))
     return np.stack(out)
@@ -158,7 +154,7 @@ def turning_light(
     """
     if frames < 1:
         raise ValueError(f"an animation needs a frame, got {frames}")
-    envmap = check_environment(room.envmap, "environment") * np.asarray(room.weight, np.float32)
+    envmap = room.shown()
     weights = np.stack([cell_means(envmap, k / frames) for k in range(frames)]).astype(np.float32)
     scene, camera = fitted.scene(), three_quarter_view(fitted.strands, size)
     index, panels = covered_pixels(scene, camera), _panels()
@@ -244,9 +240,7 @@ def write_animation(path: Path, frames: Floats, seconds: float = SECONDS) -> Non
         raise ValueError(f"{path}: an animation is a .webp file")
     if not np.isfinite(frames).all():
         raise ValueError(f"{path}: an animation wants finite radiance, and this has NaN or inf")
-    lit = frames[frames.sum(axis=-1) > 0]
-    exposed = Exposure.of([lit])(frames) if len(lit) else frames
-    values = np.rint(np.clip(exposed, 0, 1) * 255).astype(np.uint8)
+    values = np.rint(Exposure.of_picture(frames)(frames) * 255).astype(np.uint8)
     film = cv2.Animation()
     film.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in values]
     film.durations = [round(1000 * seconds / len(values))] * len(values)

@@ -19,7 +19,7 @@ from appearance.metrics.scores import (
     ssim,
 )
 from appearance.model.animation import turning_light, write_animation
-from appearance.model.baselines import NearestCameras, three_nearest
+from appearance.model.baselines import NearestCameras, other_lights, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
@@ -41,6 +41,7 @@ OWN_FRAMES = "three_nearest_own_frames"
 INTERPOLATED = {
     "three_nearest": "three nearest lights",
     "nearest_cameras": "three nearest cameras",
+    OWN_FRAMES: "its own frames",
 }
 SHOWN = {"held_out_lights": 4, "held_out_camera": 2}
 """Rows of the comparison by group."""
@@ -99,6 +100,7 @@ def assess(
     every baseline that is not beaten.
     """
     options = options or AssessOptions()
+    envmap = environment_map(environment)
     training = held_out.training(capture)
     fitted = FittedModel.load(model, capture)
     result: dict[str, Any] = {}
@@ -111,10 +113,10 @@ def assess(
             stage.warn("no camera and no light is held out: nothing is compared")
         progress("relighting", 0.8)
         size, spp = options.relit_size, options.relit_spp
-        relight(fitted, model, environment, size=size, spp=spp, seed=seed)
+        relight(fitted, model, envmap, size=size, spp=spp, seed=seed)
         if options.turning_frames:
             progress("relighting under light that turns", 0.9)
-            room = Environment(environment_map(environment))
+            room = Environment(envmap)
             sampling = Sampling(TURNING_SPP, MAX_DEPTH, seed)
             turning = turning_light(fitted, room, options.turning_frames, TURNING_SIZE, sampling)
             write_animation(model.file("relit.webp"), turning)
@@ -156,10 +158,10 @@ class _Comparison:
         lit["diffuse"] = scene.with_hair(DiffuseHair(albedo)), self.fitted
         rendered = "inverse_rendering" if self.model.has("hair_maps.npz") else "sun_fit"
         groups: dict[str, list[_Compared]] = {}
-        for group, views in self._views().items():
+        for k, (group, views) in enumerate(self._views().items()):
             groups[group] = []
             for i, (camera, lights) in enumerate(views):
-                progress(f"rendering {camera}", 0.1 + 0.3 * len(groups) * (i + 1) / len(views))
+                progress(f"rendering {camera}", 0.1 + 0.3 * (k + (i + 1) / len(views)))
                 for image in self._rendered(camera, lights, lit, stage):
                     if "ours" not in lit:
                         image.frames["ours"] = image.frames[rendered]
@@ -217,7 +219,9 @@ class _Comparison:
         """The frames of one camera under `lights`: captured, and of each scene under its lights."""
         capture, camera = self.capture, self.capture.rig.camera(name)
         mask = self.model.mask(name, "hair", capture)
+        training, rig = self.training.olat_lights(), capture.rig
         names = [n for n in lights if capture.has_light(n, name)]
+        names = [n for n in names if other_lights(capture, name, rig.light(n), training)]
         if not names or not mask.any():
             return []
         sampling = Sampling(self.options.spp, MAX_DEPTH, self.seed)

@@ -28,10 +28,13 @@ def three_nearest(
     """`camera`'s frames `(H, W, 3)` under the three `training` lights nearest to `light`, mixed.
 
     Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
-    distance to what `light` would give. `light` itself is never among the three. A pixel that is
-    saturated in some of them is mixed of the others.
+    distance to what `light` would give. `light` itself is never among the three, nor is one that
+    sends nothing to the head. A pixel that is saturated in some of them is mixed of the others, a
+    colour of those that have it. Raises `ValueError` where there is no such frame.
     """
-    names = [n for n in training if n != light.name and capture.has_light(n, camera)]
+    names = other_lights(capture, camera, light, training)
+    if not names:
+        raise ValueError(f"{camera}: the capture has no frame of it under a light to mix from")
     others = [capture.rig.light(n) for n in names]
     positions = np.array([o.position for o in others])
     distance = np.linalg.norm(positions, axis=1)
@@ -40,12 +43,22 @@ def three_nearest(
     total, known = np.zeros(1), np.zeros(1)
     for k, weight in zip(nearest, weights, strict=True):
         here, there = (x.intensity_towards(np.zeros(3)) for x in (light, others[k]))
-        gain = here / np.maximum(there, 1e-12)
-        gain *= (distance[k] / own) ** 2
+        gain = here / np.where(there > 0, there, 1) * (distance[k] / own) ** 2
         frame, saturated = capture.light(names[k], camera)
-        share = weight * np.where(saturated, SATURATED, 1.0)[..., None]
+        share = weight * np.where(saturated, SATURATED, 1.0)[..., None] * (there > 0)
         total, known = total + share * gain * frame, known + share
     return np.asarray(total / np.maximum(known, 1e-12))
+
+
+def other_lights(capture: Capture, camera: str, light: Light, training: Sequence[str]) -> list[str]:
+    """Those of `training`, without `light`, that reach the head and `camera` has a frame of."""
+    return [
+        n
+        for n in training
+        if n != light.name
+        and capture.has_light(n, camera)
+        and capture.rig.light(n).intensity_towards(np.zeros(3)).any()
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +67,9 @@ class NearestCameras:
 
     Every pixel's point is where its ray meets `scene` first; where `mask (H, W)` has hair and the
     scene has none, at the depth of the nearest pixel that meets any. The point's colour is that of
-    the `CAMERAS` cameras of `training` nearest in angle about the head, without `camera`, by the
-    inverse angle: of those that see it, or of all on whose image it falls where none does.
+    the `CAMERAS` cameras of `training` nearest in angle about the head, without `camera` and those
+    without frames, by the inverse angle: of those that see it, or of all on whose image it falls
+    where none does.
     """
 
     training: Capture
@@ -69,7 +83,12 @@ class NearestCameras:
         cls, training: Capture, camera: Camera, scene: HairScene, mask: Bools
     ) -> NearestCameras | None:
         """Where each pixel lies in the nearest cameras; None where there is no other camera."""
-        others = [c for c in training.rig.cameras if c.name != camera.name]
+        lights = training.olat_lights()
+        others = [
+            c
+            for c in training.rig.cameras
+            if c.name != camera.name and any(training.has_light(n, c.name) for n in lights)
+        ]
         points, met = _first_hits(scene, camera, mask)
         if not others or not met.any():
             return None

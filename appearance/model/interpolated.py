@@ -46,6 +46,8 @@ GUIDE = 4
 """Paths a pixel of the pictures that guide frames: these are blurred."""
 SAME = 0.999
 """The weight from which on one captured light stands for a new one: it is at the same place."""
+_DARK = 1e-12
+"""W/m² of a light that is none."""
 EXTENT = 12.0
 """The hair's extent (the root of its area) over the blur of the guide. Tried on one capture, where
 8 to 30 do within 0.2 dB of each other, and FLOORs of 0.1 to 0.6."""
@@ -199,7 +201,8 @@ class GuidedFrames:
             for i, n in enumerate(names):
                 frame, saturated = capture.light(n, name)
                 frames[i] = np.where(saturated[mask][:, None], np.nan, frame[mask])
-            frames /= _irradiances(near, middle)
+            given = _irradiances(near, middle)
+            frames = np.where(given > _DARK, frames / given, np.nan)
             if weights[k].max() < SAME:
                 guide = self._shown([*near, light], middle)
                 guide += FLOOR * guide.mean()
@@ -231,7 +234,7 @@ def _directions(vectors: AnyFloats) -> Array:
 def _irradiances(lights: Sequence[Light], point: AnyFloats) -> Floats:
     """Of each light at a point `(L, 1, 3)`."""
     at = np.asarray(point, np.float32)[None]
-    return np.stack([np.maximum(irradiance(x, at), 1e-12) for x in lights])
+    return np.stack([np.maximum(irradiance(x, at), _DARK) for x in lights])
 
 
 def _source(interpolation: Interpolation, camera: Camera) -> Any:

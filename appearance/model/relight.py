@@ -14,7 +14,7 @@ from appearance.render.coverage import coverage
 from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.smoothed import SHOWN, environment_smoothed
 from reconstruction import Camera, Model, Strands, write_exr
-from reconstruction.arrays import Floats
+from reconstruction.arrays import AnyFloats, Floats
 
 PROCEDURAL = {"studio": studio, "sky": sky}
 
@@ -27,26 +27,26 @@ def environment_map(name: str) -> Floats:
 def relight(
     fitted: FittedModel,
     model: Model,
-    environment: str = "studio",
+    envmap: AnyFloats,
     *,
     size: int = 640,
     spp: int = 32,
     seed: int = 0,
 ) -> Floats:
-    """Render `fitted` in three-quarter view under an `environment_map`: `(N, N, 3)`, N = `size`.
+    """Render `fitted` in three-quarter view under `envmap (h, w, 3)`: `(N, N, 3)`, N = `size`.
 
     Writes `relit.exr` (radiance) and `relit.png` (the subject's 99th percentile at white, sRGB)
     into `model`.
     """
-    envmap = environment_map(environment)
     scene, camera = fitted.scene(), three_quarter_view(fitted.strands, size)
     radiance = environment_smoothed(scene, camera, envmap, replace(SHOWN, spp=spp, seed=seed))
     share = coverage(scene, camera)
     subject = share["hair"] + share["head"] > 0.5
+    seen = radiance[subject] if subject.any() else radiance  # sparse hair fills no pixel
     with model.writing("relit.exr") as part:
         write_exr(part, radiance)
     with model.writing("relit.png") as part:
-        write_png(part, Exposure.of([radiance[subject]])(radiance))
+        write_png(part, Exposure.of_picture(seen)(radiance))
     return radiance
 
 

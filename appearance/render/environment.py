@@ -146,14 +146,19 @@ class Sky:
 
     @classmethod
     def of(cls, envmap: Floats, rotation_deg: float) -> Sky:
-        """The sky of `envmap (h, w, 3)`, turned counter-clockwise seen from above."""
+        """The sky of `envmap (h, w, 3)`, turned counter-clockwise seen from above.
+
+        Raises `ValueError` for a turn that is not finite.
+        """
+        if not np.isfinite(rotation_deg):
+            raise ValueError(f"an environment's rotation_deg must be finite, got {rotation_deg}")
         height, width = envmap.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         weight = envmap.astype(float).sum(-1) * (edges[:-1] - edges[1:])[:, None]
         weight = np.maximum(weight, 1e-6 * weight.max(initial=0.0))
         if weight.max(initial=0.0) == 0:
             weight = np.ones_like(weight)
-        (turn,) = opaque(rotation_deg / 360)
+        (turn,) = opaque(rotation_deg / 360 % 1)
         order = _along_curve(height, width)
         chance = (weight / weight.sum()).ravel()[order]
         return cls(

@@ -10,6 +10,9 @@ import numpy as np
 from reconstruction import read_exr
 from reconstruction.arrays import AnyFloats, Array, Floats
 
+BRIGHTEST = 1e25
+"""Radiance, or a light's intensity, up to which sums over paths stay finite in float32."""
+
 
 def load_environment(path: str | Path) -> Floats:
     """Read a lat-long map `(h, w, 3)`, scene-linear RGB, from Radiance `.hdr` or OpenEXR `.exr`.
@@ -31,16 +34,18 @@ def load_environment(path: str | Path) -> Floats:
 
 
 def check_environment(envmap: AnyFloats, name: str) -> Floats:
-    """`envmap` as float32; `ValueError` unless `(h, w, 3)`, finite and not negative."""
-    image = np.asarray(envmap, np.float32)
+    """`envmap` as float32; `ValueError` unless `(h, w, 3)` and in [0, `BRIGHTEST`]."""
+    with np.errstate(over="ignore"):  # told below
+        image = np.asarray(envmap, np.float32)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"{name}: expected a map of shape (h, w, 3), got {image.shape}")
-    wrong = ~np.isfinite(image) | (image < 0)
+    wrong = ~((image >= 0) & (image <= BRIGHTEST))
     if wrong.any():
         row, column, channel = np.argwhere(wrong)[0]
         raise ValueError(
-            f"{name}: radiance must be finite and not negative, but {int(wrong.sum())} values are "
-            f"not, the first at row {row}, column {column}: {image[row, column, channel]}"
+            f"{name}: radiance must be finite and not negative, {BRIGHTEST:g} at most, but "
+            f"{int(wrong.sum())} values are not, the first at row {row}, column {column}: "
+            f"{image[row, column, channel]}"
         )
     return image
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.bsdf.shading_frame import rodrigues
+from appearance.render.environment_maps import BRIGHTEST
 from appearance.scene.hair_scene import SCALE, light_arrays
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction import Light
@@ -43,7 +44,16 @@ class PackedLights:
 
     @classmethod
     def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> PackedLights:
-        """The bank of `lights`, their intensities times `weights`, which broadcast to `(L, 3)`."""
+        """The bank of `lights`, their intensities times `weights`, which broadcast to `(L, 3)`.
+
+        Raises `ValueError` for a light above `BRIGHTEST` W/sr.
+        """
+        strength = np.array([x.intensity for x in lights]) * np.asarray(weights, float)
+        for light, watts in zip(lights, strength, strict=True):
+            if not np.abs(watts).max() <= BRIGHTEST:
+                raise ValueError(
+                    f"{light.name}: {watts} W/sr cannot be rendered, {BRIGHTEST:g} is the most"
+                )
         position, intensity = light_arrays(lights)
         intensity = (intensity * np.asarray(weights, float)).astype(np.float32)
         aims = [np.eye(3) if x.orientation is None else x.orientation for x in lights]

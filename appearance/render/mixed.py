@@ -39,6 +39,16 @@ class Environment:
     rotation_deg: float = 0.0
     weight: ArrayLike = 1.0
 
+    def shown(self) -> Floats:
+        """The map as it shines `(h, w, 3)`: weighed, and turned by whole columns.
+
+        Raises `ValueError` where that is no map.
+        """
+        envmap = check_environment(self.envmap, "environment")
+        columns = round(envmap.shape[1] * self.rotation_deg / 360)
+        weighed = np.roll(envmap, -columns, axis=1) * np.asarray(self.weight, np.float32)
+        return check_environment(weighed, "environment times its weight")
+
 
 def render_mixed(
     scene: HairScene,
@@ -57,7 +67,8 @@ def render_mixed(
     Raises `ValueError` naming the fault.
     """
     weight = np.broadcast_to(np.asarray(weights, float), (len(lights), 3))
-    if not np.isfinite(weight).all():
+    of_maps = [np.broadcast_to(np.asarray(e.weight, float), 3) for e in environments]
+    if not all(np.isfinite(w).all() for w in (weight, *of_maps)):
         raise ValueError("weights must be finite")
     maps = [check_environment(e.envmap, f"environment {i}") for i, e in enumerate(environments)]
     image = np.zeros((camera.height * camera.width, 3), np.float32)
@@ -71,8 +82,8 @@ def render_mixed(
             PackedLights.of(lights, weight / choice[:, None]) if lights else None,
             mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if lights else None,
             [
-                (Sky.of(m, e.rotation_deg), np.broadcast_to(np.asarray(e.weight, float), 3))
-                for m, e in zip(maps, environments, strict=True)
+                (Sky.of(m, e.rotation_deg), w)
+                for m, e, w in zip(maps, environments, of_maps, strict=True)
             ],
             factor_of(field),
         )
@@ -80,8 +91,8 @@ def render_mixed(
         radiance = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
         if field is not None and field.additive:
             integrals = [
-                projected(m, e.rotation_deg, field.degree) * np.asarray(e.weight, float)
-                for m, e in zip(maps, environments, strict=True)
+                projected(m, e.rotation_deg, field.degree) * w
+                for m, e, w in zip(maps, environments, of_maps, strict=True)
             ]
             added = field.added(lights, weight, integrals)
             radiance = np.maximum(added if field.alone else radiance + added, 0)

@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many
 _PILOT_STREAM = 1 << 31
+FILM_BYTES = 3 * 12
+"""Of a pixel under a light: the film, its copy and the mean."""
 _USUAL = 0.99  # quantile of the pilot's pixels beyond which a path is a rare bright one
 
 
@@ -131,8 +133,8 @@ def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = Fal
     out = np.zeros((count, len(index), 3), np.float32)
     if out.size:
         plan = _plan(view, options, seed, indirect)
-        # the film, its copy and the mean; each tile is spread over the whole image
-        tiles = tile_count(index, 3 * 12 * count, options.memory)
+        # each tile is spread over the whole image
+        tiles = tile_count(index, FILM_BYTES * count, options.memory)
         for k in range(tiles):
             part = slice(k, None, tiles)
             out[:, part] = plan.render(index[part], options.spp, (seed, k))
@@ -191,7 +193,9 @@ class _Plan:
         # the mean of fewer still, with every shadow ray, is enough to spare most in the rest
         sparing = replace(self, dim=pilot(self, few[::8], 0).mean(1))
         one, other = np.split(pilot(sparing, np.concatenate([few, few]), 1), 2, axis=1)
-        return np.asarray(np.sqrt(((one - other) ** 2).mean(1) / 2), np.float32)
+        # squares of bright light overflow in float32, of dim light they vanish
+        squares = (one.astype(float) - other) ** 2
+        return np.asarray(np.sqrt(squares.mean(1) / 2), np.float32)
 
 
 def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan:

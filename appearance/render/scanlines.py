@@ -150,7 +150,7 @@ def _plan(
     if options.thrift > 0:
         films = plan.render(index[:: -(-len(index) // _PILOT)], 1, (seed, _PILOT_STREAM))
         brought = [f.sum(0).max(-1) for f in films.values()]
-        dim = (options.thrift * float(np.sqrt((b**2).mean())) for b in brought)
+        dim = (options.thrift * float(np.sqrt((b.astype(float) ** 2).mean())) for b in brought)
         plan = replace(plan, dim=tuple(dim))
     return plan
 

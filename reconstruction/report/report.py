@@ -51,20 +51,27 @@ def peak_memory() -> Iterator[Peak]:
 
 def free_memory() -> float | None:
     """GB that processes may still take; None where it is not known."""
-    with suppress(OSError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable"):
-                return int(line.split()[1]) * 1024 / 1e9
-    return None
+    return _gb(Path("/proc/meminfo"), "MemAvailable")
+
+
+def resident_memory() -> float | None:
+    """GB that this process holds now; None where it is not known."""
+    return _gb(_STATUS, "VmRSS")
 
 
 def _note() -> None:
+    now = _gb(_STATUS, "VmHWM") if _open else None
+    if now is not None:
+        for peak in _open:
+            peak.gb = max(peak.gb or 0.0, now)
+
+
+def _gb(path: Path, name: str) -> float | None:
     with suppress(OSError):
-        for line in _STATUS.read_text().splitlines() if _open else ():
-            if line.startswith("VmHWM"):
-                now = int(line.split()[1]) * 1024 / 1e9
-                for peak in _open:
-                    peak.gb = max(peak.gb or 0.0, now)
+        for line in path.read_text().splitlines():
+            if line.startswith(name):
+                return int(line.split()[1]) * 1024 / 1e9
+    return None
 
 
 @dataclass

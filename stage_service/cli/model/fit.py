@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stage_service.cli.support.commands import (
+    BadArgument,
     Commands,
     Output,
     add_command,
@@ -35,7 +36,12 @@ def add(commands: Commands) -> None:
     )
     fit.add_argument("--field-options", help="the field's options as JSON")
     add_view(fit)
-    fit.add_argument("--environment", default="studio", help="studio, sky, or an .hdr or .exr file")
+    fit.add_argument(
+        "--environment",
+        default="studio",
+        help="of the relit picture, where cameras or lights are held out: studio, sky, or an .hdr "
+        "or .exr file",
+    )
     fit.add_argument("--seed", type=int, default=0)
 
 
@@ -51,6 +57,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     where it held out the same. With held-out cameras or lights, judge the model on them.
     """
     from appearance import HeldOut
+    from appearance.model.relight import environment_map
     from appearance.sun_fit.fitted_appearance import FittedAppearance
     from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions
@@ -63,6 +70,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     )
     from stage_service.model_page import write_page
 
+    if args.field_options and args.field in (None, "none"):
+        raise BadArgument("--field-options says how a field is fitted: say which with --field")
     model, inverse = Model(args.model), args.method == "inverse_rendering"
     asked = {
         "held_out_cameras": args.hold_out_camera,
@@ -74,6 +83,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "fields": {"field": args.field or "none", **read_json(args.field_options)},
     }
     options = parse_options(JobOptions, asked)
+    environment_map(options.environment)  # not after all of the fits
     data: dict[str, Any] = {"model": str(model), "method": args.method}
     held_out = HeldOut(options.held_out_cameras, options.held_out_lights)
     there = FittedAppearance.is_of(model, held_out)

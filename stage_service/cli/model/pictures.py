@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from appearance import Exposure, psnr, ssim
-from appearance.metrics.scores import srgb
 from reconstruction import read_exr
 from reconstruction.arrays import Array, Bools
 
@@ -33,14 +32,22 @@ def compare_pictures(pred: Path, true: Path, mask: Path | None) -> dict[str, flo
     """
     if (pred.suffix.lower() == ".exr") != (true.suffix.lower() == ".exr"):
         raise ValueError(f"{pred} and {true}: compare two EXR files or two sRGB pictures")
+    linear = pred.suffix.lower() == ".exr"
+    a, b = (read_exr(p)[0] if linear else _picture(p) for p in (pred, true))
+    for path, image in ((pred, a), (true, b)):
+        if not np.isfinite(image).all():
+            raise ValueError(f"{path}: {(~np.isfinite(image)).sum()} of its values are not finite")
     hair = _mask(mask)
-    if pred.suffix.lower() == ".exr":
-        linear_pred, linear_true = read_exr(pred)[0], read_exr(true)[0]
-        values = linear_true if hair is None else linear_true[hair]
-        scale = Exposure.of([values]).scale
-        a, b = srgb(scale * linear_pred), srgb(scale * linear_true)
-    else:
-        a, b = _picture(pred), _picture(true)
+    if hair is not None and (hair.shape != b.shape[:2] or not hair.any()):
+        raise ValueError(
+            f"{mask}: a mask must mark pixels of {true}, {b.shape[:2]}, got {hair.shape} with "
+            f"{hair.sum()} marked"
+        )
+    if linear:
+        lit = np.percentile(b if hair is None else b[hair], 99)
+        if not lit > 0:
+            raise ValueError(f"{true}: under one pixel in a hundred is lit: it cannot be exposed")
+        a, b = (Exposure(1 / float(lit))(x) for x in (a, b))
     return {"psnr": psnr(a, b, hair), "ssim": ssim(a, b, hair)}
 
 
@@ -48,6 +55,8 @@ def _picture(path: Path) -> Array:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image is None:
         raise ValueError(f"{path}: not a picture that can be read")
+    if image.dtype.kind != "u":
+        raise ValueError(f"{path}: linear pictures are compared as .exr, others have 8 or 16 bits")
     return np.asarray(image, np.float64) / np.iinfo(image.dtype).max
 
 

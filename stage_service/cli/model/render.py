@@ -52,9 +52,8 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--guide",
         choices=("kajiya_kay", "none", "model"),
-        default="kajiya_kay",
-        help="what guides an interpolation; none is the standard one; model, for a camera of the "
-        "capture, is what our own renders say",
+        help="what guides an interpolation, kajiya_kay where nothing is said; none is the standard "
+        "one; model, for a camera of the capture, is what our own renders say",
     )
     render.add_argument(
         "--refine", action="store_true", help="turn the guide's tangents to each camera's frames"
@@ -112,6 +111,12 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     start = time.perf_counter()
     if args.seed < 0:
         raise ValueError(f"--seed {args.seed}: expected 0 or more")
+    if args.spp is not None and args.spp < 1:
+        raise ValueError(f"--spp {args.spp}: expected 1 or more")
+    if (args.guide or args.refine) and args.field != "interpolation":
+        raise ValueError("--guide and --refine go with --field interpolation")
+    if args.refine and args.guide in ("none", "model"):
+        raise ValueError(f"--refine turns kajiya_kay's tangents, not those of --guide {args.guide}")
     if args.size is not None and args.size < 16:
         raise ValueError(f"--size {args.size}: expected 16 or more")
     capture = Capture(args.capture) if args.capture is not None else None
@@ -238,7 +243,7 @@ def _still(
         mask = model.mask(camera.name, "hair", capture)
         guided = GuidedFrames(fitted.scene(), fitted, capture, camera, mask)
         return guided(image, lights), {"field": "interpolation", "guide": "model"}
-    options = InterpolationOptions(guide=args.guide, refine=args.refine)
+    options = InterpolationOptions(guide=args.guide or "kajiya_kay", refine=args.refine)
     all_lit = camera, all_lights(lights, maps)
     return _interpolated(image, options, (pose, model, capture), all_lit, progress)
 
@@ -278,11 +283,9 @@ def _interpolated(
 def _write(out: Path, image: Floats) -> None:
     from appearance import Exposure
     from appearance.metrics.pictures import write_png
-    from appearance.metrics.scores import srgb
     from reconstruction import write_exr
 
     if out.suffix == ".exr":
         write_exr(out, image)
     else:
-        lit = image[image.sum(axis=-1) > 0]
-        write_png(out, srgb(image) if not len(lit) else Exposure.of([lit])(image))
+        write_png(out, Exposure.of_picture(image)(image))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -30,6 +32,7 @@ from reconstruction import (
     ModelError,
     Rig,
     Step,
+    Strands,
     parse_options,
 )
 
@@ -248,6 +251,43 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_pat
         fit_maps(capture, other, request=request, progress=lambda what, share: told.append(what))
     assert len(told) == 1
     assert "GB of memory" in told[0]
+
+
+FIT_ALONE = """
+import sys
+from appearance import InverseRenderingRequest, fit_maps
+from reconstruction import Capture, Model, parse_options
+from reconstruction.report.report import resident_memory
+before = []
+def progress(what, share):
+    if "GB of memory" in what:
+        before.append(resident_memory())
+options = {"max_depth": 3, "fit": {"effort": {"pixels": 100, "spp": 8}}}
+capture, model = Capture(sys.argv[1]), Model(sys.argv[2])
+request = parse_options(InverseRenderingRequest, options)
+fit_maps(capture, model, request=request, progress=progress)
+stage = model.report()["inverse_rendering"]
+print(before[0], stage.figures["memory_needed_gb"], stage.peak_gb)
+"""
+
+
+@pytest.mark.parametrize("copies", [1, 150])
+def test_the_memory_that_is_told_is_what_the_process_takes(made, tmp_path, copies):
+    """By the kernel's own account of a process that does nothing else."""
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    few = model.strands()
+    points = np.concatenate([few.points + np.float32(1e-5 * k) for k in range(copies)])
+    other.write_strands(Strands.from_list(list(points.reshape(-1, 8, 3)), few.radius))
+    FittedAppearance.load(model).save(other)
+    alone = [sys.executable, "-c", FIT_ALONE, str(capture.path), str(other.path)]
+    done = subprocess.run(alone, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    before, told, peak = (float(x) for x in done.stdout.split())
+    assert told == pytest.approx(peak, rel=0.3)
+    if copies > 1:  # else it is the program's, for the most part
+        assert told - before == pytest.approx(peak - before, rel=0.4)
 
 
 def test_unknown_fields_of_the_fit_are_refused_by_name():

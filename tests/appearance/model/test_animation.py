@@ -14,6 +14,7 @@ from appearance.model.animation import (
     moving,
     sway,
     turning_light,
+    turntable,
     write_animation,
 )
 from appearance.model.relight import three_quarter_view
@@ -168,3 +169,24 @@ def test_frames_of_hair_at_rest_change_less_than_pictures_of_it(small):
     change = [float((np.diff(x, axis=0) ** 2).mean()) for x in (frames, pictures)]
     assert change[0] < 0.7 * change[1]
     assert frames.mean() == pytest.approx(pictures.mean(), rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["turntable", "turning_light", "moving"])
+def test_animations_show_a_room_as_it_is_weighed_and_turned(small, kind):
+    model, few = model_of(small), Sampling(1, 2)
+    camera, poses = three_quarter_view(model.strands, 8), [small.tuft(60)] * 2
+
+    def frames(room):
+        if kind == "moving":
+            return moving(model, poses, camera, ((), (room,)), few)
+        return {"turntable": turntable, "turning_light": turning_light}[kind](
+            model, room, 2, 8, few
+        )
+
+    envmap = studio(8)
+    quarter = np.roll(envmap, -4, axis=1)  # counter-clockwise seen from above: to the left
+    red = np.array([1.0, 0.0, 0.0], np.float32)
+    shown = frames(Environment(envmap, 90.0, red))
+    np.testing.assert_allclose(shown, frames(Environment(quarter * red)), rtol=1e-6)
+    assert shown.any()
+    assert not shown[..., 1:].any()

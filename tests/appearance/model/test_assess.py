@@ -14,7 +14,7 @@ from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
-from appearance.model.relight import environment_map, three_quarter_view
+from appearance.model.relight import environment_map, relight, three_quarter_view
 from appearance.render.coverage import coverage
 from appearance.render.smoothed import olat_smoothed, smoothed, without_rare
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -172,6 +172,68 @@ def test_three_nearest_lights_are_training_lights(made):
     weights = 1 / np.arccos([positions[n] for n in nearest])
     want = np.tensordot(weights / weights.sum(), frames, 1)
     np.testing.assert_allclose(mixed, want, rtol=1e-5)
+
+
+@pytest.fixture
+def faulty(tmp_path):
+    """Frames of ones under four lamps, of which "off" gives no light and "red" no other colour.
+
+    The camera "dead" has no frame.
+    """
+    watts = {"off": (0, 0, 0), "red": (1, 0, 0), "l0": (1, 1, 1), "l1": (1, 1, 1)}
+    places = [(0.05, -1, 0), (0, -1, 0.1), (0.2, -1, 0), (-0.2, -1, 0)]
+    lights = tuple(
+        Light(name, np.array(p, float) / np.linalg.norm(p), np.array(w, float))
+        for (name, w), p in zip(watts.items(), places, strict=True)
+    )
+    cameras = tuple(
+        Camera.look_at(name, 8, 8, (x, -1, 0.1), (0, 0, 0), 10.0)
+        for name, x in (("alive", -0.5), ("dead", 0.1), ("new", 0.0))
+    )
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights)]
+    writer = CaptureWriter.create(
+        tmp_path / "c", Rig("r", cameras, lights), {"steps": [s.to_dict() for s in steps]}
+    )
+    rng = np.random.default_rng(0)
+    for step, light in zip(steps, lights, strict=True):
+        frame = light.intensity + 1e-3 * rng.normal(size=(8, 8, 3))
+        writer.write_frame(step, "alive", frame.astype(np.float32))
+        for name in ("dead", "new"):
+            writer.record_missing(step, name, reason="none")
+    writer.finish("completed", {})
+    return Capture(tmp_path / "c")
+
+
+def test_lamps_that_give_no_light_stand_for_none(small, faulty, tmp_path):
+    """Divided by nothing, their frames' noise was a thousand million times the picture."""
+    light = Light("new", np.array([0.02, -1, 0.0]), np.ones(3))
+    training = faulty.olat_lights()
+    mixed = three_nearest(faulty, "alive", light, training)
+    np.testing.assert_allclose(mixed, 1, rtol=0.05)
+    with pytest.raises(ValueError, match="alive: the capture has no frame of it"):
+        three_nearest(faulty, "alive", light, ["off"])
+    strands = small.tuft(300)
+    scene, camera = build_scene(strands, None, hair=TRUTH), faulty.rig.camera("alive")
+    model = Model(tmp_path / "model").create()
+    model.write_strands(strands)
+    skin = (0.3, 0.3, 0.3)
+    FittedAppearance(TRUTH, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()).save(model)
+    guided = GuidedFrames(
+        scene, FittedModel.load(model, faulty), faulty, camera, np.ones((8, 8), bool)
+    )
+    assert np.abs(guided(np.zeros((8, 8, 3)), [light])).max() < 10
+
+
+def test_a_camera_without_frames_is_no_neighbour(small, faulty):
+    scene = build_scene(small.tuft(300), None, hair=TRUTH)
+    rest = faulty.view(cameras=["alive", "dead"])
+    view = NearestCameras.of(rest, faulty.rig.camera("new"), scene, np.ones((8, 8), bool))
+    assert view is not None
+    assert view.names == ("alive",)
+    assert np.isfinite(view(faulty.rig.light("l0"))).all()
+    alone = faulty.view(cameras=["dead"])
+    new = faulty.rig.camera("new")
+    assert NearestCameras.of(alone, new, scene, np.ones((8, 8), bool)) is None
 
 
 @pytest.fixture(scope="module")
@@ -348,6 +410,19 @@ def test_relighting_names_and_views():
     assert (depth > 0).all()
     with pytest.raises((ValueError, FileNotFoundError), match="nowhere"):
         environment_map("nowhere.hdr")
+
+
+@pytest.mark.parametrize(("strands", "level"), [(3, 1.0), (300, 0.0)])
+def test_sparse_hair_and_a_black_room_are_relit(small, tmp_path, strands, level):
+    """Three strands fill half of no pixel; a black room lights none."""
+    hair, skin = HairAppearance((0.1, 0.1, 0.1), 0.3, 0.3), (0.3, 0.3, 0.3)
+    model = Model(tmp_path / "model").create()
+    model.write_strands(replace(small.tuft(strands), radius=4e-5))
+    FittedAppearance(hair, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()).save(model)
+    image = relight(FittedModel.load(model), model, np.full((2, 4, 3), level), size=64, spp=4)
+    shown = cv2.imread(str(model.file("relit.png")))
+    assert (image.max() > 0) == (level > 0)
+    assert (shown.max() == 255) == (level > 0)
 
 
 def test_nothing_held_out_is_an_error_that_says_so(tmp_path):

@@ -110,6 +110,17 @@ def test_rotation_turns_the_map_counter_clockwise(ball):
     assert lit["+y"] > 4 * max(lit["+x"], lit["-y"])
 
 
+def test_a_map_that_has_turned_for_long_is_where_it_is(ball):
+    envmap = studio(16)
+    camera = eye((0, -1, 0))
+    once = render_environment(ball, camera, envmap, Sampling(4), rotation_deg=90)
+    often = render_environment(ball, camera, envmap, Sampling(4), rotation_deg=90 + 360 * 1e9)
+    np.testing.assert_array_equal(once, often)
+    for turn in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="rotation_deg must be finite"):
+            render_environment(ball, camera, envmap, Sampling(4), rotation_deg=turn)
+
+
 def test_same_seed_same_bytes(small):
     scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
     a, b, other = (
@@ -124,7 +135,7 @@ def test_dark_worlds_are_dark(ball):
     assert not render_environment(ball, eye((0, -1, 0)), np.zeros((4, 8, 3)), Sampling(4)).any()
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.1])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.1, 1e38])
 def test_impossible_radiance_is_refused(ball, value):
     world = np.ones((4, 8, 3))
     world[2, 5, 1] = value

@@ -210,6 +210,8 @@ def test_mixtures_of_seeds_and_of_nothing(tufted):
     assert not render_mixed(scene, camera, sampling=Sampling(1)).any()
     with pytest.raises(ValueError, match="must be finite"):
         render_mixed(scene, camera, lights, weights=np.nan)
+    with pytest.raises(ValueError, match="must be finite"):
+        render_mixed(scene, camera, (), [Environment(studio(16), weight=np.nan)])
     with pytest.raises(ValueError, match="greater than 0"):
         Sampling(0)
 

@@ -130,6 +130,24 @@ def test_radiance_is_linear_in_intensity(tufted):
     )
 
 
+@pytest.mark.parametrize("watts", [1e-20, 1e22])
+def test_light_of_any_strength_is_linear(tufted, watts):
+    """Its squares are no float32: of bright lights no shadow ray was cast, all was black."""
+    scene, camera, lights = tufted
+    usual = replace(lights[0], intensity=np.ones(3))
+    strong = replace(usual, intensity=np.full(3, watts))
+    one, other = (render_olat(scene, camera, [x], spp=4, seed=2) for x in (usual, strong))
+    assert one.any()
+    np.testing.assert_allclose(other / watts, one, rtol=1e-3, atol=1e-6)
+
+
+def test_lights_that_overflow_are_refused(tufted):
+    scene, camera, lights = tufted
+    blinding = replace(lights[0], name="sun", intensity=np.full(3, 1e36))
+    with pytest.raises(ValueError, match=r"^sun: .* W/sr cannot be rendered"):
+        render_olat(scene, camera, [lights[1], blinding])
+
+
 def test_indirect_light_is_what_direct_light_lacks(small, tufted):
     """A plane cannot see itself: it has none."""
     scene, camera, lights = tufted

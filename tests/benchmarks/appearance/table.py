@@ -12,8 +12,9 @@ import numpy as np
 from appearance import InverseRenderingOptions, scores
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
+from appearance.inverse_rendering.memory import Sizes, memory_needed
 from appearance.inverse_rendering.options import Variant
-from appearance.inverse_rendering.problem import FitProblem, memory_needed
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import mean_scores, scores_unavailable
 from appearance.observations import Observed
@@ -23,7 +24,7 @@ from benchmarks.appearance.known_subjects import Captured
 from benchmarks.command import within
 from reconstruction import Light, Progress, Stage, silent
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.report.report import peak_memory
+from reconstruction.report.report import peak_memory, resident_memory
 
 GROUPS = ("train views", "held-out views")
 TRUTH = "truth, fresh numbers"
@@ -74,16 +75,19 @@ class Table:
         self.variants["HairInverse"]["warnings"] = stage.warnings
         lights = None
         problem = FitProblem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
+        sizes = Sizes([len(o.pixels) for o in self.training], len(self.training[0].lights))
         for variant in variants:
             begun = time.perf_counter()
             self.progress(variant, 0.0)
             worked = time.process_time()
+            options = replace(self.options, variant=variant)
+            held = resident_memory() or 0.0
             with peak_memory() as peak:
                 found = run(
                     problem,
                     maps,
                     lights,
-                    options=replace(self.options, variant=variant),
+                    options=options,
                     seed=self.seed,
                     monitor=Monitor(within(self.progress, f"({variant})")),
                 )
@@ -93,11 +97,7 @@ class Table:
             self.variants[variant] |= {
                 "cpu_seconds": worked,
                 "memory_gb": peak.gb,
-                "memory_told_gb": memory_needed(
-                    [len(o.pixels) for o in self.training],
-                    len(self.training[0].lights),
-                    self.options.effort,
-                ),
+                "memory_told_gb": held + memory_needed(sizes, options),
                 "ended": found.ended,
                 "steps": found.steps,
                 "gain_spread": float(found.lights.gain.std()),

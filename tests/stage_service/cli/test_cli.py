@@ -175,6 +175,19 @@ def test_a_bad_option_is_one_sentence_with_its_place(capsys, command, options, p
     assert "\n" not in data["error"]["detail"]
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--environment", "nowhere.hdr"), "nowhere.hdr: no such environment map"),
+        (("--field-options", '{"spp": 4}'), "say which with --field"),
+    ],
+)
+def test_a_fit_says_what_it_cannot_use_before_it_begins(capsys, words, said):
+    code, data = run(capsys, "fit", "c", "m", "--hold-out-light", "l3", *words)
+    assert code == 3
+    assert said in data["error"]["detail"]
+
+
 def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
     code, data = run(capsys, "rig", "check", tmp_path / "none.toml")
     assert code == 3
@@ -332,6 +345,32 @@ def test_evaluate_images_compares_files_and_folders(capsys, tmp_path):
     )
     assert code == 3
     assert "two EXR files" in data["error"]["detail"]
+
+
+def test_evaluate_images_names_the_picture_that_cannot_be_compared(capsys, tmp_path):
+    image = np.random.default_rng(0).uniform(0.1, 1, (16, 16, 3)).astype(np.float32)
+    broken = {"nan": image * np.where(np.arange(16) == 3, np.nan, 1)[:, None, None]}
+    broken |= {"inf": np.where(image > 0.9, np.inf, image), "black": 0 * image, "true": image}
+    for name, values in broken.items():
+        write_exr(tmp_path / f"{name}.exr", values.astype(np.float32))
+    cv2.imwrite(str(tmp_path / "float.hdr"), image)
+    cv2.imwrite(str(tmp_path / "true.png"), (255 * image).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "none.png"), np.zeros((16, 16), np.uint8))
+    cv2.imwrite(str(tmp_path / "half.png"), np.full((8, 16), 255, np.uint8))
+    for pred, true, mask, said in [
+        ("nan.exr", "true.exr", None, "nan.exr: 48 of its values are not finite"),
+        ("inf.exr", "true.exr", None, "inf.exr: "),
+        ("true.exr", "nan.exr", None, "nan.exr: 48 of its values"),
+        ("true.exr", "black.exr", None, "black.exr: under one pixel in a hundred is lit"),
+        ("float.hdr", "true.png", None, "float.hdr: linear pictures are compared as .exr"),
+        ("true.exr", "true.exr", "none.png", "none.png: a mask must mark pixels"),
+        ("true.exr", "true.exr", "half.png", "half.png: a mask must mark pixels"),
+    ]:
+        words: list[Any] = ["evaluate", "images", tmp_path / pred, tmp_path / true]
+        words += [] if mask is None else ["--mask", tmp_path / mask]
+        code, data = run(capsys, *words)
+        assert code == 3
+        assert said in data["error"]["detail"]
 
 
 def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):

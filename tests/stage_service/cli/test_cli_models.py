@@ -224,6 +224,21 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     assert ".hair" in found["error"]["detail"]
 
 
-def test_a_negative_seed_is_refused(tmp_path, capsys):
-    assert main(["render", str(tmp_path), "--seed", "-1"]) == 3
-    assert "--seed -1: expected 0 or more" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--seed", "-1"), "--seed -1: expected 0 or more"),
+        (("--spp", "0"), "--spp 0: expected 1 or more"),
+        (("--guide", "none"), "go with --field interpolation"),
+        (("--refine",), "go with --field interpolation"),
+        (
+            ("--capture", "{capture}", "--field", "interpolation", "--guide", "none", "--refine"),
+            "not those of --guide none",
+        ),
+    ],
+)
+def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
+    asked = [str(made.model), *(w.format(capture=made.capture) for w in words)]
+    code, found = run(capsys, "render", *asked)
+    assert code == 3
+    assert said in found["error"]["detail"]
