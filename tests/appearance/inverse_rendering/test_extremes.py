@@ -47,7 +47,9 @@ def test_black_hair_is_found_darker_than_the_start(tufted):
 
 def test_white_hair_is_found_lighter_than_the_start(tufted):
     truth = HairAppearance((0.001, 0.002, 0.008), 0.25, 0.3)
-    found = check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START), ENOUGH)
+    # light goes far in it: of few paths, one bright one decides whether the fit is taken
+    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64))
+    found = check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START), quiet)
     assert found.sigma_a.max() < 0.7 * START.sigma_a[0]
 
 
