@@ -130,8 +130,10 @@ def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, In
     ids = np.sort(drawn)
     few = strands.subset(ids)
     # of radii that vary the area counts, length by length
-    wider = _area(strands) / _area(few)
-    return replace(few, radius=few.radius * wider), ids
+    left = _area(few)
+    if not left:  # strands without length: no radius makes up for the others
+        return few, ids
+    return replace(few, radius=few.radius * (_area(strands) / left)), ids
 
 
 def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:

@@ -79,8 +79,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
         raise BadArgument(
             "--wisp and --along say where to colour: give --recolour or --pigment too"
         )
-    if args.out.exists() and any(args.out.iterdir()):
-        raise BadArgument(f"--out {args.out} is not empty: choose a new folder")
+    if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
+        raise BadArgument(f"--out {args.out} is no empty folder: choose a new one")
     fitted = FittedModel.load(Model(args.model), Capture(args.capture) if args.capture else None)
     if args.strands is not None:
         fitted = restyled(fitted, read_strands(args.strands))

@@ -81,7 +81,7 @@ def test_a_full_disk_is_told_of_the_file(suffix: str, two: Strands, tmp_path: Pa
 def test_alembic_asks_for_room_before_it_begins(
     two: Strands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its library ends the process where the disk is full: 5 points of 16 bytes need 80 at least."""
+    """Its library ends the process where the disk is full. 5 points are 80 bytes."""
     pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
     monkeypatch.setattr("reconstruction.files.durable._free", lambda _: 79)
     with pytest.raises(OSError, match=r"No space left on device: .*79 are free.*hair\.abc"):

@@ -224,6 +224,26 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     assert ".hair" in found["error"]["detail"]
 
 
+@pytest.mark.usefixtures("fitted")
+def test_exports_make_their_folders_and_take_no_place_of_a_models_files(made, capsys, tmp_path):
+    deep = tmp_path / "new" / "folder" / "h.hair"
+    assert run(capsys, "export", made.model, "--to", "hair", "--out", deep)[0] == 0
+    assert len(read_strands(deep)) == 200
+    before = {p: p.read_bytes() for p in made.folder.rglob("*") if p.is_file()}
+    for kind, out in (
+        ("mitsuba", made.capture),  # its head would be in centimetres
+        ("mitsuba", made.model.path),
+        ("hair", made.model.file("strands.hair")),
+        ("usd", made.model.file("strands.usdc")),
+    ):
+        words = ("--to", kind, "--strands", 5, "--out", out)
+        code, found = run(capsys, "export", made.model, *words)
+        assert (code, "choose another folder" in found["error"]["detail"]) == (3, True)
+    assert {p: p.read_bytes() for p in made.folder.rglob("*") if p.is_file()} == before
+    code, found = run(capsys, "edit", made.model, "--cut", 1, "--out", deep)
+    assert (code, "no empty folder" in found["error"]["detail"]) == (3, True)
+
+
 def test_a_negative_seed_is_refused(tmp_path, capsys):
     assert main(["render", str(tmp_path), "--seed", "-1"]) == 3
     assert "--seed -1: expected 0 or more" in capsys.readouterr().err
