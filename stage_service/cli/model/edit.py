@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from reconstruction.arrays import Array
 
 WISP_CELLS = 32
-"""Cells of a brush across the scalp's map, where the model's own maps have fewer."""
+"""Cells of a brush across the scalp's map, at least."""
 DYED_LAYERS = 8
-"""Layers along strands where only a part of their length is dyed."""
+"""Layers along strands where only a part of their length is dyed, at least."""
 
 
 def add(commands: Commands) -> None:
@@ -106,19 +106,18 @@ def run(args: argparse.Namespace, output: Output) -> None:
 def _coloured(fitted: FittedModel, args: argparse.Namespace) -> HairMaps:
     import numpy as np
 
-    from appearance.model.edit import recoloured, wisp_of
+    from appearance.model.edit import recoloured, refined, wisp_of
 
-    maps, brush = fitted.maps, np.ones((1, 1))
+    layers = DYED_LAYERS if args.along != (0.0, 1.0) else 1
+    cells = 1 if args.wisp is None else WISP_CELLS
+    maps, brush = refined(fitted.maps, (layers, cells, cells)), np.ones((1, 1))
     if args.wisp is not None:
         u, v, radius = args.wisp
         uv = fitted.root_uv
         inside = np.flatnonzero(np.hypot(uv[:, 0] - u, uv[:, 1] - v) <= radius)
         if not len(inside):
             raise BadArgument(f"--wisp: no strand is rooted within {radius} of ({u}, {v})")
-        columns, rows = (max(n, WISP_CELLS) for n in maps.shape[1:])
-        brush = wisp_of(inside, uv, (columns, rows))
-    if args.along != (0.0, 1.0):
-        maps = maps.resized((max(len(maps.sigma_a), DYED_LAYERS), *maps.shape[1:]))
+        brush = wisp_of(inside, uv, maps.shape[1:])
     return recoloured(maps, brush, _absorption(args, maps.beta_n), along=args.along)
 
 
