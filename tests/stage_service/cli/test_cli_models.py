@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -192,6 +193,36 @@ def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
     words = ["edit", str(made.model), "--out", str(tmp_path / "bare"), "--roughen", "1.1"]
     assert main(words) == 0
     assert "holds no head" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("fitted")
+def test_an_edited_model_keeps_its_scalps_map_and_tells_of_its_own_material(made, capsys, tmp_path):
+    before = Model(shutil.copytree(made.model.path, tmp_path / "before"))
+    strands, roots = before.strands(), FittedModel.load(before).root_uv
+    known = {"uv": np.zeros((3, 2)), "vertices": np.eye(3), "faces": np.array([[0, 1, 2]])}
+    before.write_arrays("scalp_map.npz", {**known, "roots": roots})
+    write_strands(tmp_path / "few.npz", strands.subset([7, 3]))
+    words = ("edit", before, "--out", tmp_path / "after", "--strands", tmp_path / "few.npz")
+    assert run(capsys, *words, "--roughen", 1.5)[0] == 0
+    after = Model(tmp_path / "after")
+    held = after.arrays("scalp_map.npz")
+    np.testing.assert_allclose(held["roots"], roots[[7, 3]], rtol=1e-6)
+    np.testing.assert_array_equal(held["vertices"], np.eye(3))
+    beta_m = 1.5 * FittedModel.load(before).maps.beta_m
+    page = after.file("index.html").read_text(encoding="utf-8")
+    assert f"β_M {beta_m:.2f}" in page
+    assert "(inverse rendering)." not in page
+    assert after.json("appearance.json")["hair"]["beta_m"] == pytest.approx(beta_m)
+
+
+@pytest.mark.usefixtures("fitted")
+def test_other_strands_in_another_unit_are_told(made, capsys, tmp_path):
+    strands = made.model.strands()
+    for scale, said in ((1, False), (100, True)):
+        write_strands(tmp_path / "s.npz", Strands(scale * strands.points, strands.offsets))
+        out = tmp_path / str(scale)
+        main([*map(str, ("edit", made.model, "--out", out, "--strands", tmp_path / "s.npz"))])
+        assert ("is the file in metres" in capsys.readouterr().err) is said
 
 
 @pytest.mark.usefixtures("fitted")
