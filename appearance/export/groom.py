@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -146,7 +147,8 @@ def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     shape = shapes(strands).reshape(len(strands), -1)
     start = np.random.default_rng(seed).choice(len(shape), min(count, len(shape)), replace=False)
-    centres, _ = kmeans2(shape, shape[np.sort(start)], iter=8, minit="matrix", missing="warn")
+    with warnings.catch_warnings(action="ignore"):  # strands alike leave clusters empty
+        centres, _ = kmeans2(shape, shape[np.sort(start)], iter=8, minit="matrix", missing="warn")
     _, guides = cKDTree(shape).query(centres)
     guides = np.unique(guides)
     _, clump = cKDTree(shape[guides]).query(shape)

@@ -103,6 +103,13 @@ def test_clumps_are_the_wisps_that_are_there():
     np.testing.assert_allclose(own, distance)
 
 
+def test_strands_that_are_alike_are_one_clump():
+    line = np.array([[0, 0, 0], [0, 0, 0.05]])
+    guides, clump = clumps(Strands.from_list([line] * 5 + [line + 0.1]), 4, 0)
+    assert len(guides) == len(set(clump.tolist())) == 2
+    assert clump.tolist() == [clump[0]] * 5 + [1 - clump[0]]
+
+
 def test_shapes_are_points_at_equal_arc_lengths():
     bent = Strands.from_list([np.array([[0, 0, 0], [0.01, 0, 0], [0.01, 0.03, 0]])])
     expected = [[0, 0, 0], [0.01, 0, 0], [0.01, 0.01, 0], [0.01, 0.02, 0], [0.01, 0.03, 0]]
@@ -179,6 +186,8 @@ def test_usd_textures_hold_the_maps_where_st_looks_them_up(mapped, tmp_path):
         image = UsdShade.Shader(stage.GetPrimAtPath(f"/model/materials/hair/layer_{i:02d}"))
         asset = image.GetInput("file").Get()
         assert asset.resolvedPath == str(files[1 + i])
+        # MaterialX repeats a picture where nothing is said: 1 would be in the first cell again
+        assert [image.GetInput(f"{a}addressmode").Get() for a in "uv"] == ["clamp", "clamp"]
     api = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/model/hair"))
     sigma_a = np.array(api.GetPrimvar("sigma_a").Get()).reshape(60, 8, 3)
     st = np.array(api.GetPrimvar("st").Get())
