@@ -23,10 +23,13 @@ from reconstruction.geometry.strands import unit_or_zero
 SEGMENTS = (12, 8, 5)
 """Quads along a card, level by level."""
 TILE = (32, 256)
-"""Pixels of a card's texture, across and along; the widest texture has 128 tiles in a row."""
+"""Pixels of a card's texture, across and along."""
 ROW = 64
+"""Tiles in a row of the texture."""
 WIDE = 2.0
 """Standard deviations of a clump that its card reaches to either side."""
+STRAIGHT = 1e-3
+"""Sine of the angle to the way off the head below which a card has no side of its own."""
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
@@ -75,19 +78,34 @@ def make_cards(groom: Groom, count: int, segments: int, seed: int) -> Cards:
     size = np.bincount(clump)
     middle = np.stack([_means(clump, x, size) for x in points.reshape(len(points), -1).T], axis=1)
     middle = middle.reshape(len(size), segments + 1, 3)
-    along = unit_or_zero(np.asarray(np.gradient(middle, axis=1)).reshape(-1, 3)).reshape(
-        middle.shape
-    )
+    along = _unit(np.asarray(np.gradient(middle, axis=1)))
+    along[~along.any(axis=2)] = (0, 0, 1)  # of strands without length
     centre = (
         groom.strands.points.mean(axis=0) if groom.head is None else groom.head.vertices.mean(0)
     )
-    outwards = middle - centre
-    across = unit_or_zero(np.cross(along, outwards).reshape(-1, 3)).reshape(middle.shape)
+    across = _across(along, middle - centre)
     normal = np.cross(across, along)
     aside = ((points - middle[clump]) * across[clump]).sum(axis=2)
     spread = np.sqrt(np.stack([_means(clump, x, size) for x in aside.T**2], axis=1))
     least = 2 * float(np.median(groom.strands.radius))
     return Cards(middle, across, normal, np.maximum(WIDE * spread, least), clump)
+
+
+def _across(along: Array, outwards: Array) -> Array:
+    """Unit vectors `(C, K, 3)` at right angles to both; where cards stand straight off the head,
+    the way that the rest of the card has, or any."""
+    across = np.cross(along, outwards)
+    length = np.linalg.norm(across, axis=2, keepdims=True)
+    clear = length > STRAIGHT * np.linalg.norm(outwards, axis=2, keepdims=True)
+    rest = np.where(clear, across, 0).sum(axis=1)
+    none = ~rest.any(axis=1)
+    rest[none] = np.eye(3)[np.abs(along[none, 0]).argmin(axis=1)]
+    beside = rest[:, None] - along * (along * rest[:, None]).sum(axis=2, keepdims=True)
+    return _unit(np.where(clear, across, beside))
+
+
+def _unit(vectors: Array) -> Array:
+    return unit_or_zero(vectors.reshape(-1, 3)).reshape(vectors.shape)
 
 
 def draw_cards(groom: Groom, cards: Cards, colour: Array) -> Ints:

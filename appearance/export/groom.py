@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -130,8 +131,10 @@ def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, In
     ids = np.sort(drawn)
     few = strands.subset(ids)
     # of radii that vary the area counts, length by length
-    wider = _area(strands) / _area(few)
-    return replace(few, radius=few.radius * wider), ids
+    left = _area(few)
+    if not left:  # strands without length: no radius makes up for the others
+        return few, ids
+    return replace(few, radius=few.radius * (_area(strands) / left)), ids
 
 
 def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
@@ -144,7 +147,8 @@ def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     shape = shapes(strands).reshape(len(strands), -1)
     start = np.random.default_rng(seed).choice(len(shape), min(count, len(shape)), replace=False)
-    centres, _ = kmeans2(shape, shape[np.sort(start)], iter=8, minit="matrix", missing="warn")
+    with warnings.catch_warnings(action="ignore"):  # strands alike leave clusters empty
+        centres, _ = kmeans2(shape, shape[np.sort(start)], iter=8, minit="matrix", missing="warn")
     _, guides = cKDTree(shape).query(centres)
     guides = np.unique(guides)
     _, clump = cKDTree(shape[guides]).query(shape)

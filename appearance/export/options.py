@@ -16,10 +16,11 @@ class ExportOptions:
     `strands`: so many of them, drawn at random, their radius larger by as much as the length lost,
     which keeps the area that they cover; all where None or where there are fewer. `guides`: strands
     that stand for clumps of the others, 0 for none. `cards`: ribbons of the finest level of glTF;
-    each further level has a quarter of them.
+    each further level has a quarter of them. The most make a texture of 16,384 pixels, what
+    graphics cards take.
     """
 
     strands: Count | None = None
     guides: Annotated[int, Field(ge=0)] = 0
-    cards: Count = 600
-    seed: int = 0
+    cards: Annotated[int, Field(gt=0, le=4096)] = 600
+    seed: Annotated[int, Field(ge=0)] = 0

@@ -27,7 +27,8 @@ def export_unreal(groom: Groom, path: Path) -> None:
     """
     every = np.arange(len(groom.strands))
     colour = groom.colour(groom.looked_up[0])
-    with archive(path) as top:
+    points = len(groom.strands.points) + len(groom.strands.subset(groom.guides).points)
+    with archive(path, 40 * points) as top:
         _curves(top, "hair", groom, every, colour)
         if len(groom.guides):
             guides = _curves(top, "guides", groom, groom.guides)

@@ -150,6 +150,8 @@ def _layers(stage: Any, textures: list[str]) -> Any:
         image = _shader(stage, f"hair/layer_{i:02d}", "ND_image_vector3")
         image.CreateInput("file", TYPES.Asset).Set(Sdf.AssetPath(file))
         image.CreateInput("filtertype", TYPES.String).Set("closest")  # cells, as we look them up
+        for axis in "uv":  # a place at the map's end is in its last cell, not in the first again
+            image.CreateInput(f"{axis}addressmode", TYPES.String).Set("clamp")
         image.CreateInput("texcoord", TYPES.Float2).ConnectToSource(
             st.CreateOutput("out", TYPES.Float2)
         )

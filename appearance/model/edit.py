@@ -39,8 +39,8 @@ def recoloured(
     """`maps` with the absorption under the `brush (w, h)` in [0, 1] mixed with `sigma_a (3,)`.
 
     `along` is the part of the strands that is dyed, 0 the root and 1 the tip; a layer is dyed by
-    the share of its span that this covers. Maps with fewer cells than the brush get as many. Mixed
-    in the square root of the absorption, in which colours are about evenly spaced. Raises
+    the share of its span that this covers. Maps with fewer cells than the brush are `refined`.
+    Mixed in the square root of the absorption, in which colours are about evenly spaced. Raises
     `ValueError` for a brush, an absorption or a part out of range.
     """
     paint, wanted = np.asarray(brush, float), np.asarray(sigma_a, float)
@@ -52,17 +52,30 @@ def recoloured(
         raise ValueError(
             f"along is a part of the strands from a to b with 0 <= a < b <= 1, got {along}"
         )
-    layers, columns, rows = maps.shape
-    shape = (layers, max(columns, paint.shape[0]), max(rows, paint.shape[1]))
-    fine = maps if shape == maps.shape else maps.resized(shape)
-    u, v = (
-        np.minimum(np.arange(n) * m // n, m - 1)
-        for n, m in zip(shape[1:], paint.shape, strict=True)
-    )
+    fine = refined(maps, (1, *paint.shape))
+    layers, *cells = fine.shape
+    u, v = (np.arange(n) * m // n for n, m in zip(cells, paint.shape, strict=True))
     share = _covered(along, layers)[:, None, None, None] * paint[np.ix_(u, v)][None, :, :, None]
     root = np.sqrt(fine.sigma_a)
     mixed = (root + share * (np.sqrt(wanted) - root)) ** 2
     return replace(fine, sigma_a=np.where(share > 0, mixed, fine.sigma_a))
+
+
+def refined(maps: HairMaps, least: tuple[int, int, int]) -> HairMaps:
+    """`maps` of at least the shape `least` that look the same.
+
+    Each cell becomes so many alike; new layers lie on the lines between the old ones.
+    """
+    layers, columns, rows = maps.shape
+    if layers < least[0]:
+        between = max(layers - 1, 1)
+        layers = 1 + between * -(-(least[0] - 1) // between)
+    fine = maps.resized((layers, columns, rows))
+    across, down = (max(1, -(-m // n)) for n, m in zip((columns, rows), least[1:], strict=True))
+    sigma_a, rotation = (
+        x.repeat(across, axis=1).repeat(down, axis=2) for x in (fine.sigma_a, fine.rotation)
+    )
+    return replace(maps, sigma_a=sigma_a, rotation=rotation)
 
 
 def roughened(maps: HairMaps, factor: float) -> HairMaps:

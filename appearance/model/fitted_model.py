@@ -111,9 +111,12 @@ class FittedModel:
         return {}
 
     def save(self, model: Model) -> None:
-        """Write a model that `load` reads back; the fit's report and pictures are not copied."""
+        """Write a model that `load` reads back; the fit's report and pictures are not copied.
+
+        Its `appearance.json` is of the hair that is rendered, the mean of maps.
+        """
         appearance, hair = self.appearance, self.maps.mean()
-        if self.maps.uniform and hair != appearance.hair:
+        if hair != appearance.hair:
             red, green, blue = colour_of_absorption(hair.sigma_a, hair.beta_n)
             v = float(variance_of_roughness(hair.beta_m))
             appearance = replace(

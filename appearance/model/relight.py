@@ -16,6 +16,8 @@ from appearance.render.smoothed import SHOWN, environment_smoothed
 from reconstruction import Camera, Model, Strands, write_exr
 from reconstruction.arrays import AnyFloats, Floats
 
+LEAST = 1e-3
+"""Metres about their middle that are seen of strands that all lie in one place."""
 PROCEDURAL = {"studio": studio, "sky": sky}
 
 
@@ -55,9 +57,13 @@ def three_quarter_view(strands: Strands, size: int, round_deg: float = 0.0) -> C
 
     The face looks along −y, as everywhere in this project. `round_deg` is how far the camera has
     gone round it from there, counter-clockwise seen from above.
+
+    Raises `ValueError` without strands.
     """
+    if not len(strands):
+        raise ValueError("there are no strands to see: give a camera of the capture's rig")
     low, high = strands.points.min(axis=0).astype(float), strands.points.max(axis=0).astype(float)
-    middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    middle, reach = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), LEAST)
     c, s = np.cos(np.radians(round_deg)), np.sin(np.radians(round_deg))
     direction = np.array([0.62 * c + 0.75 * s, 0.62 * s - 0.75 * c, 0.22])
     distance = 6.0 * reach

@@ -84,7 +84,7 @@ def _write(path: Path, data: memoryview, flags: int) -> None:
 def writing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """A temporary path to write to; afterwards `path` is whole, and where `durable` on the disk.
 
-    Where the block raises, nothing is left of what it wrote.
+    Where the block raises, nothing is left of what it wrote; an `OSError` names a file.
     """
     temporary = part(path)
     try:
@@ -92,8 +92,10 @@ def writing(path: Path, *, durable: bool = True) -> Iterator[Path]:
         if durable:
             flush(temporary)
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            error.filename = str(path)  # of a full disk `write` does not say where
         raise
 
 

@@ -112,7 +112,7 @@ def limits() -> dict[str, Any]:
 def listening(host: str = LOOPBACK, port: int = 0, unix: Path | None = None) -> socket.socket:
     """A socket on `host`:`port` (0: any free one), or at the path `unix`, for this user and group.
 
-    Raises `OSError` when the address is taken.
+    Raises `OSError` when the address is taken or there is no such port.
     """
     if unix is not None:
         return _at(unix)
@@ -122,6 +122,9 @@ def listening(host: str = LOOPBACK, port: int = 0, unix: Path | None = None) -> 
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+    except OverflowError as error:
+        listener.close()
+        raise OSError(f"there is no port {port}: expected one from 0 to 65535") from error
     except OSError as error:
         listener.close()
         raise OSError(

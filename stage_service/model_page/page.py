@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -99,7 +100,7 @@ def _result(model: Model) -> Html:
     """What to take away: strands and material, with the files that hold them."""
     if not model.has("strands.npz"):
         return element("p", "There are no strands yet: the reconstruction has not come to its end.")
-    strands = model.strands()
+    strands, name = model.strands(), shlex.quote(model.path.name)
     lengths = strands.lengths()
     facts = [
         ("strands", [element("b", f"{len(strands):,}"), f" of {len(strands.points):,} points"])
@@ -133,9 +134,9 @@ def _result(model: Model) -> Html:
             element(
                 "p",
                 "To turn it under your hand, in a browser: ",
-                element("code", f"hairstage view {model.path.name}"),
+                element("code", f"hairstage view {name}"),
                 ". For other programs: ",
-                element("code", f"hairstage export {model.path.name} --to blender --out FOLDER"),
+                element("code", f"hairstage export {name} --to blender --out FOLDER"),
                 class_="quiet",
             ),
         ]
@@ -153,7 +154,14 @@ def _material_files(model: Model) -> list[str]:
     if not model.has("hair_maps.npz"):
         return ["the material in ", link("appearance.json"), " (Sun's fit)"]
     more = [" and the lights as found in ", link("lights.json")] if model.has("lights.json") else []
-    return ["the material in ", link("hair_maps.npz"), " (inverse rendering)", *more]
+    how = " (inverse rendering)" if _by_inverse_rendering(model) else ""
+    return ["the material in ", link("hair_maps.npz"), how, *more]
+
+
+def _by_inverse_rendering(model: Model) -> bool:
+    """Whether its maps are a fit's; those of an edited model, which has no report, are not."""
+    names = (stage.name for stage in model.report().stages)
+    return model.has("hair_maps.npz") and "inverse_rendering" in names
 
 
 def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
@@ -184,7 +192,7 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
                 "the maps are in rejected"
             ],
         )
-    elif model.has("hair_maps.npz"):
+    elif _by_inverse_rendering(model):
         yield "rendered", ["inverse rendering; the roughness and colour above are its start"]
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.files.durable import writing
+from reconstruction.files.durable import require_free, writing
 from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.geometry.strands import Strands
 
@@ -27,15 +27,17 @@ def write_abc(path: Path, strands: Strands) -> None:
 
     Raises `StrandFileError` where the extra is not installed.
     """
-    with archive(path) as top:
+    with archive(path, 20 * len(strands.points)) as top:
         add_curves(top, "hair", strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3)))
 
 
 @contextmanager
-def archive(path: Path) -> Iterator[Any]:
+def archive(path: Path, needed: int) -> Iterator[Any]:
     """The top object of a new archive; afterwards `path` is whole or not there.
 
-    Raises `StrandFileError` where the extra is not installed or the file cannot be written.
+    Raises `StrandFileError` where the extra is not installed or the file cannot be written, and
+    `DiskFull` where there is no room for `needed` bytes: the library, once it meets a full disk,
+    ends the process.
     """
     try:
         import imath  # noqa: F401
@@ -45,6 +47,7 @@ def archive(path: Path) -> Iterator[Any]:
             f"{path}: .abc is written by alembic3d, which is not installed ({error}): "
             "pip install 'hairstage[alembic]'"
         ) from error
+    require_free(path, needed, reserve=0)
     try:
         with writing(path) as temporary:
             made = Abc.OArchive(str(temporary))

@@ -66,5 +66,5 @@ def write_npz(path: Path, strands: Strands) -> None:
     }
     if strands.confidence is not None:
         arrays["confidence"] = strands.confidence
-    with writing(path) as temporary:
-        np.savez(temporary, allow_pickle=False, **arrays)
+    with writing(path) as temporary, temporary.open("wb") as file:  # a name gets ".npz" put behind
+        np.savez(file, allow_pickle=False, **arrays)

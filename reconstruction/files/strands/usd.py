@@ -21,11 +21,13 @@ from reconstruction.files.durable import writing
 from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.geometry.strands import Strands
 
+_START = Usd.TimeCode.EarliestTime()
+"""The first of an attribute's times, or its only value: many programs write times alone."""
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def read_usd(path: Path) -> Strands:
-    """Read all linear `BasisCurves` of a stage at its default time, in metres with z up."""
+    """Read all linear `BasisCurves` of a stage in metres with z up; of an animation its start."""
     try:
         return _read(Usd.Stage.Open(str(path)))
     except Tf.ErrorException as error:  # also of values, which are read when they are asked for
@@ -36,7 +38,7 @@ def _read(stage: Any) -> Strands:
     turn = float(UsdGeom.GetStageMetersPerUnit(stage)) * np.eye(3)
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
-    cache = UsdGeom.XformCache()
+    cache = UsdGeom.XformCache(_START)
     curves = (UsdGeom.BasisCurves(prim) for prim in stage.Traverse())
     hair = (c.GetPrim() for c in curves if c and c.ComputePurpose() != UsdGeom.Tokens.guide)
     found = [_curves(prim, cache, turn) for prim in hair]
@@ -58,8 +60,8 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
         raise StrandFileError(f"{where}: only linear curves can be read; convert the cubic ones")
     if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
         raise StrandFileError(f"{where}: closed (periodic) curves are no strands")
-    points = np.asarray(curves.GetPointsAttr().Get() or [], np.float64).reshape(-1, 3)
-    counts = np.asarray(curves.GetCurveVertexCountsAttr().Get() or [], np.int64)
+    points = np.asarray(curves.GetPointsAttr().Get(_START) or [], np.float64).reshape(-1, 3)
+    counts = np.asarray(curves.GetCurveVertexCountsAttr().Get(_START) or [], np.int64)
     if (counts < 2).any() or counts.sum() != len(points):
         raise StrandFileError(
             f"{where}: curveVertexCounts must be at least 2 and sum to the {len(points)} points, "
@@ -69,7 +71,7 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
     linear = to_world[:3, :3] @ turn.T
     world = points @ linear + to_world[3, :3] @ turn.T
     scale = abs(np.linalg.det(linear)) ** (1 / 3)
-    widths = np.asarray(curves.GetWidthsAttr().Get() or [], np.float64) * scale
+    widths = np.asarray(curves.GetWidthsAttr().Get(_START) or [], np.float64) * scale
     if len(widths) == 0:
         widths = np.full(len(points), 8e-5)
     elif len(widths) == 1:

@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from reconstruction.arrays import Array
 
 WISP_CELLS = 32
-"""Cells of a brush across the scalp's map, where the model's own maps have fewer."""
+"""Cells of a brush across the scalp's map, at least."""
+OFF = 0.02
+"""Metres from other strands' roots to the model's, in the median, that are hardly on one scalp."""
 DYED_LAYERS = 8
-"""Layers along strands where only a part of their length is dyed."""
+"""Layers along strands where only a part of their length is dyed, at least."""
 
 
 def add(commands: Commands) -> None:
@@ -66,6 +68,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
     Write the edited MODEL as a new model folder, which render and export take. Several edits are
     made in this order: strands, cut, colour, roughness.
     """
+    import numpy as np
+    from scipy.spatial import cKDTree
+
     from appearance import FittedModel
     from appearance.model.edit import cut, restyled, roughened
     from reconstruction import Capture, Model, read_strands
@@ -79,11 +84,19 @@ def run(args: argparse.Namespace, output: Output) -> None:
         raise BadArgument(
             "--wisp and --along say where to colour: give --recolour or --pigment too"
         )
-    if args.out.exists() and any(args.out.iterdir()):
-        raise BadArgument(f"--out {args.out} is not empty: choose a new folder")
-    fitted = FittedModel.load(Model(args.model), Capture(args.capture) if args.capture else None)
+    if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
+        raise BadArgument(f"--out {args.out} is no empty folder: choose a new one")
+    source = Model(args.model)
+    fitted = FittedModel.load(source, Capture(args.capture) if args.capture else None)
     if args.strands is not None:
-        fitted = restyled(fitted, read_strands(args.strands))
+        before, fitted = fitted, restyled(fitted, read_strands(args.strands))
+        distance, _ = cKDTree(before.strands.roots).query(fitted.strands.roots)
+        off = float(np.median(distance))
+        if off > OFF:
+            output.note(
+                f"warning: half of the strands of {args.strands} begin over {off:.2g} m from all "
+                "of the model's: is the file in metres, z up, in the model's frame?"
+            )
     if args.cut is not None:
         fitted = cut(fitted, args.cut)
     if args.recolour or args.pigment:
@@ -92,6 +105,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
         fitted = fitted.with_maps(roughened(fitted.maps, args.roughen))
     model = Model(args.out)
     fitted.save(model)
+    if source.has("scalp_map.npz"):
+        roots = fitted.root_uv.astype(np.float32)
+        model.write_arrays("scalp_map.npz", {**source.arrays("scalp_map.npz"), "roots": roots})
     write_page(model)
     if fitted.head is None:
         output.note(
@@ -106,19 +122,18 @@ def run(args: argparse.Namespace, output: Output) -> None:
 def _coloured(fitted: FittedModel, args: argparse.Namespace) -> HairMaps:
     import numpy as np
 
-    from appearance.model.edit import recoloured, wisp_of
+    from appearance.model.edit import recoloured, refined, wisp_of
 
-    maps, brush = fitted.maps, np.ones((1, 1))
+    layers = DYED_LAYERS if args.along != (0.0, 1.0) else 1
+    cells = 1 if args.wisp is None else WISP_CELLS
+    maps, brush = refined(fitted.maps, (layers, cells, cells)), np.ones((1, 1))
     if args.wisp is not None:
         u, v, radius = args.wisp
         uv = fitted.root_uv
         inside = np.flatnonzero(np.hypot(uv[:, 0] - u, uv[:, 1] - v) <= radius)
         if not len(inside):
             raise BadArgument(f"--wisp: no strand is rooted within {radius} of ({u}, {v})")
-        columns, rows = (max(n, WISP_CELLS) for n in maps.shape[1:])
-        brush = wisp_of(inside, uv, (columns, rows))
-    if args.along != (0.0, 1.0):
-        maps = maps.resized((max(len(maps.sigma_a), DYED_LAYERS), *maps.shape[1:]))
+        brush = wisp_of(inside, uv, maps.shape[1:])
     return recoloured(maps, brush, _absorption(args, maps.beta_n), along=args.along)
 
 

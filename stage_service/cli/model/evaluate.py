@@ -85,11 +85,19 @@ def run_images(args: argparse.Namespace, output: Output) -> None:
     Compare two pictures, or two folders by file name. EXR files are exposed alike (the 99th
     percentile of the true pixels becomes 1) and get the sRGB curve first.
     """
-    from stage_service.cli.model.pictures import compare_pictures, pair_up
+    from stage_service.cli.model.pictures import SUFFIXES, compare_pictures, pair_up
 
     pairs = pair_up(args.pred, args.true)
     if not pairs:
         raise BadArgument(f"{args.pred} and {args.true} have no file name in common")
+    there = [p for f in (args.pred, args.true) if f.is_dir() for p in f.iterdir()]
+    pictures = {p.name for p in there if p.suffix.lower() in SUFFIXES}
+    alone = sorted(pictures - {name for name, *_ in pairs})
+    if alone:
+        output.note(
+            f"warning: {len(alone)} pictures are in one of the folders alone and left out, the "
+            f"first is {alone[0]}"
+        )
     images = {name: compare_pictures(a, b, args.mask) for name, a, b in pairs}
     mean = {
         key: sum(figures[key] for figures in images.values()) / len(images)

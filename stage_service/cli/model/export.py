@@ -58,6 +58,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions
     from reconstruction import Capture, Model, parse_options, write_strands
+    from reconstruction.model import FILES
 
     out: Path = args.out
     if args.to in SUFFIXES and out.suffix not in SUFFIXES[args.to]:
@@ -66,6 +67,14 @@ def run(args: argparse.Namespace, output: Output) -> None:
         )
     if args.to in FOLDERS and out.is_file():
         raise BadArgument(f"--out {out} is a file: {args.to} makes a folder")
+    folder = out if args.to in FOLDERS else out.parent
+    if any((folder / name).exists() for name in ("strands.npz", "rig.json")) and (
+        args.to in FOLDERS or out.name in FILES
+    ):
+        raise BadArgument(
+            f"--out {out} would be among the files of a model or a capture, and take the place of "
+            "one: choose another folder"
+        )
     if args.camera is not None and (args.capture is None or args.to != "mitsuba"):
         raise BadArgument("--camera is a view for mitsuba, of the rig of --capture")
     names = ("strands", "guides", "cards", "seed")
@@ -73,6 +82,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
     if args.to in STRANDS:
         strands, _ = thinned(model.strands(), options.strands, options.seed)
+        out.parent.mkdir(parents=True, exist_ok=True)
         write_strands(out, strands)
         files = [out]
     else:
@@ -91,6 +101,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
 def _write(args: argparse.Namespace, groom: Groom, capture: Capture | None) -> list[Path]:
     """Write the file or folder; returns what was written."""
     out: Path = args.out
+    out.parent.mkdir(parents=True, exist_ok=True)
     if args.to in ("usd", "houdini"):
         from appearance.export.usd import export_usd
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from urllib.parse import quote
 
 from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
 
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     key = secrets.token_urlsafe(24)
 
     def ready(url: str) -> None:
-        address = f"{url}/view#model={name}&token={key}"
+        address = f"{url}/view#model={quote(name, safe='')}&token={key}"
         output.result({"url": address, "model": str(args.model)}, f"{address}\n(Ctrl-C ends it)")
 
     exit_on_sigterm()

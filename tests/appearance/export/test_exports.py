@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from appearance import Exposure, FittedModel, HairAppearance, HeldOut, Sampling, render_environment
 from appearance.bsdf.maps import HairMaps
 from appearance.export.blender import export_blender
-from appearance.export.cards import export_gltf
+from appearance.export.cards import export_gltf, make_cards
 from appearance.export.groom import Groom, clumps, shapes, thinned
 from appearance.export.mitsuba import View, export_mitsuba
 from appearance.export.options import ExportOptions
@@ -70,6 +70,24 @@ def test_thinned_strands_cover_what_all_did():
     assert thinned(strands, 7, 0)[0] is strands
 
 
+def test_strands_without_length_are_thinned_as_they_are():
+    still = Strands.from_list([np.zeros((2, 3))] * 4, radius=3e-5)
+    few, _ = thinned(still, 2, 0)
+    assert (len(few), few.radius) == (2, 3e-5)
+
+
+def test_a_strand_straight_off_the_head_is_a_card_with_a_side(fitted, tmp_path):
+    """Of all ways across such a card none is level with the head."""
+    line = np.array([[0, 0, 0.1], [0, 0, 0.2]])
+    bristle = replace(fitted, strands=Strands.from_list([line], radius=5e-5), head=None)
+    cards = make_cards(Groom.of(bristle, ExportOptions()), 1, 4, 0)
+    assert (cards.half >= 5e-5).all()
+    for unit in (cards.across, cards.normal):
+        np.testing.assert_allclose(np.linalg.norm(unit, axis=2), 1)
+        np.testing.assert_allclose(unit[..., 2], 0, atol=1e-12)  # at right angles to the strand
+    np.testing.assert_array_equal(cards.across, np.broadcast_to(cards.across[:, :1], (1, 5, 3)))
+
+
 def test_clumps_are_the_wisps_that_are_there():
     rng = np.random.default_rng(0)
     line = np.array([[0, 0, 0], [0, 0, 0.05], [0, 0.01, 0.1]])
@@ -83,6 +101,13 @@ def test_clumps_are_the_wisps_that_are_there():
     distance, _ = cKDTree(shape[guides]).query(shape)
     own = np.linalg.norm(shape - shape[guides][clump], axis=1)
     np.testing.assert_allclose(own, distance)
+
+
+def test_strands_that_are_alike_are_one_clump():
+    line = np.array([[0, 0, 0], [0, 0, 0.05]])
+    guides, clump = clumps(Strands.from_list([line] * 5 + [line + 0.1]), 4, 0)
+    assert len(guides) == len(set(clump.tolist())) == 2
+    assert clump.tolist() == [clump[0]] * 5 + [1 - clump[0]]
 
 
 def test_shapes_are_points_at_equal_arc_lengths():
@@ -161,6 +186,8 @@ def test_usd_textures_hold_the_maps_where_st_looks_them_up(mapped, tmp_path):
         image = UsdShade.Shader(stage.GetPrimAtPath(f"/model/materials/hair/layer_{i:02d}"))
         asset = image.GetInput("file").Get()
         assert asset.resolvedPath == str(files[1 + i])
+        # MaterialX repeats a picture where nothing is said: 1 would be in the first cell again
+        assert [image.GetInput(f"{a}addressmode").Get() for a in "uv"] == ["clamp", "clamp"]
     api = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/model/hair"))
     sigma_a = np.array(api.GetPrimvar("sigma_a").Get()).reshape(60, 8, 3)
     st = np.array(api.GetPrimvar("st").Get())
@@ -292,7 +319,9 @@ def test_blender_gets_arrays_and_a_script_that_python_reads(mapped, tmp_path):
 
 
 def test_options_that_cannot_be_are_refused():
-    for wrong in ({"strands": 0}, {"guides": -1}, {"cards": 0}, {"strand": 3}):
+    """5,000 cards, 64 a row of 256 pixels, are 20,224 pixels: graphics cards take 16,384."""
+    several = {"strands": 0}, {"guides": -1}, {"cards": 0}, {"cards": 5000}, {"seed": -1}
+    for wrong in (*several, {"strand": 3}):
         with pytest.raises(BadOptions, match=next(iter(wrong))):
             parse_options(ExportOptions, wrong)
 

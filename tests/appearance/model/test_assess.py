@@ -408,6 +408,10 @@ def test_relighting_names_and_views():
     pixels, depth = view.project(strands.points)
     assert view.inside(pixels).all()
     assert (depth > 0).all()
+    still = Strands.from_list([np.full((2, 3), 0.1)])
+    np.testing.assert_allclose(three_quarter_view(still, 64).project(still.points)[0], 31.5)
+    with pytest.raises(ValueError, match="no strands to see"):
+        three_quarter_view(Strands.from_list([]), 64)
     with pytest.raises((ValueError, FileNotFoundError), match="nowhere"):
         environment_map("nowhere.hdr")
 

@@ -67,6 +67,14 @@ def test_a_brush_colours_its_wisp_and_nothing_else(fitted):
         dyed.sigma_a[2, 0, brush[0] == 1], [[3.0, 0.1, 0.1]] * int((brush[0] == 1).sum())
     )
     assert recoloured(HairMaps.of(HAIR), brush, (1, 1, 1)).shape == (1, 4, 4)
+    finer = np.zeros((9, 7))
+    finer[:2] = 1  # and no more, though the maps' cells are twice as wide
+    looks = [
+        at_points(m, fitted.strands, uv)[0]
+        for m in (fitted.maps, recoloured(fitted.maps, finer, (3.0, 0.1, 0.1)))
+    ]
+    differ = np.abs(looks[1] - looks[0]).max(axis=1) > 0
+    np.testing.assert_array_equal(differ, (uv[:, 0] < 0.25)[fitted.strands.strand_of_point])
     soft = wisp_of(left, uv, (4, 4), soft=1.0)
     assert 0 < soft[2].max() < 1
     with pytest.raises(ValueError, match="brush"):

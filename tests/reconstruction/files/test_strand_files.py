@@ -62,6 +62,33 @@ def test_a_scalar_radius_stays_a_scalar(suffix: str, two: Strands, tmp_path: Pat
     assert radius == pytest.approx(2e-4, rel=1e-6)
 
 
+@pytest.mark.parametrize("suffix", [s.upper() for s in BOTH_WAYS])
+def test_a_suffix_in_capitals_is_the_same_format(suffix: str, two: Strands, tmp_path: Path) -> None:
+    write_strands(tmp_path / f"HAIR{suffix}", two)
+    np.testing.assert_array_equal(read_strands(tmp_path / f"HAIR{suffix}").points, two.points)
+    assert [p.name for p in tmp_path.iterdir()] == [f"HAIR{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hair"])
+def test_a_full_disk_is_told_of_the_file(suffix: str, two: Strands, tmp_path: Path) -> None:
+    path = tmp_path / f"hair{suffix}"
+    (tmp_path / f".part-hair{suffix}").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=rf"No space left on device: '{path}'"):
+        write_strands(path, two)
+    assert not list(tmp_path.iterdir())
+
+
+def test_alembic_asks_for_room_before_it_begins(
+    two: Strands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its library ends the process where the disk is full. 5 points are 80 bytes."""
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    monkeypatch.setattr("reconstruction.files.durable._free", lambda _: 79)
+    with pytest.raises(OSError, match=r"No space left on device: .*79 are free.*hair\.abc"):
+        write_strands(tmp_path / "hair.abc", two)
+    assert not list(tmp_path.iterdir())
+
+
 def test_confidence_goes_to_npz_and_usd(two: Strands, tmp_path: Path) -> None:
     confidence = np.linspace(0, 1, len(two.points), dtype=np.float32)
     strands = Strands(two.points, two.offsets, two.radius, confidence)
@@ -393,6 +420,26 @@ def Xform "head" {{
 def test_usd_axes_units_and_transforms(tmp_path: Path) -> None:
     path = tmp_path / "x.usda"
     path.write_text(USDA.format(type="linear", widths="[0.02]"))
+    strands = read_strands(path)
+    np.testing.assert_allclose(
+        strands.points, [[0.01, -0.08, 0.02], [0.04, -0.11, 0.05]], atol=1e-9
+    )
+    assert strands.radius == pytest.approx(1e-4)
+
+
+def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
+    """Houdini writes the values of frames alone, also of a single one."""
+    path = tmp_path / "x.usda"
+    text = USDA.format(type="linear", widths="[0.02]")
+    timed = {
+        "int[] curveVertexCounts = [2]": "{1: [2], 2: [2]}",
+        "point3f[] points = [(1, 2, 3), (4, 5, 6)]": "{1: [(1, 2, 3), (4, 5, 6)], 2: [(0, 0, 0),"
+        " (0, 0, 9)]}",
+        "float[] widths = [0.02]": "{1: [0.02], 2: [0.5]}",
+    }
+    for still, moving in timed.items():
+        text = text.replace(still, f"{still.split(' = ')[0]}.timeSamples = {moving}")
+    path.write_text(text)
     strands = read_strands(path)
     np.testing.assert_allclose(
         strands.points, [[0.01, -0.08, 0.02], [0.04, -0.11, 0.05]], atol=1e-9

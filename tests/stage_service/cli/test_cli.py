@@ -340,6 +340,9 @@ def test_evaluate_images_compares_files_and_folders(capsys, tmp_path):
     assert code == 0
     assert data["images"]["a.png"]["psnr"] == pytest.approx(20 * np.log10(25.5), abs=0.01)
     assert data["images"]["b.exr"] == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
+    cv2.imwrite(str(tmp_path / "true" / "only.png"), image.astype(np.uint8))
+    assert main(["evaluate", "images", str(tmp_path / "pred"), str(tmp_path / "true")]) == 0
+    assert "1 pictures are in one of the folders alone" in capsys.readouterr().err
     code, data = run(
         capsys, "evaluate", "images", tmp_path / "pred" / "a.png", tmp_path / "true" / "b.exr"
     )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import redirect_stdout
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 
 from appearance import FittedModel, HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
+from appearance.export.groom import at_points
 from appearance.render.coverage import coverage
 from reconstruction import (
     Camera,
@@ -139,6 +142,15 @@ def test_inverse_rendering_runs_suns_fit_again_where_other_images_are_held_out(
     assert called[1:] == ["fit", "inverse_rendering", "assess"]
 
 
+def dyed_points(before: FittedModel, folder: Path) -> np.ndarray:
+    """Which points `(S, n)` of the same strands have another colour in the model `folder`."""
+    looks = [
+        at_points(maps, before.strands, before.root_uv)[0]
+        for maps in (before.maps, FittedModel.load(Model(folder)).maps)
+    ]
+    return (np.abs(looks[1] - looks[0]) > 1e-4).any(axis=1).reshape(len(before.strands), -1)
+
+
 @pytest.mark.usefixtures("fitted")
 def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
     before = FittedModel.load(made.model)
@@ -160,18 +172,20 @@ def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
         *("--wisp", f"{u},{v},0.1", "--along", "0.5,1"),
     )
     assert code == 0
-    wisp = FittedModel.load(Model(tmp_path / "wisp")).maps
-    dyed = (np.abs(wisp.sigma_a - before.maps.resized(wisp.shape).sigma_a) > 1e-4).any(-1)
-    assert not dyed[: len(dyed) // 2].any()
-    assert 0.0 < dyed[-1].mean() < 0.1
+    dyed = dyed_points(before, tmp_path / "wisp")
+    far = np.hypot(*(before.root_uv - (u, v)).T)
+    assert dyed[far < 0.1, -1].all()
+    assert not dyed[far > 0.1 + np.sqrt(2) / 32].any()  # a cell of the brush away
+    assert not dyed[:, np.linspace(0, 1, dyed.shape[1]) < 0.5 - 1 / 7].any()
     code, _ = run(
         *(capsys, "edit", made.model, "--out", tmp_path / "band", "--recolour", "0.9,0.1,0.1"),
         *("--along", "0.3,0.4"),
     )
     assert code == 0
-    band = FittedModel.load(Model(tmp_path / "band")).maps
-    dyed = (np.abs(band.sigma_a - before.maps.resized(band.shape).sigma_a) > 1e-4).any((1, 2, 3))
-    assert dyed.tolist() == [False, False, True, True, False, False, False, False]
+    along = np.linspace(0, 1, dyed.shape[1])
+    dyed = dyed_points(before, tmp_path / "band")
+    assert dyed[:, np.abs(along - 0.35) < 0.05].all()
+    assert not dyed[:, np.abs(along - 0.35) > 0.05 + 1 / 7].any()
     code, _ = run(capsys, "render", tmp_path / "wisp", "--spp", 1, "--out", tmp_path / "x.png")
     assert code == 0
     lights = [Model(m).json("lights.json") for m in (made.model.path, tmp_path / "band")]
@@ -179,6 +193,36 @@ def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
     words = ["edit", str(made.model), "--out", str(tmp_path / "bare"), "--roughen", "1.1"]
     assert main(words) == 0
     assert "holds no head" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("fitted")
+def test_an_edited_model_keeps_its_scalps_map_and_tells_of_its_own_material(made, capsys, tmp_path):
+    before = Model(shutil.copytree(made.model.path, tmp_path / "before"))
+    strands, roots = before.strands(), FittedModel.load(before).root_uv
+    known = {"uv": np.zeros((3, 2)), "vertices": np.eye(3), "faces": np.array([[0, 1, 2]])}
+    before.write_arrays("scalp_map.npz", {**known, "roots": roots})
+    write_strands(tmp_path / "few.npz", strands.subset([7, 3]))
+    words = ("edit", before, "--out", tmp_path / "after", "--strands", tmp_path / "few.npz")
+    assert run(capsys, *words, "--roughen", 1.5)[0] == 0
+    after = Model(tmp_path / "after")
+    held = after.arrays("scalp_map.npz")
+    np.testing.assert_allclose(held["roots"], roots[[7, 3]], rtol=1e-6)
+    np.testing.assert_array_equal(held["vertices"], np.eye(3))
+    beta_m = 1.5 * FittedModel.load(before).maps.beta_m
+    page = after.file("index.html").read_text(encoding="utf-8")
+    assert f"β_M {beta_m:.2f}" in page
+    assert "(inverse rendering)." not in page
+    assert after.json("appearance.json")["hair"]["beta_m"] == pytest.approx(beta_m)
+
+
+@pytest.mark.usefixtures("fitted")
+def test_other_strands_in_another_unit_are_told(made, capsys, tmp_path):
+    strands = made.model.strands()
+    for scale, said in ((1, False), (100, True)):
+        write_strands(tmp_path / "s.npz", Strands(scale * strands.points, strands.offsets))
+        out = tmp_path / str(scale)
+        main([*map(str, ("edit", made.model, "--out", out, "--strands", tmp_path / "s.npz"))])
+        assert ("is the file in metres" in capsys.readouterr().err) is said
 
 
 @pytest.mark.usefixtures("fitted")
@@ -242,3 +286,23 @@ def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
     code, found = run(capsys, "render", *asked)
     assert code == 3
     assert said in found["error"]["detail"]
+
+
+@pytest.mark.usefixtures("fitted")
+def test_exports_make_their_folders_and_take_no_place_of_a_models_files(made, capsys, tmp_path):
+    deep = tmp_path / "new" / "folder" / "h.hair"
+    assert run(capsys, "export", made.model, "--to", "hair", "--out", deep)[0] == 0
+    assert len(read_strands(deep)) == 200
+    before = {p: p.read_bytes() for p in made.folder.rglob("*") if p.is_file()}
+    for kind, out in (
+        ("mitsuba", made.capture),  # its head would be in centimetres
+        ("mitsuba", made.model.path),
+        ("hair", made.model.file("strands.hair")),
+        ("usd", made.model.file("strands.usdc")),
+    ):
+        words = ("--to", kind, "--strands", 5, "--out", out)
+        code, found = run(capsys, "export", made.model, *words)
+        assert (code, "choose another folder" in found["error"]["detail"]) == (3, True)
+    assert {p: p.read_bytes() for p in made.folder.rglob("*") if p.is_file()} == before
+    code, found = run(capsys, "edit", made.model, "--cut", 1, "--out", deep)
+    assert (code, "no empty folder" in found["error"]["detail"]) == (3, True)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from urllib.parse import parse_qs, urlsplit
+
 import cv2
 import numpy as np
 import pytest
 
-from reconstruction import Model
+from reconstruction import Model, Strands
 from reconstruction.light_planes.point_cloud import PointCloud
+from stage_service.cli import main
+from stage_service.cli.stage import processes
 from stage_service.viewer.packing import PackedStrands
 
 STRANDS = "/view/models/bristles/strands/model"
@@ -48,6 +53,22 @@ def test_without_the_key_the_page_comes_and_the_model_does_not(http):
     assert http.get("/view/page/../../../etc/passwd", headers=nobody).status_code in (401, 404)
     assert http.get(STRANDS, headers=nobody).status_code == 401
     assert http.get("/view/models", headers=nobody).status_code == 401
+
+
+def test_the_address_holds_whatever_name_a_model_has(tmp_path, monkeypatch, capsys):
+    model = Model(tmp_path / "long hair & 100% #2").create()
+    model.write_strands(Strands.from_list([np.array([[0, 0, 0], [0, 0, 0.1]])]))
+    monkeypatch.setattr(processes, "exit_on_sigterm", lambda: None)
+    assert main(["view", str(model), "--port", "70000"]) == 3
+    assert "from 0 to 65535" in capsys.readouterr().err
+
+    def serve(viewing, access, port, ready):
+        ready("http://127.0.0.1:1")
+
+    monkeypatch.setattr("stage_service.api.app.serve_viewer", serve)
+    assert main(["view", str(model), "--json"]) == 0
+    url = json.loads(capsys.readouterr().out)["url"]
+    assert parse_qs(urlsplit(url).fragment)["model"] == [model.path.name]  # as the page reads it
 
 
 def test_the_page_asks_no_other_host(http):
