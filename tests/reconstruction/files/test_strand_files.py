@@ -428,7 +428,7 @@ def test_usd_axes_units_and_transforms(tmp_path: Path) -> None:
 
 
 def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
-    """Houdini writes the values of frames alone, also of a single one."""
+    """Animations hold the values of frames alone, and none by default."""
     path = tmp_path / "x.usda"
     text = USDA.format(type="linear", widths="[0.02]")
     timed = {
