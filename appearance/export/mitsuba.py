@@ -39,7 +39,7 @@ class View:
 def export_mitsuba(groom: Groom, folder: Path, view: View) -> Path:
     """Write `scene.xml`, its curves, the head and the environment; returns the scene's path.
 
-    Units are centimetres; radiance is ours. A pinhole, the principal point in the image's middle.
+    Units are centimetres; radiance is ours. A pinhole of square pixels.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shapes = []
@@ -127,13 +127,18 @@ def _head(skin: tuple[float, float, float]) -> str:
 
 def _sensor(camera: Camera, spp: int) -> str:
     fov = np.degrees(2 * np.arctan(0.5 * camera.width / camera.K[0, 0]))
+    # of the film's middle from the principal point, in films; our first pixel's middle is (0, 0)
+    aside, below = 0.5 - (camera.K[:2, 2] + 0.5) / (camera.width, camera.height)
     eye = camera.center * SCALE
     vectors = {"origin": eye, "target": eye + camera.R[2], "up": -camera.R[1]}
     look = " ".join(f'{k}="{", ".join(f"{x:.6f}" for x in value)}"' for k, value in vectors.items())
     return (
         f' <sensor type="perspective"><float name="fov" value="{fov:.6f}"/>\n'
-        f'  <string name="fov_axis" value="x"/><transform name="to_world"><lookat {look}/>'
-        f'</transform>\n  <sampler type="independent"><integer name="sample_count" value="{spp}"/>'
+        f'  <string name="fov_axis" value="x"/>\n'
+        f'  <float name="principal_point_offset_x" value="{aside:.9f}"/>'
+        f'<float name="principal_point_offset_y" value="{below:.9f}"/>\n'
+        f'  <transform name="to_world"><lookat {look}/></transform>\n'
+        f'  <sampler type="independent"><integer name="sample_count" value="{spp}"/>'
         f'</sampler>\n  <film type="hdrfilm"><integer name="width" value="{camera.width}"/>'
         f'<integer name="height" value="{camera.height}"/>'
         '<rfilter type="box"/></film></sensor>\n'

@@ -82,6 +82,12 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
         raise StrandFileError(
             f"{where}: {len(widths)} widths for {len(counts)} curves with {len(points)} points"
         )
+    thin = int((~(widths > 0)).sum())
+    if thin:
+        raise StrandFileError(
+            f"{where}: {thin} of {len(widths)} widths are not above 0: give strands a width up to "
+            "their tips"
+        )
     return world.astype(np.float32), counts, (widths / 2).astype(np.float32)
 
 

@@ -51,6 +51,8 @@ def run_geometry(args: argparse.Namespace, output: Output) -> None:
     from reconstruction.evaluation.assessment import assess_strands
     from stage_service.cli.support.tables import assessment_text
 
+    if args.seed < 0:
+        raise BadArgument(f"--seed {args.seed}: expected 0 or more")
     pred, true = read_strands(args.pred), read_strands(args.true)
     if not len(true):
         raise BadArgument(f"{args.true}: no strands to compare with")

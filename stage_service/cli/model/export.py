@@ -80,6 +80,10 @@ def run(args: argparse.Namespace, output: Output) -> None:
     names = ("strands", "guides", "cards", "seed")
     options = parse_options(ExportOptions, {n: getattr(args, n) for n in names}, "export")
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
+    moved = capture.plan.get("import", {}).get("origin") if capture is not None else None
+    if moved is not None:
+        by = ", ".join(f"{x:g}" for x in moved)
+        output.note(f"the capture was moved: add ({by}) m to have all in the world it came from")
     if args.to in STRANDS:
         strands, _ = thinned(model.strands(), options.strands, options.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -92,6 +96,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
                 f"warning: {model} has no fit: its hair goes out in an even brown; "
                 "'hairstage fit CAPTURE MODEL' first measures colour and roughness"
             )
+        if model.has("field.npz"):
+            output.note(f"warning: {model} renders with a field, of which exports know nothing")
         if groom.head is None:
             output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
         files = _write(args, groom, capture)

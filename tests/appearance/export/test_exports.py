@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import subprocess
 import sys
 from dataclasses import replace
 
 import cv2
+import mitsuba as mi
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
@@ -250,6 +252,21 @@ def test_stock_mitsuba_renders_our_picture(which, request, tmp_path):
     np.testing.assert_allclose(stock[seen].mean(axis=0), mean[seen].mean(axis=0), rtol=0.03)
     noise = np.sqrt(((ours[0] - ours[1])[seen] ** 2).mean())
     assert np.sqrt(((stock - mean)[seen] ** 2).mean()) < 1.5 * noise + 0.02 * mean[seen].mean()
+
+
+def test_mitsubas_camera_sees_a_point_where_ours_does(fitted, tmp_path):
+    """Of a calibrated camera, whose principal point is not in the middle of its pictures."""
+    camera = Camera.look_at("c", 64, 48, (0.1, -0.5, 0.1), (0, 0, -0.02), 14)
+    camera = replace(camera, K=camera.K + np.array([[0, 0, 9.0], [0, 0, -5.0], [0, 0, 0]]))
+    groom = Groom.of(fitted, ExportOptions())
+    path = export_mitsuba(groom, tmp_path, View(camera, np.ones((4, 8, 3), np.float32)))
+    sensor = re.search(r"<sensor.*</sensor>", path.read_text(), re.DOTALL)
+    theirs = mi.load_string(f'<scene version="3.0.0">{sensor[0]}</scene>').sensors()[0]
+    for pixel in ([0, 0], [63, 0], [20, 40]):
+        at = mi.Point2f((pixel[0] + 0.5) / 64, (pixel[1] + 0.5) / 48)
+        ray, _ = theirs.sample_ray(0, 0, at, mi.Point2f(0.5))
+        point = np.array(ray(40.0)).ravel() / 100
+        np.testing.assert_allclose(camera.project(point[None])[0][0], pixel, atol=1e-3)
 
 
 def read_glb(path):

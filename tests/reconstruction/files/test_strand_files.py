@@ -428,7 +428,7 @@ def test_usd_axes_units_and_transforms(tmp_path: Path) -> None:
 
 
 def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
-    """Houdini writes the values of frames alone, also of a single one."""
+    """Animations hold the values of frames alone, and none by default."""
     path = tmp_path / "x.usda"
     text = USDA.format(type="linear", widths="[0.02]")
     timed = {
@@ -452,6 +452,7 @@ def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
     [
         ("cubic", "[0.02]", "only linear curves"),
         ("linear", "[0.02, 0.03, 0.04]", "3 widths for 1 curves"),
+        ("linear", "[0.02, 0]", "1 of 2 widths are not above 0: give strands a width up to"),
     ],
 )
 def test_usd_that_cannot_be_read(kind: str, widths: str, words: str, tmp_path: Path) -> None:

@@ -303,6 +303,8 @@ def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_pat
 
     command = "evaluate", "geometry"
     true, out = tmp_path / "true.npz", tmp_path / "out"
+    code, data = run(capsys, *command, true, true, "--seed", -1)
+    assert (code, data["error"]["detail"]) == (3, "--seed -1: expected 0 or more")
     code, data = run(capsys, *command, true, true, "--out", out)
     assert (code, data["warnings"]) == (0, [])
     assert json.loads((out / "report.json").read_text()) == data

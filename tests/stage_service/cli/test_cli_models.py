@@ -15,6 +15,7 @@ import pytest
 from appearance import FittedModel, HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.export.groom import at_points
+from appearance.fields.field import Field
 from appearance.render.coverage import coverage
 from reconstruction import (
     Camera,
@@ -286,6 +287,26 @@ def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
     code, found = run(capsys, "render", *asked)
     assert code == 3
     assert said in found["error"]["detail"]
+
+
+@pytest.mark.usefixtures("fitted")
+def test_exports_tell_of_what_they_do_not_hold(made, capsys, tmp_path, monkeypatch):
+    model = Model(shutil.copytree(made.model.path, tmp_path / "model"))
+    capture = shutil.copytree(made.capture, tmp_path / "moved")
+    plan = json.loads((capture / "plan.json").read_text())
+    plan["import"] = {"notes": [], "origin": [0.5, -2.0, 1.25]}
+    (capture / "plan.json").write_text(json.dumps(plan))
+    words = ["export", str(model), "--to", "maps", "--out", str(tmp_path / "maps")]
+    assert main([*words, "--capture", str(capture)]) == 0
+    said = capsys.readouterr().err
+    assert "add (0.5, -2, 1.25) m" in said
+    assert "field" not in said
+    model.file("field.npz").write_bytes(b"")
+    monkeypatch.setattr(Field, "load", lambda _: None)
+    assert main([*words, "--capture", str(made.capture)]) == 0
+    said = capsys.readouterr().err
+    assert "was moved" not in said
+    assert "renders with a field" in said
 
 
 @pytest.mark.usefixtures("fitted")
