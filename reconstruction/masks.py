@@ -40,6 +40,7 @@ Source = Literal[
 ]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
+OUTLINE = 2e-3  # metres, and a pixel at least, about a head's outline that may be the head's
 _PLACE = 3e-3  # metres: what is so near looks alike
 _SAME_PLACE = 5e-3  # metres: as far apart may two cameras' depths of one place be
 MOST_DISAGREEMENT = 0.15
@@ -200,7 +201,7 @@ class _Geometry:
 class _View:
     """A camera's `subject`, and what is known of each of its pixels `(H, W)`.
 
-    `outside` shows the subject off the head's outline, `standing` and `lying` have points off and
+    `outside` shows the subject `OUTLINE` off the head's, `standing` and `lying` have points off and
     on the head. `looks (4, P)` are those of `hair_features` at the subject's pixels, None where too
     few lights were shot.
     """
@@ -229,8 +230,9 @@ class _View:
         """What `geometry` and the OLAT frames of `capture` say of a camera."""
         outside, covered = np.zeros((2, *subject.shape), bool)
         if geometry.head is not None:
-            covered = np.isfinite(mesh_depth(camera, geometry.head))
-            outside = subject & ~ndimage.binary_dilation(covered)
+            depth = mesh_depth(camera, geometry.head)
+            covered = np.isfinite(depth)
+            outside = subject & ~_beside(covered, camera, depth[covered])
         off, on = geometry.votes(camera)
         standing, lying = subject & (off > on), subject & covered & (on > off)
         seen = looks(capture, camera.name, subject)
@@ -439,6 +441,17 @@ def _samples(head: Mesh, step: float) -> tuple[Array, Array]:
         points.append(np.einsum("kc,fci->fki", weights, corners[of]).reshape(-1, 3))
         faces.append(np.repeat(of, len(weights)))
     return np.concatenate(points), normals[np.concatenate(faces)]
+
+
+def _beside(covered: Bools, camera: Camera, depth: Array) -> Bools:
+    """What a head is or its outline's error may be `(H, W)`, of the pixels that it has `covered`.
+
+    `depth (P,)` of those, metres.
+    """
+    if not covered.any():
+        return covered
+    pixels = max(1.0, OUTLINE * camera.K[0, 0] / float(np.median(depth)))
+    return np.asarray(ndimage.distance_transform_edt(~covered) <= pixels)
 
 
 def _fill(subject: Bools, hair: Bools, skin: Bools) -> Bools:

@@ -33,7 +33,12 @@ from reconstruction.head.capture_head import (
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.images.segmentation import Network
-from reconstruction.light_codes.line_strands import line_strands, merge, roots_first
+from reconstruction.light_codes.line_strands import (
+    SEGMENT_WEIGHT,
+    line_strands,
+    merge,
+    roots_first,
+)
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, sweep_peaks, triangulate
 from reconstruction.masks import MaskedCapture, hair_masks, report_agreement, usable_masks
@@ -101,16 +106,16 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
         head = head or stages.head_under_skin(masked, cloud)
         envelope, depths = stages.envelope(masked, cloud, head.mesh)
         measured = stages.tangents(masked, cloud, depths)
-        seen = stages.surface(measured, cloud)
+        seen, lines = stages.surface(measured, cloud), measured
         if method == "fused":
             more, segments = stages.lines(masked, head, "photometric")
             seen += more
-            measured = merge(measured, segments)
+            lines, measured = merge(measured, segments), merge(measured, segments, SEGMENT_WEIGHT)
         scalp = find_scalp(head.mesh, envelope)
         field = stages.field(envelope, measured, scalp)
         grown = stages.grown(field, scalp, seen)
         grown = stages.refined(grown, measured, cloud)
-        stages.rooted(grown, measured, scalp, head.scalp_map)
+        stages.rooted(grown, lines, scalp, head.scalp_map)
 
 
 def method_for(capture: Capture) -> Method:
@@ -259,15 +264,13 @@ class _Stages:
         with self.report.stage("strands") as stage:
             stage.leave_out("roots", why, "the field and the growth")
             lines = Measured(segments.points, segments.directions, segments.confidence)
-            self._unrooted([*polylines], lines, stage)
+            self._unrooted(Strands.from_list(polylines), lines, stage)
 
-    def _unrooted(self, polylines: list[AnyFloats], measured: Measured, stage: Stage) -> None:
+    def _unrooted(self, strands: Strands, measured: Measured, stage: Stage) -> None:
         """Write strands that have no roots; raises `CaptureError` where there is none."""
-        if not polylines:
+        if not len(strands):
             raise CaptureError("no strand was found: the method 'hull' fills the masks' hull")
-        radius = self._radius(len(polylines))
-        strands = Strands.from_list([p.astype(np.float32) for p in polylines], radius)
-        self._write(strands, measured, stage)
+        self._write(replace(strands, radius=self._radius(len(strands))), measured, stage)
 
     def hull(self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None) -> None:
         """Strands along the smooth field of the hull's surface, pulled by all that is measured.
@@ -282,6 +285,7 @@ class _Stages:
         measured, seen = Measured.none(), list[AnyFloats]()
         if olat:
             measured = self.tangents(masked, cloud, depths)
+        written = measured
         with self.report.stage("line stereo") as stage:
             if not olat:
                 stage.warn("no single lights: nothing is measured, all strands are guessed")
@@ -291,14 +295,15 @@ class _Stages:
             else:
                 try:
                     lines, segments = self.lines(masked, head, "photometric")
-                    seen, measured = list(lines), merge(measured, segments)
+                    seen, written = list(lines), merge(measured, segments)
+                    measured = merge(measured, segments, SEGMENT_WEIGHT)
                 except CaptureError as error:
                     stage.warn(f"line stereo finds nothing: {error}")
         scalp = None if mesh is None else find_scalp(mesh, envelope)
         field = self.field(envelope, with_descent(envelope, measured, mesh), scalp)
         if head is not None and scalp is not None:
             grown = self.refined(self.grown(field, scalp, seen), measured, cloud)
-            self.rooted(grown, measured, scalp, head.scalp_map)
+            self.rooted(grown, written, scalp, head.scalp_map)
             return
         with self.report.stage("strands") as stage:
             coverage, tracing = Coverage(field), Tracing(max_length=o.max_length)
@@ -306,7 +311,12 @@ class _Stages:
                 coverage.add(path)
             within = UNROOTED_DEPTH if o.within is None else o.within
             gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
-            self._unrooted(roots_first([*seen, *gaps], None), measured, stage)
+            short = Strands.from_list([*seen, *gaps]).cut(o.max_length)
+            self._unrooted(
+                Strands.from_list(roots_first([short[i] for i in range(len(short))], None)),
+                written,
+                stage,
+            )
 
     def envelope(
         self, masked: MaskedCapture, cloud: PointCloud, head: Mesh | None
@@ -316,7 +326,15 @@ class _Stages:
         with self.report.stage("envelope") as stage:
             if head is None:
                 return build_hull(masked, grid=o.grid, stage=stage)
-            return build_envelope(masked, cloud, head, grid=o.grid, margin=o.margin, stage=stage)
+            return build_envelope(
+                masked,
+                cloud,
+                head,
+                grid=o.grid,
+                margin=o.margin,
+                stage=stage,
+                longest=o.max_length,
+            )
 
     def tangents(
         self, masked: MaskedCapture, cloud: PointCloud, depths: dict[str, Array]
@@ -397,7 +415,8 @@ class _Stages:
                 raise CaptureError(
                     "no strand could be grown: the envelope does not reach the scalp"
                 )
-            strands = Strands.from_list(result.strands).resampled(SPACING)
+            # traced both ways and led to the scalp, they may be more than twice as long
+            strands = Strands.from_list([*result.strands]).cut(o.max_length).resampled(SPACING)
             stage.figures.update(
                 strands=len(strands),
                 from_roots=len(rooted),
@@ -423,8 +442,10 @@ class _Stages:
         with self.report.stage("refinement") as stage:
             lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
             why = None
-            if not len(cloud) or not len(lines.points):
+            if not len(cloud):
                 why = "without a sweep lines lie on the visual hull, millimetres off"
+            elif not len(lines.points):
+                why = "no line was measured"
             elif not (o.steps or o.worth):
                 why = "the options ask for none"
             if why is not None:

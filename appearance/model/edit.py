@@ -100,7 +100,7 @@ def cut(fitted: FittedModel, length: float) -> FittedModel:
             rotation=_root_part(maps.rotation, kept),
         )
     field = None if fitted.field is None else fitted.field.on_cut(share)
-    return replace(fitted, strands=_cut(strands, length), maps=maps, field=field)
+    return replace(fitted, strands=strands.cut(length), maps=maps, field=field)
 
 
 def restyled(fitted: FittedModel, strands: Strands) -> FittedModel:
@@ -130,26 +130,6 @@ def _covered(along: tuple[float, float], layers: int) -> Array:
     low, high = np.maximum(middle - half, 0), np.minimum(middle + half, 1)
     inside = np.minimum(high, along[1]) - np.maximum(low, along[0])
     return np.maximum(inside, 0) / (high - low)
-
-
-def _cut(strands: Strands, length: float) -> Strands:
-    """Strands that end after `length` metres, the last point interpolated."""
-    points, first = strands.points.astype(float), strands.offsets[:-1]
-    step = np.zeros(len(points))
-    starts = strands.segment_starts
-    step[starts + 1] = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
-    total = np.cumsum(step)
-    arc = total - total[first][strands.strand_of_point]
-    keep = arc - step < length
-    keep[first] = True
-    beyond = np.flatnonzero(keep & (arc > length))
-    share = ((length - arc[beyond - 1]) / step[beyond])[:, None]
-    points[beyond] = points[beyond - 1] * (1 - share) + points[beyond] * share
-    counts = np.bincount(strands.strand_of_point[keep], minlength=len(strands))
-    radius = strands.radius[keep] if isinstance(strands.radius, np.ndarray) else strands.radius
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    confidence = None if strands.confidence is None else strands.confidence[keep]
-    return Strands(points[keep].astype(np.float32), offsets, radius, confidence)
 
 
 def _root_part(table: Array, kept: Array) -> Array:

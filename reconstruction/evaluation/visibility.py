@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from reconstruction.arrays import AnyFloats, Bools, Floats, Ints
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
@@ -57,19 +57,23 @@ class Visibility:
 
 
 class _DepthBuffer:
-    """The nearest depth behind every pixel of a finer image of the part that shows the strands."""
+    """The nearest depth behind every pixel of a finer image of the part that shows the strands.
+
+    It is a pinhole's image: the camera's own lens only says what falls on its picture.
+    """
 
     def __init__(self, camera: Camera, strands: AnyFloats, pixel: float) -> None:
-        self.camera = camera
+        self.lens = camera
+        self.camera = camera = camera.pinhole()
         pixels, depth = camera.project(strands)
         front = depth > 1e-6
         self.scale, self.low, self.shape, self.span = 1.0, np.zeros(2), (1, 1), pixel
         if front.any():
             focal = max(camera.K[0, 0], camera.K[1, 1])
             self.scale = float(np.median(depth[front])) / (focal * pixel)
-            end = np.array([camera.width, camera.height]) - 0.5
-            self.low = np.clip(pixels[front].min(axis=0), -0.5, end)
-            extent = np.clip(pixels[front].max(axis=0), -0.5, end) - self.low
+            first, end = _picture(self.lens, camera)
+            self.low = np.clip(pixels[front].min(axis=0), first, end)
+            extent = np.clip(pixels[front].max(axis=0), first, end) - self.low
             wanted = float(np.prod(extent * self.scale + 2))
             self.scale *= min(1.0, float(np.sqrt(MOST_PIXELS / wanted)))
             width, height = np.ceil(extent * self.scale).astype(int) + 1
@@ -104,7 +108,10 @@ class _DepthBuffer:
         out = np.zeros(len(points), bool)
         (left, top), (right, bottom) = self.image
         for part, x, y, z in self._project(points):
-            seen = (x >= left) & (y >= top) & (x < right) & (y < bottom)
+            if self.lens.distorted:
+                seen = (x > -np.inf) & self.lens.inside(self.lens.project(points[part])[0])
+            else:
+                seen = (x >= left) & (y >= top) & (x < right) & (y < bottom)
             on, flat = self._pixels(x, y)
             seen[on] &= z[on] <= self.depth[flat] + np.float32(tolerance)
             out[part] = seen
@@ -124,3 +131,13 @@ class _DepthBuffer:
         size = np.array(self.shape[::-1])
         over = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) < size).all(axis=1)
         return np.asarray(front & over)
+
+
+def _picture(lens: Camera, pinhole: Camera) -> Array:
+    """First and last column and row `(2, 2)` that the picture through `lens` has in `pinhole`'s."""
+    end = np.array([lens.width, lens.height]) - 0.5
+    if not lens.distorted:
+        return np.stack([np.full(2, -0.5), end])
+    grid = np.stack(np.meshgrid(*(np.linspace(-0.5, e, 17) for e in end)), axis=-1)
+    pixels = pinhole.project(lens.center + lens.rays(grid))[0].reshape(-1, 2)
+    return np.stack([pixels.min(axis=0), pixels.max(axis=0)])

@@ -118,6 +118,25 @@ class Strands:
         moved = self.points.astype(float) @ np.asarray(rotation, float).T + np.asarray(translation)
         return replace(self, points=moved.astype(np.float32))
 
+    def cut(self, length: float) -> Strands:
+        """Strands that end after at most `length` metres, > 0, the last point interpolated."""
+        points, first = self.points.astype(float), self.offsets[:-1]
+        step = np.zeros(len(points))
+        starts = self.segment_starts
+        step[starts + 1] = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
+        total = np.cumsum(step)
+        arc = total - total[first][self.strand_of_point]
+        keep = arc - step < length
+        keep[first] = True
+        beyond = np.flatnonzero(keep & (arc > length))
+        share = ((length - arc[beyond - 1]) / step[beyond])[:, None]
+        points[beyond] = points[beyond - 1] * (1 - share) + points[beyond] * share
+        counts = np.bincount(self.strand_of_point[keep], minlength=len(self))
+        radius = self.radius[keep] if isinstance(self.radius, np.ndarray) else self.radius
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        confidence = None if self.confidence is None else self.confidence[keep]
+        return Strands(points[keep].astype(np.float32), offsets, radius, confidence)
+
     def resampled(self, step: float) -> Strands:
         """Every strand resampled at equal arc lengths of about `step` metres, ends kept.
 

@@ -15,7 +15,8 @@ from reconstruction.growth.field import OrientationField
 Method = Literal["euler", "midpoint", "rk4"]
 
 _LIFT = 12e-3  # metres that a root is lifted by, at most, to where there is hair
-_SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3  # metres: shorter strands are not kept
+_SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3
+"""Metres under which strands are not kept; half of `Tracing.max_length` where that is less."""
 
 _ROUNDS = 120
 
@@ -101,7 +102,8 @@ def grow_from_roots(
 
     A root whose envelope stays clear of the skin is led to it along the normal, by at most 12 mm.
     Photobooth §3.4 ends a strand at the last measured voxel that it passes; here they go on, since
-    what a strand passes inside the envelope is hair as well. Those shorter than 5 mm are not kept.
+    what a strand passes inside the envelope is hair as well. Those shorter than 5 mm are not kept,
+    nor of shorter hair those under half of `max_length`.
 
     Two thousand strands at a time on `threads` (one per core where None), so that memory grows with
     what is kept alone; the strands do not depend on it.
@@ -109,6 +111,7 @@ def grow_from_roots(
     at: Array = np.asarray(roots, np.float64)
     step = tracing.step
     out_of: Array = np.asarray(normals, np.float64)
+    shortest = min(_SHORTEST_FROM_ROOT, tracing.max_length / 2)
 
     def some(first: int) -> list[Floats]:
         these = slice(first, first + _TOGETHER)
@@ -123,7 +126,7 @@ def grow_from_roots(
         traced = trace(field, starts[which], n[which], tracing)
         out = []
         for root, path in zip(p[which].astype(np.float32), traced, strict=True):
-            if (len(path) - 1) * step < _SHORTEST_FROM_ROOT:
+            if (len(path) - 1) * step < shortest:
                 continue
             near = np.linalg.norm(root - path[0]) < step
             out.append(path.copy() if near else np.vstack([root[None], path]))
@@ -147,8 +150,9 @@ class Coverage:
         self.covered[n[n >= 0]] = True
 
     def share(self) -> float:
-        """Of the voxels with an orientation."""
-        return float(self.covered[self.field.valid].mean())
+        """Of the voxels with an orientation; 0 where there is none."""
+        valid = self.field.valid
+        return float(self.covered[valid].sum() / max(int(valid.sum()), 1))
 
     def gaps(self) -> Ints:
         """Numbers `(G,)` of the voxels with an orientation and no strand."""
@@ -170,12 +174,13 @@ def fill_gaps(
     strands that meet nothing measured, and the volume between hair and face has no hair. None takes
     3 mm, or two voxels where those are more. Each round starts from at most `batch` of the
     remaining gaps, so that strands of one round cover the seeds of the next. Paths shorter than
-    10 mm are not kept.
+    10 mm, or than half of `max_length`, are not kept.
     """
     rng = np.random.default_rng(seed)
     out: list[Floats] = []
     spent = ~field.near_measured(max(3e-3, 2 * field.grid.spacing) if within is None else within)
     centers = field.grid.centers()
+    shortest = min(_SHORTEST_THROUGH_GAP, tracing.max_length / 2)
     for _ in range(_ROUNDS):
         gaps = coverage.gaps()
         gaps = gaps[~spent[gaps]]
@@ -188,7 +193,7 @@ def fill_gaps(
         paths = trace(field, np.tile(starts, (2, 1)), np.vstack([d, -d]), tracing)
         for a, b in zip(paths[: len(chosen)], paths[len(chosen) :], strict=True):
             path = np.concatenate([b[:0:-1], a])
-            if (len(path) - 1) * tracing.step >= _SHORTEST_THROUGH_GAP:
+            if (len(path) - 1) * tracing.step >= shortest:
                 out.append(path)
                 coverage.add(path)
     return out

@@ -11,14 +11,20 @@ from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.mesh_queries import depth_map, inside_mesh, mesh_depth
+from reconstruction.geometry.mesh_queries import (
+    depth_map,
+    inside_mesh,
+    mesh_depth,
+    mesh_silhouette,
+)
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.images.visual_hull import space_carve, visual_hull
+from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 
 _BARE = 2e-3  # metres behind the head's surface up to which a pixel of skin rules hair out
+_ACROSS = 128  # voxels along the edge of the box in which hair is looked for
 
 
 def build_envelope(
@@ -29,10 +35,12 @@ def build_envelope(
     grid: float,
     margin: float,
     stage: Stage,
+    longest: float = 0.3,
 ) -> tuple[VoxelGrid, dict[str, Array]]:
     """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels.
 
-    `grid` is the voxels' edge, `margin` how far in front of the seen surface hair may be, metres.
+    `grid` is the voxels' edge, `margin` how far in front of the seen surface hair may be, and
+    `longest` how long it is, metres.
 
     The visual hull of everything that is not background, less the head's inside, less what a
     camera saw through: voxels in front of a triangulated hair pixel, or on the head and in front of
@@ -41,7 +49,7 @@ def build_envelope(
     and their depth is where the ray enters the envelope.
     """
     masks, cameras = masked.masks, masked.cameras
-    bounds = _bounds(cloud, head)
+    bounds = _bounds(masked, cloud, head, longest)
     hull = visual_hull(
         cameras, {k: m.subject for k, m in masks.items()}, spacing=grid, bounds=bounds
     )
@@ -131,11 +139,27 @@ def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
     return np.where(np.isfinite(out), out, 0.0)
 
 
-def _bounds(cloud: PointCloud, head: Mesh) -> Array:
-    """A box `(2, 3)` that holds the hair: the points', or 12 cm about the head's upper part."""
+def _bounds(masked: MaskedCapture, cloud: PointCloud, head: Mesh, longest: float) -> Array:
+    """A box `(2, 3)` that holds the hair: the points', or 12 cm about the head's upper part.
+
+    Without points also what the hull of hair and head has within `longest` metres of that part.
+    """
     if len(cloud) >= 100:
         low, high = np.percentile(cloud.points, [0.1, 99.9], axis=0)
         return np.stack([low - 0.015, high + 0.015])
     top = head.vertices[:, 2].max()
     upper = head.vertices[head.vertices[:, 2] > top - 0.25]
-    return np.stack([upper.min(axis=0) - 0.12, upper.max(axis=0) + 0.12])
+    low, high = upper.min(axis=0), upper.max(axis=0)
+    reach = np.stack([low - longest, high + longest])
+    hair = {c.name: masked.masks[c.name].hair for c in masked.cameras}
+    both = {
+        c.name: trim_edges(hair[c.name] | mesh_silhouette(c, head), hair[c.name])
+        for c in masked.cameras
+    }
+    both = {name: mask for name, mask in both.items() if mask.any()}
+    edge = float(np.ptp(reach, axis=0).max()) / _ACROSS
+    there = visual_hull(masked.cameras, both, spacing=edge, bounds=reach).centers()
+    box = [low - 0.12, high + 0.12]
+    return np.stack(
+        [np.vstack([box, there - edge]).min(axis=0), np.vstack([box, there + edge]).max(axis=0)]
+    )

@@ -71,9 +71,15 @@ def refine(
     """Drop the strands that explain nothing new and move the others onto the measured lines.
 
     Also returns JSON-ready figures on what became of them. At least one line must be measured.
+    Raises `ValueError` where no strand is worth enough to stay.
     """
     lines = Lines(measured)
     kept = worthwhile(strands, lines, options.worth)
+    if not kept.any():
+        raise ValueError(
+            f"no strand adds refine.worth {options.worth:g} a millimetre to the others: take less; "
+            "0 keeps every strand"
+        )
     start = out = strands.subset(kept)
     for _ in range(options.steps):
         out = gauss_newton_step(out, start, lines)

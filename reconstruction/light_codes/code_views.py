@@ -88,17 +88,21 @@ def views_of(
 
     Lights are weighed so that each gives the same irradiance at `subject (3,)`, metres. Reports how
     many lights vary, thresholds, and which cameras no light stands beside. Raises `CaptureError`
-    without single-light frames, or where fewer than two cameras see hair.
+    without single-light frames, or where fewer than two cameras see hair under them.
     """
     stage = stage or Stage("lightcodes")
     names = capture.olat_lights()
     if not names:
         raise CaptureError(f"{capture.path}: no OLAT frames, which lines and lightcodes come from")
     cameras = [c for c in capture.rig.cameras if c.name in hair and hair[c.name].any()]
+    unlit = [c.name for c in cameras if not any(capture.has_light(n, c.name) for n in names)]
+    if unlit:
+        stage.warn(f"{', '.join(unlit)}: no frame of a single light; left out of line stereo")
+        cameras = [c for c in cameras if c.name not in unlit]
     if len(cameras) < 2:
         raise CaptureError(
             f"{capture.path}: hair is on the masks of {[c.name for c in cameras]}: line stereo "
-            "needs two cameras that see it; check the masks"
+            "needs two cameras that see it under single lights; check the masks"
         )
     views = []
     for done, camera in enumerate(cameras):
@@ -142,8 +146,6 @@ def _view(
     images = np.zeros((len(names), camera.height, camera.width), np.float32)
     clipped = np.zeros(images.shape, bool)
     shot = np.array([capture.has_light(n, camera.name) for n in names])
-    if not shot.any():
-        raise CaptureError(f"{capture.path}: {camera.name} has no frame of a single light")
     for i, (name, light) in enumerate(zip(names, lights, strict=True)):
         if not shot[i]:
             continue

@@ -168,12 +168,12 @@ def line_strands(
     return roots_first([*connect_segments(views, segments, report)], head), segments
 
 
-def merge(measured: Measured, segments: Segments) -> Measured:
-    """The measurements of both methods; segments count `SEGMENT_WEIGHT` times their confidence."""
+def merge(measured: Measured, segments: Segments, weight: float = 1.0) -> Measured:
+    """The measurements of both methods; segments count `weight` times their confidence."""
     return Measured(
         np.concatenate([measured.points, segments.points]),
         np.concatenate([measured.directions, segments.directions]),
-        np.concatenate([measured.confidence, SEGMENT_WEIGHT * segments.confidence]),
+        np.concatenate([measured.confidence, weight * segments.confidence]),
     )
 
 

@@ -449,3 +449,16 @@ def test_one_class_is_not_split() -> None:
     assert apart == pytest.approx(8, abs=0.2)
     assert otsu(np.r_[np.zeros(50), np.ones(50)])[0] == 0
     assert otsu(np.ones(5)) == (np.inf, 0.0)
+
+
+@pytest.mark.parametrize("size", [64, 400])
+def test_finer_pictures_do_not_take_the_rim_of_a_head_that_is_too_small_for_hair(
+    shoot: Callable[..., Capture], stage_camera: Callable[..., Camera], size: int
+) -> None:
+    """A millimetre too small, which is four pixels of the finer camera."""
+    camera = stage_camera("c", -40, size=size)
+    capture = shoot(cameras=[camera], lights=LIGHTS[::3], extra=hairy, sweep=False, samples=1)
+    mask = hair_masks(capture, head=ball(0.99 * RADIUS, n=64))["c"]
+    subject, hair = upper(camera)
+    assert mask.hair[hair].mean() > 0.7
+    assert mask.hair[subject & ~hair].mean() < 0.02

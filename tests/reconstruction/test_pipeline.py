@@ -29,6 +29,7 @@ from reconstruction import (
 )
 from reconstruction.estimate import estimate
 from reconstruction.geometry.lights import dome_positions
+from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import PointCloud
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.tangents.estimate import Measured, light_groups, thinned
@@ -353,3 +354,29 @@ def test_light_groups_are_neighbours() -> None:
 def test_thinning_keeps_the_mean_of_a_cell() -> None:
     points = np.array([[1e-4, 0, 0], [3e-4, 0, 0], [5e-3, 0, 0]])
     np.testing.assert_allclose(thinned(points, 1e-3), [[2e-4, 0, 0], [5e-3, 0, 0]])
+
+
+def test_no_strand_is_longer_than_the_hair(model: tuple[Path, Report]) -> None:
+    """Gaps are filled both ways, and what is found there is led to the scalp as well."""
+    lengths = read_strands(model[0] / "strands.npz").lengths()
+    assert lengths.max() < 0.2 + 1e-4
+    assert lengths.max() > 0.19  # a ball of 10 cm has meridians of 31 cm
+
+
+def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
+    unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fibres along the equator that line stereo saw, where texture says that hair runs down."""
+    around = np.linspace(0, 2 * np.pi, 400)
+    line = 0.101 * np.stack([np.cos(around), np.sin(around), 0 * around], axis=1)
+    along = np.stack([-np.sin(around), np.cos(around), 0 * around], axis=1)
+    ones = np.ones(len(line), np.int64)
+    segments = Segments(line, along, np.full(len(line), 0.2), 0 * ones, 3 * ones)
+    monkeypatch.setattr("reconstruction.pipeline.line_strands", lambda *_, **__: ([line], segments))
+    monkeypatch.setattr("reconstruction.pipeline.FINE_PIXEL", 1.0)
+    reconstruct(unswept, Model(tmp_path), method="hull", options=replace(COARSE, max_length=0.7))
+    strands = read_strands(tmp_path / "strands.npz")
+    on = (np.abs(strands.points[:, 2]) < 1e-5) & (np.abs(strands.tangents()[:, 2]) < 1e-3)
+    assert on.sum() > 100
+    assert strands.confidence is not None
+    assert np.median(strands.confidence[on]) == pytest.approx(0.2, abs=0.03)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -279,3 +280,19 @@ print(f, time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).r
     print(f"F {f:.3f}, {seconds:.0f} s of processor time, {kilobytes / 1e6:.2f} GB")
     assert 0.3 < f < 1
     assert kilobytes < 512_000
+
+
+@pytest.mark.parametrize("k1", [-0.25, 0.25])
+def test_what_a_lens_brings_into_the_picture_is_seen_and_hides(k1: float) -> None:
+    """A plane of short strands, some of it off the picture, and a second one behind it."""
+    pinhole = Camera.look_at("lens", 200, 200, [0, -0.5, 0], [0, 0, 0], 60)
+    lens = replace(pinhole, distortion=np.array([k1, 0.05 if k1 < 0 else 0.0]))
+    places = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 41), 0.0, np.linspace(-0.4, 0.4, 41)), -1)
+    points = places.reshape(-1, 3)
+    ends = points[:, None] + np.array([[0, 0, -1e-3], [0, 0, 1e-3]])
+    plane = Strands.from_list([*ends], 5e-4)
+    visible, on_picture = Visibility([lens], plane), lens.inside(lens.project(points)[0])
+    assert on_picture.sum() != pinhole.inside(pinhole.project(points)[0]).sum()
+    np.testing.assert_array_equal(visible(points), on_picture)
+    behind = lens.center + 1.01 * (points - lens.center)
+    assert not visible(behind[on_picture]).any()

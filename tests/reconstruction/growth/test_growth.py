@@ -227,3 +227,16 @@ def test_a_neighbour_across_the_way_is_no_way_to_the_root() -> None:
     rooted = [line((-0.02, 0, 0.05), (0.02, 0, 0.05))]
     loose = [line((0, 0, 0.052), (0, 0, 0.10))]
     assert root_all(rooted, loose, flat_scalp()).dropped == 1
+
+
+def test_hair_shorter_than_the_shortest_that_is_kept_elsewhere_grows() -> None:
+    field = analytic(up, (9, 9, 21))
+    low, short = field.grid.origin, Tracing(max_length=4e-3)
+    (strand,) = grow_from_roots(field, low[None], np.array([[0, 0, 1.0]]), short)
+    assert strand[-1, 2] - strand[0, 2] == pytest.approx(4e-3, abs=1e-4)
+    assert fill_gaps(field, Coverage(field), short, seed=4)
+
+
+def test_where_nothing_has_an_orientation_nothing_is_covered() -> None:
+    field = dataclasses.replace(analytic(up, (3, 3, 3)), degenerate=np.ones(27, bool))
+    assert Coverage(field).share() == 0

@@ -137,3 +137,8 @@ def test_confidence_is_that_of_the_line_that_agrees_best_and_0_far_from_all() ->
     np.testing.assert_allclose(confidence[[10, 20, 30]], 0.8 * np.exp([0, -0.5, -0.5]), rtol=1e-4)
     assert not confidence[35:].any()
     assert not supported(straight, Measured.none()).any()
+
+
+def test_asking_more_of_strands_than_any_has_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"no strand adds refine\.worth 1 a millimetre"):
+        refine(strands(1, 0.0), lines(0.0, 0.0), RefineOptions(worth=1.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -140,3 +141,18 @@ def test_a_hull_is_cut_to_a_ball_and_its_grid_with_it() -> None:
     assert distance.max() <= radius
     assert len(distance) == (np.linalg.norm(hull.centers() - center, axis=1) <= radius).sum()
     assert not Ball((1.0, 0.0, 0.0), 0.02).within(hull, 0.0).inside.any()
+
+
+def test_a_camera_without_frames_of_single_lights_is_left_out_of_line_stereo(
+    fibres: Any, tmp_path: Path
+) -> None:
+    path = fibres.shoot(tmp_path / "capture").path
+    name, journal = fibres.cameras[0].name, path / "journal.jsonl"
+    records = [json.loads(line) for line in journal.read_text().splitlines()]
+    lost = {"file": None, "reason": "dropped"}
+    records = [r | lost if r.get("camera") == name else r for r in records]
+    journal.write_text("".join(json.dumps(r) + "\n" for r in records))
+    report = run(Capture(path), tmp_path / "model")
+    assert any(w.startswith(f"{name}: no frame") for w in report["lightcodes"].warnings)
+    strands = read_strands(tmp_path / "model" / "strands.npz")
+    assert compare_strands(strands, fibres.strands, samples=None)["all"]["2mm_20deg"]["f"] > 0.5
