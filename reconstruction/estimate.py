@@ -269,7 +269,12 @@ class _Probe:
         images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * count + 60)
         views = 0.7 + 0.3 * len(self.cameras)  # that see a point
         scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
-        add("orientation", measured, table, max(images + observed, 12 * scores + observed) / GB)
+        add(
+            "orientation",
+            measured,
+            table,
+            max(images + observed, (6 if reads else 3) * scores + observed) / GB,
+        )
 
     def _line_stereo(self, add: Callable[[str, float, float, float], None]) -> None:
         cameras, lights, hair = len(self.cameras), self.lights, self.hair

@@ -20,6 +20,8 @@ NEARLY_PARALLEL = 0.1
 FINER = 8
 """Angles at which support is looked up between two of the bank: 0.9 degrees for 24 filters."""
 
+_ROWS = 20_000  # of scores that are made or decided at once: they take several times their memory
+
 
 def half_sphere(count: int) -> Array:
     """`count` nearly evenly spaced unit vectors `(N, 3)` of the half sphere z >= 0."""
@@ -52,6 +54,10 @@ class LineEvidence:
         pixels, _ = camera.project(points[index])
         x, y = np.rint(pixels).astype(int).T
         return cls(camera, index, pixels, support[:, y, x].T)
+
+    def part(self, which: slice) -> LineEvidence:
+        """What it says at some of its points."""
+        return LineEvidence(self.camera, self.index[which], self.pixels[which], self.support[which])
 
 
 def line_support(responses: AnyFloats) -> Floats:
@@ -93,6 +99,12 @@ def line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
     its angle to the viewing ray: a line along the ray is a dot that no texture speaks about.
     Between the bank's angles support runs as its Fourier series does.
     """
+    parts = range(0, len(evidence.index), _ROWS)
+    scored = [_line_scores(evidence.part(slice(k, k + _ROWS)), candidates) for k in parts]
+    return np.concatenate(scored or [np.zeros((0, len(candidates)), np.float32)])
+
+
+def _line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
     camera = evidence.camera
     rays = camera.rays(evidence.pixels)
     # The projection of direction t at a pixel: the image velocity of X + s t, up to its length.
@@ -152,7 +164,14 @@ def decide(scores: AnyFloats, candidates: Array) -> Tangents:
         raise ValueError(f"scores must be (N, {len(candidates)}), got {scores.shape}")
     if not len(scores):
         return Tangents(np.zeros((0, 3)), np.zeros(0))
-    spread = float(np.median(scores.std(axis=1))) + 1e-12
+    parts = np.array_split(scores, -(-len(scores) // _ROWS))
+    spread = float(np.median(np.concatenate([part.std(axis=1) for part in parts]))) + 1e-12
+    decided = [_decided(part, candidates, spread) for part in parts]
+    return Tangents(*(np.concatenate(x) for x in zip(*decided, strict=True)))
+
+
+def _decided(scores: AnyFloats, candidates: Array, spread: float) -> tuple[Array, Array]:
+    """Directions `(N, 3)` and confidences `(N,)` of some rows."""
     weights = np.exp(6.0 * (scores - scores.max(axis=1, keepdims=True)) / spread / 3)
     pair = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     basis = np.stack([candidates[:, i] * candidates[:, j] for i, j in pair], axis=1)
@@ -165,7 +184,7 @@ def decide(scores: AnyFloats, candidates: Array) -> Tangents:
     direction = vectors[:, :, 2]
     direction *= np.where((direction * best).sum(axis=1) < 0, -1, 1)[:, None]
     flat = np.ptp(scores, axis=1) <= 0
-    return Tangents(direction, np.where(flat, 0.0, np.clip(confidence, 0, 1)))
+    return direction, np.where(flat, 0.0, np.clip(confidence, 0, 1))
 
 
 def _full(tensors: AnyFloats) -> Array:

@@ -43,7 +43,7 @@ SHOWN = {
     "comparison.png": "Frames that no fit has seen: captured, rendered, and the baselines.",
     "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
     "render.png": "What hairstage render drew last.",
-    "plots/geometry.png": "Strands against the true ones, beside baselines and turned as the truth is.",
+    "plots/geometry.png": "Strands against the true ones, beside baselines and true directions.",
 }
 
 

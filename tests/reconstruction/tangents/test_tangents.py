@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -242,3 +244,21 @@ def test_observations_undo_distance_and_intensity() -> None:
 
 def test_a_flat_table_has_no_contrast() -> None:
     assert Reflection(np.ones(8), np.ones(72)).contrast == pytest.approx(1)
+
+
+def test_scores_are_made_and_decided_without_many_times_their_memory() -> None:
+    """Of 20 megapixels there are half a million points: 1 GB of scores, 10 GB beside them."""
+    rng = np.random.default_rng(0)
+    points, candidates = rng.normal(size=(80_000, 3)) * 0.01, half_sphere(100)
+    camera = Camera.look_at("c", 64, 64, (0, -1, 0), (0, 0, 0), 10.0)
+    support = rng.random((24, 64, 64), np.float32)
+    evidence = LineEvidence.of(camera, support, points, np.ones(len(points), bool))
+    tracemalloc.start()
+    scores = line_scores(evidence, candidates)
+    of_making = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    decide(scores, candidates)
+    of_deciding = tracemalloc.get_traced_memory()[1] - scores.nbytes
+    tracemalloc.stop()
+    assert of_making < 5 * scores.nbytes
+    assert of_deciding < 2 * scores.nbytes
