@@ -64,7 +64,7 @@ def test_white_hair(tufted):
     """What is left of its light after a crossing; the roughness of a lobe that all light makes."""
     truth = replace(tufted.truth, sigma_a=(0.001, 0.002, 0.008))
     problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
-    quiet = replace(EFFORT, pixels=60)
+    quiet = replace(EFFORT, pixels=60, spp=4 * EFFORT.spp)
     _, _, maps, _, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3), effort=quiet)
     left = np.exp(-2 * maps.sigma_a[0, 0, 0])
     assert left == pytest.approx(np.exp(-2 * np.array(truth.sigma_a)), abs=0.04)
