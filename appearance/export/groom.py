@@ -147,7 +147,9 @@ def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     shape = shapes(strands).reshape(len(strands), -1)
     start = np.random.default_rng(seed).choice(len(shape), min(count, len(shape)), replace=False)
-    with warnings.catch_warnings(action="ignore"):  # strands alike leave clusters empty
+    with warnings.catch_warnings():
+        # strands that are alike leave some: they are guides of no strand, and go below
+        warnings.filterwarnings("ignore", "One of the clusters is empty", UserWarning)
         centres, _ = kmeans2(shape, shape[np.sort(start)], iter=8, minit="matrix", missing="warn")
     _, guides = cKDTree(shape).query(centres)
     guides = np.unique(guides)

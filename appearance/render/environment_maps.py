@@ -35,8 +35,7 @@ def load_environment(path: str | Path) -> Floats:
 
 def check_environment(envmap: AnyFloats, name: str) -> Floats:
     """`envmap` as float32; `ValueError` unless `(h, w, 3)` and in [0, `BRIGHTEST`]."""
-    with np.errstate(over="ignore"):  # told below
-        image = np.asarray(envmap, np.float32)
+    image = np.asarray(envmap)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"{name}: expected a map of shape (h, w, 3), got {image.shape}")
     wrong = ~((image >= 0) & (image <= BRIGHTEST))
@@ -47,7 +46,7 @@ def check_environment(envmap: AnyFloats, name: str) -> Floats:
             f"{int(wrong.sum())} values are not, the first at row {row}, column {column}: "
             f"{image[row, column, channel]}"
         )
-    return image
+    return np.asarray(image, np.float32)
 
 
 def studio(height: int = 128) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -262,3 +263,14 @@ def test_scores_are_made_and_decided_without_many_times_their_memory() -> None:
     tracemalloc.stop()
     assert of_making < 5 * scores.nbytes
     assert of_deciding < 2 * scores.nbytes
+
+
+def test_views_that_see_noise_do_not_outvote_one_that_sees_the_highlight() -> None:
+    points, truth, (view, *_) = turning_patch()
+    table = Reflection.learn([view], truth, np.ones(len(points), bool))
+    rng, candidates = np.random.default_rng(5), half_sphere(800)
+    noise = [rng.uniform(0, 2, view.response.shape).astype(np.float32) for _ in range(4)]
+    views = [view, *(replace(view, response=n) for n in noise)]
+    scores = np.sum([table.scores(o, points, candidates) for o in views], axis=0)
+    error = degrees_between(decide(scores, candidates).directions, truth)
+    assert np.median(error) < 2.5
