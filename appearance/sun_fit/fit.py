@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import count as count_from
 
 import numpy as np
 
@@ -21,10 +22,14 @@ from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
 from appearance.sun_fit.light_correlation import (
+    BESIDE,
     WINDOW,
+    Highlight,
     Highlights,
     Roughness,
+    beside,
     disordered,
+    match_disorder,
     match_roughness,
 )
 from appearance.sun_fit.mirror_samples import (
@@ -49,7 +54,7 @@ from appearance.sun_fit.roughness_and_colour import (
 )
 from appearance.sun_fit.visible_fibres import VisibleFibres, visible_fibres
 from reconstruction import Capture, Model, Progress, Report, Stage, silent
-from reconstruction.arrays import Array, Floats
+from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.report.report import Series
 
 MAX_DEPTH = 16
@@ -59,8 +64,10 @@ ROUGHNESSES = (0.04, 0.12, 0.3, 0.6, 0.95)
 """β_M of the first renderings; nothing outside is found."""
 NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
 """Those that follow, as factors on the answer of the first."""
+DISORDERS = (0.0, 6.0, 12.0, 18.0, 24.0)
+"""Degrees by which rendered strands are turned; by no more than the last."""
 DISORDER = 1.6
-"""Turn of single strands over the error of a pixel's mean inclination.
+"""Turn of single strands over the error of a pixel's mean inclination, where nothing tells it.
 
 √2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
@@ -158,13 +165,13 @@ def _observed(
         mask = model.mask(name, "hair", training)
         bare = model.mask(name, "skin", training) & ~mask
         seen += int(mask.sum())
-        wanted = chosen(mask, options.hair_pixels, rng)
-        beside = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
-        both = observe(training, name, lights, np.concatenate([wanted, beside]))
+        wanted = _with_those_beside(chosen(mask, options.hair_pixels, rng), mask)
+        uncovered = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
+        both = observe(training, name, lights, np.concatenate([wanted, uncovered]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
         if len(wanted):
             hair.append(both.where(is_hair))
-        if len(beside) >= 10:
+        if len(uncovered) >= 10:
             skin.append(both.where(~is_hair))
         if missing := int((~both.valid.any(axis=1)).sum()):
             stage.warn(f"{name}: {missing} of {len(lights)} lights have no usable frame")
@@ -184,6 +191,30 @@ def _observed(
             f"{1 - kept / seen:.0%} of the renderings",
         )
     return FitPixels(hair, skin)
+
+
+def _matched(observed: Observed) -> Bools:
+    """Which pixels' highlights are matched `(P,)`: pairs beside each other, then others."""
+    keep = np.zeros(len(observed.pixels), bool)
+    pairs = beside(observed)
+    keep[_some(pairs, ROUGHNESS_PIXELS // 2)] = True
+    keep[_some(np.flatnonzero(~keep), ROUGHNESS_PIXELS - int(keep.sum()))] = True
+    return keep
+
+
+def _some(rows: Ints, most: int) -> Ints:
+    """`most` of the rows `(N, ...)`, evenly spread."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]
+
+
+def _with_those_beside(pixels: Ints, mask: Bools) -> Ints:
+    """`pixels (P,)` and, of as many as are matched, those of the mask that lie beside them."""
+    width = mask.shape[1]
+    few = pixels[:: max(1, len(pixels) // ROUGHNESS_PIXELS)]
+    right = few[::2][few[::2] % width + BESIDE < width] + BESIDE
+    below = few[1::2] + BESIDE * width
+    added = np.concatenate([right, below[below < mask.size]])
+    return np.union1d(pixels, added[mask.ravel()[added]])
 
 
 def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
@@ -253,26 +284,31 @@ class SunFit:
         captured = highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in views])
         series = Series("roughness", "standard error of log β_M")
         stage.series.append(series)
-        rendered: dict[float, list[Floats]] = {}
+        runs = count_from(1)
+
+        def rendered(scene: HairScene, beta: float) -> Highlight:
+            number = next(runs)
+            self.progress("matching the highlight", 0.5 + number / 80)
+            lit = scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
+            return highlights.of([self._halves(lit, o, number) for o, _ in views])
 
         def matched(scene: HairScene, roughnesses: Iterable[float]) -> Roughness:
-            rendered.clear()
-            for beta in roughnesses:
-                hair, number = replace(first.hair, beta_m=beta), len(series.points) * 16
-                self.progress("matching the highlight", 0.5 + (number + len(rendered)) / 200)
-                lit = scene.with_hair(hair).with_skin(first.skin)
-                rendered[beta] = [self._halves(lit, o, number + len(rendered)) for o, _ in views]
-            family = [(beta, highlights.of(rendered[beta])) for beta in rendered]
+            family[:] = [(beta, rendered(scene, beta)) for beta in roughnesses]
             found = match_roughness(captured, family)
             series.points.append((time.perf_counter() - start, found.error))
             return found
 
-        about = matched(self.scene, ROUGHNESSES)
-        scene, off = self.scene, DISORDER * np.radians(about.tangents_deg)
-        if self.disordered is not None and off > 0:
-            scene = self.disordered(float(off))
+        family: list[tuple[float, Highlight]] = []
+        about, scene, disorder = matched(self.scene, ROUGHNESSES), self.scene, None
+        if self.disordered is not None:
+            turned = {d: self.disordered(float(np.radians(d))) for d in DISORDERS}
+            disorder = match_disorder(
+                captured, [(d, rendered(scene, about.beta_m)) for d, scene in turned.items()]
+            )
+            off = DISORDER * about.tangents_deg if disorder is None else disorder.degrees
+            scene = self.disordered(float(np.radians(off)))
         nearer = np.clip(np.array(NEARER) * about.beta_m, ROUGHNESSES[0], ROUGHNESSES[-1])
-        found = matched(scene, np.unique(nearer).tolist()).after(about)
+        found = matched(scene, np.unique(nearer).tolist()).after(about, disorder)
         stage.figures |= {
             "samples": count,
             "pairs_of_lights": int(captured.pairs.sum()),
@@ -288,8 +324,7 @@ class SunFit:
             "views": list(found.views),
             "correlation_deg": float(np.degrees(captured.angle())),
             "rendered_correlation_deg": [
-                [beta, float(np.degrees(highlights.of(rendered[beta]).angle()))]
-                for beta in rendered
+                [beta, float(np.degrees(highlight.angle()))] for beta, highlight in family
             ],
         }
         for warning in found.warnings():
@@ -351,9 +386,9 @@ class SunFit:
         out = []
         for o in hair:
             fibres = visible_fibres(self.scene, o.camera, o.pixels, seed=self.seed)
-            found = np.flatnonzero(usable(fibres))
-            few = np.linspace(0, len(found) - 1, min(len(found), ROUGHNESS_PIXELS)).astype(int)
-            keep = np.isin(np.arange(len(o.pixels)), found[few])
+            fit = usable(fibres)
+            o, fibres = o.where(fit), fibres.where(fit)
+            keep = _matched(o)
             o, fibres = o.where(keep), fibres.where(keep)
             near = mirror_lights(o, fibres, tilt_deg=self._tilt, window=WINDOW)
             out.append((o.under(near), fibres))

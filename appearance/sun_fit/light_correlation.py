@@ -8,8 +8,10 @@ far enough, the profile decides, with the spread of its shifts as an unknown. Re
 roughness are measured in the same way; the roughness is where theirs meet the capture's.
 
 Reconstructed strands are smoother than hair: a pixel of theirs mixes fewer directions, which the
-products do see. The renderings are of strands that are `disordered` by as much as the profile says
-that tangents are off.
+products do see. By how much is told by pixels that lie beside each other: how much less the product
+of their answers falls with the angle than that of one pixel's (`Highlight.likeness`) hardly depends
+on the roughness, but falls with every turn of single strands. The renderings are of strands that
+are `disordered` until their likeness is the capture's (`match_disorder`).
 """
 
 from __future__ import annotations
@@ -33,6 +35,11 @@ WINDOW = np.pi / 3
 """How far from the mirror direction lights are taken, both ways."""
 EDGES = np.radians([0, 8, 16, 24, 32, 40, 50, 60, 75, 90, 120])
 """Bins of |θ_i − θ_i'| of two lights."""
+BESIDE = 3
+"""Pixels that two pixels lie apart, in a row or a column, whose likeness is asked for.
+
+As far as a lens's blur and a filter do not mix them.
+"""
 SIDE = 3
 """A view's hair is parted in 3 × 3."""
 FEWEST_PAIRS = 200
@@ -46,7 +53,7 @@ WORST_MISFIT = 3.0
 _DEVIATIONS = np.linspace(-WINDOW, WINDOW, 31)
 _INNER = slice(4, 26)  # a shift brings in nothing unknown there
 _SHIFTS = np.radians(np.arange(0, 31, 3))
-_FLOOR = 0.01  # what a mean of a bin is off by at least, of the mean over bins
+_FLOOR = 0.02  # what a mean of a bin is off by at least, of the mean over bins
 _BETWEEN_RENDERINGS = 0.015  # error of log β_M by interpolation
 _STEPS = 400
 _WAVE = 0.06  # metres of strand: about the pitch of wavy hair
@@ -57,12 +64,15 @@ class Highlight:
     """Sums over `J` parts of the hair, `SIDE`² of each view.
 
     `products (J, 10)` of a pixel's answers to two lights, over `EDGES`, and `pairs` how many;
+    `products_beside` of two pixels' answers that lie `BESIDE` each other, and `pairs_beside`;
     `values (J, 30)` of its answers over the signed deviation from the mirror direction, and
     `samples` how many.
     """
 
     products: Array
     pairs: Array
+    products_beside: Array
+    pairs_beside: Array
     values: Array
     samples: Array
 
@@ -75,6 +85,23 @@ class Highlight:
     def correlation(self, parts: Array) -> Array:
         """Mean products over `EDGES`, relative to their mean `(M, 10)`; `parts (M, J)` weigh."""
         return _relative(parts @ self.products, parts @ self.pairs)
+
+    def likeness(self, parts: Array) -> Array:
+        """How far pixels beside each other answer as one pixel does `(M,)`; `parts (M, J)` weigh.
+
+        The slope of their mean products over those of one pixel, bin by bin: 1 where all pixels
+        have the same highlight, 0 where they are strangers.
+        """
+        within, beside = (
+            parts @ total / np.maximum(parts @ count, 1)
+            for total, count in (
+                (self.products, self.pairs),
+                (self.products_beside, self.pairs_beside),
+            )
+        )
+        off = within - within.mean(axis=1, keepdims=True)
+        spread = np.maximum((off**2).sum(axis=1), 1e-300)
+        return np.asarray((off * beside).sum(axis=1) / spread)
 
     def profiles(self, parts: Array) -> Array:
         """Mean answers over deviation if shifted at random `(M, S, 11)`, relative to their mean.
@@ -103,7 +130,8 @@ class LightPairs:
 
     `sample (N,)`, `first` and `second (M,)` are flat indices into an `(L, P)` array; `bin_of_sample
     (N,)` and `bin_of_pair (M,)` count through the bins of one part of the hair after the other;
-    `scale (L, P)` turns radiance into the fibre's answer, 1/sr.
+    `scale (L, P)` turns radiance into the fibre's answer, 1/sr. The first `own` pairs are of one
+    pixel, the rest of two that lie `BESIDE` each other.
     """
 
     sample: Ints
@@ -111,6 +139,7 @@ class LightPairs:
     first: Ints
     second: Ints
     bin_of_pair: Ints
+    own: int
     scale: Array
 
     @classmethod
@@ -125,9 +154,19 @@ class LightPairs:
         sample = light * count + pixel
         ends = np.searchsorted(pixel, np.arange(count + 1))
         pairs = [np.stack(np.triu_indices(b - a, 1)) + a for a, b in pairwise(ends)]
+        own = sum(pair.shape[1] for pair in pairs)
+        pairs += [
+            np.stack(np.meshgrid(np.arange(*ends[p : p + 2]), np.arange(*ends[q : q + 2]))).reshape(
+                2, -1
+            )
+            for p, q in beside(observed)
+        ]
         i, j = sample[np.concatenate(pairs, axis=1)]
         angle = np.abs(deviation[i] - deviation[j])
-        i, j, angle = (x[angle < EDGES[-1]] for x in (i, j, angle))
+        # two answers to one light have the noise of that light's frame in common
+        kept = (angle < EDGES[-1]) & (i // count != j // count)
+        own = int(kept[:own].sum())
+        i, j, angle = (x[kept] for x in (i, j, angle))
         shines = [light.intensity_towards(found.middle)[:, channel] for light in observed.lights]
         return cls(
             sample,
@@ -135,6 +174,7 @@ class LightPairs:
             i,
             j,
             part[i % count] * (len(EDGES) - 1) + _bin(angle, EDGES),
+            own,
             found.squared / np.maximum(shines, 1e-12) / np.maximum(fibres.share, 1e-12),
         )
 
@@ -146,9 +186,14 @@ class LightPairs:
         a, b = (np.asarray(self.scale * x, float).ravel() for x in (one, other))
         i, j, k = self.first, self.second, self.sample
         of_pairs, of_samples = len(EDGES) - 1, len(_DEVIATIONS) - 1
+        products = 0.5 * (a[i] * b[j] + a[j] * b[i])
+        own, other = slice(None, self.own), slice(self.own, None)
         return Highlight(
-            _summed(self.bin_of_pair, 0.5 * (a[i] * b[j] + a[j] * b[i]), of_pairs),
-            _summed(self.bin_of_pair, np.ones(len(i)), of_pairs),
+            *(
+                _summed(self.bin_of_pair[which], values[which], of_pairs)
+                for which in (own, other)
+                for values in (products, np.ones(len(i)))
+            ),
             _summed(self.bin_of_sample, 0.5 * (a[k] + b[k]), of_samples),
             _summed(self.bin_of_sample, np.ones(len(k)), of_samples),
         )
@@ -175,6 +220,23 @@ class Highlights:
 
 
 @dataclass(frozen=True)
+class Disorder:
+    """By how much single strands turn beyond those that were rendered.
+
+    `degrees`, root mean square, with its standard error, up to `most`: what was rendered.
+    """
+
+    degrees: float
+    error: float
+    most: float
+
+    @property
+    def share(self) -> float:
+        """Error of its square, relative: 1 at most."""
+        return min(2 * self.error / self.degrees, 1.0) if self.degrees > 0 else 1.0
+
+
+@dataclass(frozen=True)
 class Roughness:
     """A roughness with what is known of its error.
 
@@ -183,7 +245,8 @@ class Roughness:
     inside `range`, that of the renderings. `views` are the answers of single views that have pairs
     enough. `misfit` is the χ² of the best match per degree of freedom. `tangents_deg` is how far
     inclinations are off, root mean square, more than in the renderings, and `tangents_error_deg`
-    its standard error.
+    its standard error. `disorder` is by how much the rendered strands were disordered; None where
+    no two pixels beside each other told.
     """
 
     beta_m: float
@@ -197,14 +260,17 @@ class Roughness:
     tangents_deg: float
     tangents_error_deg: float
     systematic: float = 0.0
+    disorder: Disorder | None = None
 
-    def after(self, other: Roughness) -> Roughness:
-        """This one, of disordered strands, with `other`, of the strands as they are.
+    def after(self, other: Roughness, disorder: Disorder | None) -> Roughness:
+        """This one, of strands of that `disorder`, with `other`, of the strands as they are.
 
-        Half of what lies between the two answers joins the error: how the strands are wrong is not
-        known better. The tangents' error is that of `other`.
+        What lies between the two answers, which grows with the square of the disorder, joins the
+        error by the disorder's; half of it where that was not measured. The tangents' error is that
+        of `other`.
         """
-        systematic = 0.5 * abs(float(np.log(self.beta_m / other.beta_m)))
+        share = 0.5 if disorder is None else disorder.share
+        systematic = share * abs(float(np.log(self.beta_m / other.beta_m)))
         wider = np.exp(np.hypot(self.error, systematic) * 2 - self.error * 2)
         return replace(
             self,
@@ -214,6 +280,7 @@ class Roughness:
             tangents_deg=other.tangents_deg,
             tangents_error_deg=other.tangents_error_deg,
             systematic=systematic,
+            disorder=disorder,
         )
 
     def warnings(self) -> list[str]:
@@ -230,12 +297,29 @@ class Roughness:
         if np.sqrt(self.error**2 - self.systematic**2) > max(2 * self.parts, LARGEST_ERROR):
             views = ", ".join(f"{beta:.2g}" for beta in self.views)
             said.append(f"views disagree about β_M by more than their noise: {views}")
+        if self.disorder is not None and self.disorder.degrees >= self.disorder.most:
+            said.append(
+                "pixels beside each other differ by more than strands turned by "
+                f"{self.disorder.most:g}° do: β_M {self.beta_m:.2g} may be too large"
+            )
         if self.misfit > WORST_MISFIT:
             said.append(
                 f"no roughness fits the highlight (χ² {self.misfit:.1f} per degree of freedom): "
                 "are the strands where the hair is?"
             )
         return said
+
+
+def beside(observed: Observed) -> Ints:
+    """Places `(N, 2)` in `observed.pixels` of two that lie `BESIDE` each other, right or below."""
+    pixels, width = observed.pixels, observed.camera.width
+    order = np.argsort(pixels, kind="stable")
+    found = []
+    for step, fits in ((BESIDE, pixels % width + BESIDE < width), (BESIDE * width, True)):
+        at = np.minimum(np.searchsorted(pixels[order], pixels + step), len(pixels) - 1)
+        there = np.flatnonzero((pixels[order[at]] == pixels + step) & fits)
+        found.append(np.stack([there, order[at[there]]], axis=1))
+    return np.concatenate(found)
 
 
 def disordered(strands: Strands, angle: float, seed: int) -> Strands:
@@ -254,6 +338,38 @@ def disordered(strands: Strands, angle: float, seed: int) -> Strands:
     return replace(strands, points=points.astype(np.float32))
 
 
+def match_disorder(
+    captured: Highlight, rendered: Sequence[tuple[float, Highlight]]
+) -> Disorder | None:
+    """The disorder, degrees, whose rendered highlights are as alike as the `captured` ones.
+
+    Between the `rendered`, which ascend from 0, a parabola. The error is the jackknife's over parts
+    of the hair, or what the views' answers differ by. None where too few pixels lie `BESIDE` each
+    other.
+    """
+    if captured.pairs_beside.sum() < FEWEST_PAIRS:
+        return None
+    nodes = np.array([degrees for degrees, _ in rendered])
+    chosen, left_out = _chosen(captured.pairs_beside)
+    curve = np.polyfit(nodes, np.stack([h.likeness(chosen) for _, h in rendered]), 2)
+    x = np.linspace(0, nodes[-1], _STEPS)
+    falling = np.minimum.accumulate(np.vander(x, 3) @ curve)
+    answers = x[np.abs(falling - captured.likeness(chosen)).argmin(axis=0)]
+    return Disorder(float(answers[0]), max(_errors(answers, left_out)), float(nodes[-1]))
+
+
+def _chosen(pairs: Array) -> tuple[Array, int]:
+    """Weights `(M, J)` of parts that have `pairs (J, B)`: of all, of all but one, of single views.
+
+    And how many leave one out.
+    """
+    parts, there = len(pairs), pairs.sum(axis=1)
+    left_out = (1 - np.eye(parts))[there > 0]
+    views = np.kron(np.eye(parts // SIDE**2), np.ones(SIDE**2))
+    views = views[views @ there >= FEWEST_OF_VIEW]
+    return np.concatenate([np.ones((1, parts)), left_out, views]), len(left_out)
+
+
 def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlight]]) -> Roughness:
     """The β_M whose rendered highlights are nearest the `captured` one.
 
@@ -269,12 +385,8 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
         )
     nodes = np.log([beta for beta, _ in rendered])
     x = np.linspace(nodes[0], nodes[-1], _STEPS)
-    parts = len(captured.pairs)
-    left_out = (1 - np.eye(parts))[captured.pairs.sum(axis=1) > 0]
-    views = np.kron(np.eye(parts // SIDE**2), np.ones(SIDE**2))
-    views = views[views @ captured.pairs.sum(axis=1) >= FEWEST_OF_VIEW]
-    chosen = np.concatenate([np.ones((1, parts)), left_out, views])
-    jackknife = slice(1, len(left_out) + 1)
+    chosen, left_out = _chosen(captured.pairs)
+    jackknife = slice(1, left_out + 1)
 
     def distance(target: Array, family: Array) -> Array:
         """χ² `(_STEPS, M, ...)` between `target (M, B)` and renderings `(nodes, M, ..., B)`."""
@@ -282,7 +394,7 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
         plain = family.reshape(*family.shape[:2], -1, target.shape[-1])[:, :, 0]
         nearest = np.argmin(((plain[:, 0] - target.reshape(len(target), -1)[0]) ** 2).sum(axis=1))
         off = (target.reshape(plain.shape[1:]) - plain[nearest])[jackknife]
-        variance = (len(left_out) - 1) * off.var(axis=0) + _FLOOR**2
+        variance = (left_out - 1) * off.var(axis=0) + _FLOOR**2
         curves = PchipInterpolator(nodes, family, axis=0)(x)
         return np.asarray(((curves - target) ** 2 / variance).sum(axis=-1))
 
@@ -296,8 +408,8 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
     best = np.array([_lowest(x, c) for c in chi2.T])
     profiles = by_profile[chi2.argmin(axis=0), np.arange(len(chosen))]
     shifts = np.array([_lowest(_SHIFTS, p) for p in profiles])
-    answer, alone = best[0], best[len(left_out) + 1 :]
-    scatter, between = _errors(best, len(left_out))
+    answer, alone = best[0], best[left_out + 1 :]
+    scatter, between = _errors(best, left_out)
     least = chi2[:, 0].min()
     bins = captured.pairs.shape[1] + (_INNER.stop - _INNER.start) // 2
     misfit = float(least / (bins - 4))
@@ -314,7 +426,7 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
         tuple(np.exp(alone).tolist()),
         misfit,
         float(np.degrees(shifts[0]) / 2),
-        float(np.degrees(max(_errors(shifts, len(left_out)))) / 2),
+        float(np.degrees(max(_errors(shifts, left_out))) / 2),
     )
 
 

@@ -1,5 +1,7 @@
 """Roughness from pairs of lights: on lobes that are computed, whose roughness is known."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,7 @@ def pairs(deviation):
     of_pair = part * 10 + np.digitize(angle, EDGES[1:-1])
     return LightPairs(
         *(x.ravel() for x in (index, of_sample, index[one], index[other], of_pair)),
+        of_pair.size,
         np.ones(deviation.shape),
     )
 
@@ -98,11 +101,10 @@ def test_a_highlight_that_does_not_answer_is_a_warning(family):
 def test_noise_without_a_highlight_is_a_warning(family):
     rng = np.random.default_rng(0)
     nothing = highlight(0.3)
-    values = Highlight(
-        nothing.pairs * rng.normal(1, 0.02, nothing.pairs.shape),
-        nothing.pairs,
-        nothing.samples * rng.normal(1, 0.02, nothing.samples.shape),
-        nothing.samples,
+    values = replace(
+        nothing,
+        products=nothing.pairs * rng.normal(1, 0.02, nothing.pairs.shape),
+        values=nothing.samples * rng.normal(1, 0.02, nothing.samples.shape),
     )
     assert match_roughness(values, family).warnings()
 
@@ -110,9 +112,11 @@ def test_noise_without_a_highlight_is_a_warning(family):
 def test_views_that_disagree_are_a_warning(family):
     one, other = highlight(0.2), highlight(0.5)
     half = SIDE**2
-    names = ("products", "pairs", "values", "samples")
     mixed = Highlight(
-        *(np.concatenate([getattr(one, n)[:half], getattr(other, n)[half:]]) for n in names)
+        *(
+            np.concatenate([getattr(one, f.name)[:half], getattr(other, f.name)[half:]])
+            for f in fields(one)
+        )
     )
     found = match_roughness(mixed, family)
     assert found.views == pytest.approx((0.2, 0.5), rel=0.1)
@@ -121,6 +125,6 @@ def test_views_that_disagree_are_a_warning(family):
 
 def test_too_few_pairs_are_an_error_that_says_what_to_do(family):
     few = highlight(0.3)
-    few = Highlight(few.products, few.pairs * 0, few.values, few.samples)
+    few = replace(few, pairs=few.pairs * 0)
     with pytest.raises(ValueError, match="needs more lights"):
         match_roughness(few, family)
