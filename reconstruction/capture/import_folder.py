@@ -29,7 +29,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reconstruction.arrays import Bools, Floats
+from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.capture.exposures import Merged, Unchanged, flattened, merge
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.grey_ball import PlacedBall, Scale
@@ -47,16 +47,26 @@ from reconstruction.capture.import_settings import (
 from reconstruction.capture.import_tables import cameras_of, lights_of, projectors_of
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
+from reconstruction.files.masks import half_grey
 from reconstruction.files.pictures import PictureError, picture_size, read_picture
 from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
 from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.placement import PlacementError, resized
+from reconstruction.geometry.placement import (
+    FURTHEST,
+    NEAREST,
+    PlacementError,
+    Sight,
+    length,
+    resized,
+)
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
 
+SMALLEST, LARGEST = 0.03, 2.5
+"""Metres across a part of a scalp, and a head on its body."""
 BALL_FRAMES = 48
 """Frames that are read, evenly spread, for what a grey ball says."""
 
@@ -119,13 +129,14 @@ class Import:
         if not folder.is_dir():
             raise ImportProblem(f"{folder}: no such folder")
         settings = settings_of(folder) if settings is None else settings
-        if geometry is None:
-            geometry = Geometry(cameras_of(folder / "cameras.json"))
+        own = geometry is None
+        geometry = geometry or Geometry(cameras_of(folder / "cameras.json"))
         lights = geometry.lights or lights_of(
             folder / "lights.json", {id_: c.name for id_, c in geometry.cameras.items()}
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
+        _check_metres(folder, given, "cameras" if own else "", "" if geometry.lights else "lights")
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
         found = find(folder, settings, given) if found is None else found
@@ -391,14 +402,52 @@ def _mask(path: Path, camera: Camera) -> Bools:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if found == expected else None
     if image is None:
         raise ImportProblem(f"{path}: expected a PNG of {expected} pixels, got {found}")
-    return np.asarray(image) >= 128
+    try:
+        return half_grey(np.asarray(image, np.uint8))
+    except ValueError as error:
+        raise ImportProblem(f"{path}: {error}") from error
+
+
+def _check_metres(folder: Path, rig: Rig, *own: str) -> None:
+    """Whether the folder's `own` files ("cameras", "lights") can count in metres.
+
+    Raises `ImportProblem` where all of them are too far from what the cameras look at, or too near.
+    """
+    try:
+        sight = Sight.of(rig.cameras)
+    except PlacementError:
+        return
+    lights = np.array([x.position for x in rig.lights])
+    far = {"cameras": sight.distance, "lights": np.linalg.norm(lights - sight.point, axis=1)}
+    for kind in filter(None, own):
+        distance = float(np.median(far[kind]))
+        if sight.whole and not NEAREST <= distance <= FURTHEST:
+            raise ImportProblem(
+                f"{folder / kind}.json: the {kind} stand {length(distance)} from what the "
+                "cameras look at: its numbers must be metres, with z up, whatever the unit of "
+                "other files"
+            )
+
+
+def _check_size(path: Path, points: Array) -> None:
+    """Whether `points (N, 3)` of a head, or of a part of one, can be metres."""
+    wide = float(np.ptp(points, axis=0).max())
+    if not SMALLEST <= wide <= LARGEST:
+        raise ImportProblem(
+            f"{path}: is {length(wide)} wide: its numbers must be metres, with z up, whatever the "
+            "unit of cameras and lights"
+        )
 
 
 def _head(path: Path) -> Mesh | None:
+    if not path.is_file():
+        return None
     try:
-        return read_obj(path) if path.is_file() else None
+        head = read_obj(path)
     except ValueError as error:
         raise ImportProblem(str(error)) from error
+    _check_size(path, head.vertices)
+    return head
 
 
 def _scalp(path: Path) -> str | None:
@@ -406,7 +455,8 @@ def _scalp(path: Path) -> str | None:
     if not path.is_file():
         return None
     try:
-        read_points(path)
+        points, _ = read_points(path)
     except ValueError as error:
         raise ImportProblem(str(error)) from error
+    _check_size(path, points)
     return path.read_text()

@@ -105,9 +105,12 @@ def _array(
     name = next((n for n in names if n in table), None)
     if name is None:
         raise CameraFileError(f"{where}: has none of {', '.join(names)}")
+    said = table[name]
     try:
-        value = np.array(table[name], dtype=np.float64)
-    except (TypeError, ValueError):
+        if isinstance(said, Mapping):  # as OpenCV writes matrices in JSON
+            said = np.reshape(said["data"], (said["rows"], said["cols"]))
+        value = np.array(said, dtype=np.float64)
+    except (TypeError, ValueError, LookupError):
         value = np.full(1, np.nan)
     if (shapes and value.shape not in shapes) or not np.isfinite(value).all():
         expected = " or ".join(map(str, shapes or ()))

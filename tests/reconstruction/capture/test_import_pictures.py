@@ -372,6 +372,23 @@ def test_a_raw_file_of_a_sensor_that_is_not_known_is_refused(tmp_path, sensor, s
         read_picture(tmp_path / "odd.dng", Sensor(), (32, 24))
 
 
+def test_numbers_of_each_camera_are_one_step_of_a_light(folder, tmp_path):
+    """A counter of the camera's own says nothing of a light that is shot once."""
+    numbers = iter(range(900))
+    everywhere(
+        lambda c, n, x: save(folder / "images" / c / f"{next(numbers)}_{n}.png", x, np.uint16)
+    )
+    settings(folder, "[pictures]\nolat = 'images/{camera}/{number}_{light}.png'\n")
+    capture = import_folder(folder, tmp_path / "out")
+    assert [s.light for s in capture.steps] == list(LIGHTS)
+    assert all(capture.has(s, c) for s in capture.steps for c in CAMERAS)
+    # where one is shot twice the number tells which is which
+    save(folder / "images/left/1000_0.png", light_of(0, 0), np.uint16)
+    save(folder / "images/right/1000_0.png", light_of(1, 0), np.uint16)
+    again = import_folder(folder, tmp_path / "again")
+    assert [s.light for s in again.steps if again.has(s, "left")] == [LIGHTS[0], *LIGHTS]
+
+
 def test_two_files_for_one_frame(folder, tmp_path):
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
     save(folder / "images/left/1.tif", light_of(0, 0), np.uint16)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction import Camera
+from reconstruction import Camera, write_exr
 from reconstruction.files.cameras import CameraFileError, read_cameras
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModel, LensModelCamera
@@ -53,6 +53,7 @@ WRITERS: dict[str, Callable[[Path, list[Camera]], object]] = {
     "cameras.xml": writers.write_metashape,
     "2.xml": lambda path, cameras: writers.write_metashape(path, cameras, component=True),
     "opencv": writers.write_opencv,
+    "opencv.json": writers.write_opencv_json,
     "map.json": writers.write_map,
 }
 
@@ -166,6 +167,24 @@ def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
         for i, frame in enumerate(data["frames"])
         for k in range(3)
     }
+    path.write_text(json.dumps(data))
+    assert_same_pixels(read_cameras(path).cameras, stage())
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".tif", ".png"])
+def test_pictures_say_how_large_they_are_where_the_file_does_not(suffix, tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    writers.write_transforms(path, stage())
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        del frame["w"], frame["h"]
+        frame["file_path"] = frame["file_path"].replace(".png", suffix)
+        there = tmp_path / frame["file_path"]
+        there.parent.mkdir(exist_ok=True)
+        if suffix == ".exr":
+            write_exr(there, np.zeros((480, 640, 3), np.float32))
+        else:
+            cv2.imwrite(str(there), np.zeros((480, 640, 3), np.uint8))
     path.write_text(json.dumps(data))
     assert_same_pixels(read_cameras(path).cameras, stage())
 
