@@ -67,6 +67,8 @@ from reconstruction.report.report import Progress, silent
 
 SMALLEST, LARGEST = 0.03, 2.5
 """Metres across a part of a scalp, and a head on its body."""
+FLAT_FULL = 0.01
+"""Share of a flat field that may saturate: specks."""
 BALL_FRAMES = 48
 """Frames that are read, evenly spread, for what a grey ball says."""
 
@@ -317,9 +319,15 @@ class Import:
         for camera, path in self.found.flats.items():
             size = (self.shot[camera].width, self.shot[camera].height)
             try:
-                light = read_picture(path, self.settings.sensor, size).light
+                picture = read_picture(path, self.settings.sensor, size)
             except PictureError as error:
                 raise ImportProblem(str(error)) from error
+            light, full = picture.light, float(picture.saturated.mean())
+            if full > FLAT_FULL:
+                raise ImportProblem(
+                    f"{path}: a flat field must not saturate, {full:.0%} of it does: shoot it at a "
+                    "shorter exposure"
+                )
             mean = light.mean(axis=(0, 1))
             if not (mean > 0).all():
                 raise ImportProblem(f"{path}: a flat field shows light in every channel")

@@ -180,9 +180,11 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     }
     left = [n for n, p in names.items() if p not in used and p.suffix.lower() in FORMATS]
     shot = {s.light for s in steps}
+    without = sorted({c.name for c in rig.cameras} - {camera for _, camera in frames})
+    bare = [f"no picture of {_few(without)}: all its frames are missing"] if without else []
     return Found(
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
-        tuple(left), (*_notes(rig, shot, used, settings, left), *reader.notes()),
+        tuple(left), (*bare, *_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
 
 

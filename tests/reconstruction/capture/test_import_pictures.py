@@ -233,6 +233,12 @@ def test_missing_frames_are_values(folder, tmp_path):
     assert not capture.has_light("light_001", "left")
     assert capture.has_light("light_001", "right")
     assert any("light_002" in note for note in capture.plan["import"]["notes"])
+    assert not any("no picture of" in note for note in capture.plan["import"]["notes"])
+    for picture in (folder / "images" / "right").iterdir():
+        picture.unlink()
+    capture = import_folder(folder, tmp_path / "again")
+    said = "no picture of right: all its frames are missing"
+    assert said in capture.plan["import"]["notes"]
 
 
 def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
@@ -296,6 +302,17 @@ def test_a_flat_field_evens_the_lens(folder, tmp_path):
     capture = import_folder(folder, tmp_path / "out")
     expected = light_of(0, 1) * falls.mean()
     np.testing.assert_allclose(capture.light("light_001", "left")[0], expected, rtol=2e-3)
+
+
+def test_a_flat_field_that_saturates_is_refused(folder, tmp_path):
+    """It would say that the lens darkens nothing."""
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    falls = np.linspace(0.5, 1.6, SIZE)[:, None, None] * np.ones((1, SIZE, 3), np.float32)
+    for camera in CAMERAS:
+        save(folder / f"flat_{camera}.png", falls, np.uint16)
+    settings(folder, 'pictures.flat = "flat_{camera}.png"')
+    with pytest.raises(ImportProblem, match=r"flat_.*\.png: a flat field must not saturate, 5\d% "):
+        import_folder(folder, tmp_path / "out")
 
 
 def cut_off(path: Path) -> None:

@@ -157,6 +157,21 @@ def test_what_opencv_did_not_write_is_refused(tmp_path: Path) -> None:
             read_cameras(path)
 
 
+def test_a_camera_alone_and_a_map_without_a_camera_in_json(tmp_path: Path) -> None:
+    first, second, *_ = stage()
+    path = tmp_path / "cameras.json"
+    writers.write_map(path, [first, second])
+    data = json.loads(path.read_text())
+    data[second.name]["intrinsics"] = data[second.name].pop("K")
+    path.write_text(json.dumps(data))
+    found = read_cameras(path)
+    assert_same_pixels(found.cameras, [first])
+    assert [n.endswith(f"is there: {second.name}") for n in found.notes] == [True]
+    alone = tmp_path / f"{first.name}.json"
+    alone.write_text(json.dumps(data[first.name]))
+    assert_same_pixels(read_cameras(alone).cameras, [first])
+
+
 def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
     """As files have it that list a frame for each camera and light."""
     path = tmp_path / "transforms.json"
