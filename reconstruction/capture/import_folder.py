@@ -337,14 +337,20 @@ class Import:
     def _subjects(self, progress: Progress) -> dict[str, Bools]:
         """The subject's pixels, of the user or else by clean plates, in those of the pictures."""
         out = {n: _mask(p, self.shot[n]) for n, p in self.found.subjects.items()}
+        by_plates = {}
         for camera in {c for _, c in self.found.plates} - set(out):
             pairs, told = _with_plates(self.found, camera), Unchanged()
             for k, (picture, plate) in enumerate(pairs):
                 told.add(self.frame(picture, camera), self.frame(plate, camera))
                 progress("comparing with clean plates", (k + 1) / len(pairs))
             if pairs:
-                out[camera] = told.subject()
-        return out
+                by_plates[camera] = told.subject()
+        if by_plates and not any(mask.any() for mask in by_plates.values()):
+            raise ImportProblem(
+                f"pictures.clean_plate = {self.settings.pictures.clean_plate!r}: no pixel of a "
+                "frame differs from its clean plate: are they of the stage without the subject?"
+            )
+        return out | by_plates
 
     def _undistorted(self, masks: Mapping[str, Bools]) -> dict[str, Bools]:
         return {

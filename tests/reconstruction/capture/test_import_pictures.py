@@ -20,6 +20,7 @@ from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
 from reconstruction.files.pictures import PictureError, Sensor, read_picture
 from reconstruction.images.silhouettes import silhouette
+from stage_service.cli import main
 
 SIZE = 24  # pixels on a side
 CAMERAS, LIGHTS = ("left", "right"), ("light_000", "light_001", "light_002")
@@ -288,6 +289,42 @@ def test_clean_plates_that_match_no_frame_are_told(folder, tmp_path):
     (note,) = [n for n in capture.plan["import"]["notes"] if "clean" in n]
     assert note.startswith("right: ")
     assert [p.name for p in capture.path.glob("subjects/*")] == ["left.png"]
+
+
+def test_clean_plates_that_show_the_subject_are_refused(folder, tmp_path):
+    for name in ("plate", "olat"):
+        everywhere(lambda c, n, x, at=name: save(folder / at / c / f"{n}.png", x, np.uint16))
+    text = 'pictures.olat = "olat/{camera}/{light}.png"\n'
+    settings(folder, text + 'pictures.clean_plate = "plate/{camera}/{light}.png"')
+    with pytest.raises(ImportProblem, match="no pixel of a frame differs from its clean plate"):
+        import_folder(folder, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        (["--unit", "mm"], "up and camera axes go with --cameras; cameras.json"),
+        (["--up", "y"], "up and camera axes go with --cameras; cameras.json"),
+        (["--light-distance", "2"], "light distance, up and camera axes go with --cameras"),
+        (["--take", "ID20001"], "--take goes with --preset faceolat"),
+        (["--preset", "humanolat", "--pictures", "x"], "--pictures does not go with --preset"),
+    ],
+)
+def test_options_that_nothing_would_read_are_refused(folder, tmp_path, capsys, asked, says):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    assert main(["import", str(folder), "--out", str(tmp_path / "out"), *asked]) != 0
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_draws_beside_a_folder_that_is_not_there(folder, tmp_path, monkeypatch):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    assert main(["import", str(folder), "--out", str(tmp_path / "new/out"), "--dry-run"]) == 0
+    assert (tmp_path / "new" / "out-contact-sheet.png").is_file()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert main(["import", str(folder), "--out", ".", "--dry-run"]) == 0
+    assert (tmp_path / "here-contact-sheet.png").is_file()
 
 
 def test_a_flat_field_evens_the_lens(folder, tmp_path):
