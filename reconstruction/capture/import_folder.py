@@ -29,7 +29,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reconstruction.arrays import Array, Bools, Floats
+from reconstruction.arrays import Bools, Floats
 from reconstruction.capture.exposures import Merged, Unchanged, flattened, merge
 from reconstruction.capture.folder import Capture, Step
 from reconstruction.capture.grey_ball import PlacedBall, Scale
@@ -44,29 +44,26 @@ from reconstruction.capture.import_settings import (
     find,
     read_settings,
 )
-from reconstruction.capture.import_tables import cameras_of, lights_of, projectors_of
+from reconstruction.capture.import_tables import (
+    cameras_of,
+    check_metres,
+    head_of,
+    lights_of,
+    projectors_of,
+    scalp_of,
+)
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
 from reconstruction.files.masks import half_grey
 from reconstruction.files.pictures import PictureError, picture_size, read_picture
-from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
-from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.placement import (
-    FURTHEST,
-    NEAREST,
-    PlacementError,
-    Sight,
-    length,
-    resized,
-)
+from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.placement import PlacementError, resized
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
 
-SMALLEST, LARGEST = 0.03, 2.5
-"""Metres across a part of a scalp, and a head on its body."""
 FLAT_FULL = 0.01
 """Share of a flat field that may saturate: specks."""
 BALL_FRAMES = 48
@@ -138,7 +135,7 @@ class Import:
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
-        _check_metres(folder, given, "cameras" if own else "", "" if geometry.lights else "lights")
+        check_metres(folder, given, "cameras" if own else "", "" if geometry.lights else "lights")
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
         found = find(folder, settings, given) if found is None else found
@@ -149,7 +146,7 @@ class Import:
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
         lit = {s.light for s in found.steps}
         rig = replace(given, cameras=kept, lights=tuple(x for x in given.lights if x.name in lit))
-        head, scalp = _head(folder / "head.obj"), _scalp(folder / "scalp.obj")
+        head, scalp = head_of(folder / "head.obj"), scalp_of(folder / "scalp.obj")
         ball = None
         if settings.grey_ball is not None:
             if settings.units == "relative" or settings.scale != 1:
@@ -420,57 +417,3 @@ def _mask(path: Path, camera: Camera) -> Bools:
         return half_grey(np.asarray(image, np.uint8))
     except ValueError as error:
         raise ImportProblem(f"{path}: {error}") from error
-
-
-def _check_metres(folder: Path, rig: Rig, *own: str) -> None:
-    """Whether the folder's `own` files ("cameras", "lights") can count in metres.
-
-    Raises `ImportProblem` where all of them are too far from what the cameras look at, or too near.
-    """
-    try:
-        sight = Sight.of(rig.cameras)
-    except PlacementError:
-        return
-    lights = np.array([x.position for x in rig.lights])
-    far = {"cameras": sight.distance, "lights": np.linalg.norm(lights - sight.point, axis=1)}
-    for kind in filter(None, own):
-        distance = float(np.median(far[kind]))
-        if sight.whole and not NEAREST <= distance <= FURTHEST:
-            raise ImportProblem(
-                f"{folder / kind}.json: the {kind} stand {length(distance)} from what the "
-                "cameras look at: its numbers must be metres, with z up, whatever the unit of "
-                "other files"
-            )
-
-
-def _check_size(path: Path, points: Array) -> None:
-    """Whether `points (N, 3)` of a head, or of a part of one, can be metres."""
-    wide = float(np.ptp(points, axis=0).max())
-    if not SMALLEST <= wide <= LARGEST:
-        raise ImportProblem(
-            f"{path}: is {length(wide)} wide: its numbers must be metres, with z up, whatever the "
-            "unit of cameras and lights"
-        )
-
-
-def _head(path: Path) -> Mesh | None:
-    if not path.is_file():
-        return None
-    try:
-        head = read_obj(path)
-    except ValueError as error:
-        raise ImportProblem(str(error)) from error
-    _check_size(path, head.vertices)
-    return head
-
-
-def _scalp(path: Path) -> str | None:
-    """The text of a file of points, once it could be read as such."""
-    if not path.is_file():
-        return None
-    try:
-        points, _ = read_points(path)
-    except ValueError as error:
-        raise ImportProblem(str(error)) from error
-    _check_size(path, points)
-    return path.read_text()
