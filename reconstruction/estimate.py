@@ -7,6 +7,7 @@ is a table of seconds per unit, scaled by how fast this machine is at a known ta
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,7 +18,9 @@ import numpy as np
 from reconstruction.capture.folder import Capture, CaptureError, MissingFrame, Step, StepKind
 from reconstruction.capture.kept_frames import kept_bytes
 from reconstruction.geometry.cameras import Camera
+from reconstruction.head.capture_head import HeadPoints, digitised_points
 from reconstruction.images.orientation import responses
+from reconstruction.light_codes.codes import WORD
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
 from reconstruction.methods import Method
 from reconstruction.pipeline import FINE_PIXEL, method_for
@@ -32,6 +35,10 @@ KNOWN_TASK = 0.0155
 SWEPT, UNSWEPT = 2.0, 8.0
 """Cells of `MeasureOptions.thin` that a surface is deep: triangulated, and where hulls put it."""
 
+DEPTHS = 3.2e-6
+"""Seconds that line stereo takes for a pixel and a neighbour on two cores; all share it evenly."""
+
+HEAD_FIT = 2.0  # seconds: points are thinned to about as many, whatever the capture
 ROWS = 12  # of a sweep that the probe searches, in each of three places
 LOOKS = 96  # lights that hair is told from skin by: up to twice as many are read
 GB = 1e9
@@ -89,9 +96,8 @@ def estimate(
     capture = capture.view(undistorted=True)
     kept = [c.name for c in capture.rig.cameras if c.name not in options.held_out]
     probe = _Probe(capture.view(cameras=kept), options, progress)
-    if method == "auto":
-        method = method_for(capture)
-    stages = list(probe.stages(method))
+    stages = probe.stages(method)
+    method = method_for(capture) if method == "auto" else method
     progress("probed", 1.0)
     frames = sum(capture.has(s, c.name) for s in capture.steps for c in capture.rig.cameras)
     each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
@@ -205,87 +211,134 @@ class _Probe:
         most = deep * sphere / self.options.measure.thin**2
         return most * (1 - float(np.exp(-0.7 * self.hair / most)))
 
-    def stages(self, method: Method) -> list[StageCost]:
-        """The stages of `method`, in order."""
+    @cached_property
+    def volume(self) -> float:
+        """Voxels that can hold hair, millions: the ball of the outline, of a sweep its shell."""
+        share = 0.3 if self.capture.of_kind("scanline") else 1.0
+        outline = self.hair / len(self.cameras) * self.pixel**2
+        return share * 0.75e-6 * outline**1.5 / self.options.grid**3
+
+    def stages(self, asked: Method) -> list[StageCost]:
+        """The stages in the order of the report, also those that find nothing to do."""
+        method = method_for(self.capture) if asked == "auto" else asked
         slow, n, hair, lights = self.slowness, self.points, self.hair, self.lights
         base = 0.3  # that the process has, and what of a sweep's points it keeps
         out: list[StageCost] = []
 
-        def add(name: str, measured: float, table: float, gb: float) -> None:
+        def add(name: str, measured: float = 0.0, table: float = 0.0, gb: float = 0.0) -> None:
             seconds = measured + slow * table
             share = measured / seconds if seconds > 0 else 0.0
             out.append(StageCost(name, seconds, base + gb, share))
 
+        if self.capture.plan.get("import"):
+            add("import")
+        if self.capture.lenses:
+            add("lenses")
+        known = self.capture.head is not None
+        points: HeadPoints | str | None = self.options.scalp_points
+        if not known and points is None:
+            points = digitised_points(self.capture, None)
+        if points is not None:
+            add("head", table=HEAD_FIT)
+            known = True
+        if asked == "auto":
+            add("method")
         sweep = self.frames("scanline")
+        rows, stripes = 0.0, 0.0
         if sweep:
             rows, stripes = sweep * self.row(), 0.7 * hair * len(self.capture.rig.projectors)
-            add("triangulation", rows, 3e-5 * stripes, (150 * self.pixels + 565 * stripes) / GB)
-            if tracking := self.frames("tracking"):
-                read = tracking * self.reading("tracking")
-                each = 0.02 + 6e-6 * min(hair / len(self.cameras), 12_000.0)
-                add("motion", read, tracking * each, (300 * self.pixels + 560 * hair) / GB)
+        add("triangulation", rows, 3e-5 * stripes, (150 * self.pixels + 565 * stripes) / GB)
+        if sweep:
+            tracking = self.frames("tracking")
+            read = tracking * self.reading("tracking") if tracking else 0.0
+            each = 0.02 + 6e-6 * min(hair / len(self.cameras), 12_000.0)
+            add("motion", read, tracking * each, (300 * self.pixels + 560 * hair) / GB)
             base += 560 * hair / GB
         looked = min(lights, 1.5 * LOOKS) * len(self.cameras)
         lit = len(self.cameras) if self.frames("all_on") else self.frames("olat")
-        more = looked + (lit if self.capture.head is None else 0)
+        more = looked + (0 if known else lit)
         add(
             "masks",
             lit * self.read + more * (self.read if self.frames("all_on") else self.again),
             looked * 1.7e-7 * self.pixels,
             (8 * min(lights, 1.5 * LOOKS) / len(self.cameras) + 40) * hair / GB,
         )
-        seen = method in ("photometric", "lmvs")
-        voxels = (2e-3 / self.options.grid) ** 3
-        volume = voxels * (1.0 if self.capture.head is not None else 2.0)  # the head's own, too
-        if not seen:
-            add("envelope", 0.0, 4.5 * voxels, 0.3 * voxels)
-            if lights:
-                self._orientation(add)
-        if seen or method == "fused" or (method == "hull" and lights and self.pixel <= FINE_PIXEL):
-            self._line_stereo(add)
-        if not seen:
-            if sweep:
-                add("surface", 0.0, 8e-9 * n * n, 8e-6 * n)
+        if method in ("photometric", "lmvs"):
+            lines = self._line_stereo(add, method)
+            add("strands", table=3e-5 * lines, gb=7e-6 * lines)
+            return out
+        if method != "hull" and not known:
+            add("head", table=HEAD_FIT)
+        volume = self.volume
+        bare = not known and method == "hull"  # nothing but a hull, filled 12 mm deep
+        each = 0.1 if bare else 0.5
+        add("envelope", table=2 + each * len(self.cameras) * volume, gb=0.3 * volume)
+        if lights:
+            self._orientation(add)
+        lines = 0.0
+        if method == "hull":
+            sees = lights > 0 and self.pixel <= FINE_PIXEL
+            place = len(out)
+            lines = self._line_stereo(add, method) if sees else 0.0
+            add("line stereo", table=2e-5 * lines, gb=5e-7 * hair if sees else 0.0)
+            out.insert(place, out.pop())
+        else:
+            add("surface", table=8e-9 * n * n if sweep else 0.0, gb=8e-6 * n if sweep else 0.0)
+            if method == "fused":
+                lines = self._line_stereo(add, method)
+        grown = (3.0 if bare else 1.2) * volume + 7e-6 * n + 5e-6 * lines
+        if sweep:
             grown = 0.6 + 2e-5 * n
-            if not sweep:  # lines that line stereo saw are many, and all get roots
-                fine = lights and self.pixel <= FINE_PIXEL
-                grown = 0.6 + 2.7e-5 * n if fine else 0.9 * volume + 7e-6 * n
-            add("field", 0.0, 5.0 * voxels, 0.8 * volume)
-            add("strands", 0.0, 7.0 + 2e-4 * n, grown)
-            if sweep:
-                add("refinement", 0.0, 2.0 + 4.5e-4 * n, 0.3 + 4e-5 * n)
-            if self.capture.head is not None:
-                add("roots", 0.0, 1.5 + 3e-5 * n, 0.2 + 2e-5 * n if sweep else grown)
+        traced = (30 if bare else 16) * volume + 1.2e-4 * n + 1e-4 * lines
+        add("field", table=7.5 * volume, gb=1.2 * volume)
+        add("strands", table=traced, gb=grown)
+        if bare:
+            return out
+        if sweep:
+            add("refinement", table=2.0 + 4.5e-4 * n, gb=0.3 + 4e-5 * n)
+            add("roots", table=0.5 + 1.5e-5 * n, gb=0.2 + 2e-5 * n)
+        else:
+            add("refinement")
+            add("roots", table=1.5 + 3.3e-5 * n + 1.2e-4 * lines, gb=0.8 * grown)
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
-        lights, n = self.lights, self.points
-        self.progress("filtering", 0.6)
+        lights, n, bank = self.lights, self.points, self.options.measure.bank
         groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
-        measured = self.frames("olat") * self.again + groups * self.filtering()
+        measured = self.frames("olat") * self.again + groups * self.filtering(bank)
         reads = lights if lights >= FEWEST_LIGHTS else 0
-        table = n * (2.2e-4 + 1.4e-6 * reads)
-        count = self.options.measure.bank.count
-        images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * count + 60)
+        table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
+        images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
         views = 0.7 + 0.3 * len(self.cameras)  # that see a point
         scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
-        add(
-            "orientation",
-            measured,
-            table,
-            max(images + observed, (6 if reads else 3) * scores + observed) / GB,
-        )
+        part = 0.35e9 * min(n / 2e4, 1.0)  # of scores, as they are decided
+        times = 4 if reads else 2.4
+        add("orientation", measured, table, max(images, times * scores + part + observed) / GB)
 
-    def _line_stereo(self, add: Callable[[str, float, float, float], None]) -> None:
+    def _line_stereo(
+        self, add: Callable[[str, float, float, float], None], method: Method
+    ) -> float:
+        """Add its stages; returns how many lines views are expected to agree on."""
         cameras, lights, hair = len(self.cameras), self.lights, self.hair
-        measured = self.frames("olat") * self.again
-        gb = self.pixels * (18 * lights + 400) / GB
-        add("lightcodes", measured, 6e-7 * cameras * lights * self.pixels, gb)
+        frames, bank = self.frames("olat"), self.options.light_codes.bank
+        measured = frames * (self.again + self.filtering(bank))
+        add(
+            "lightcodes",
+            measured,
+            1.2e-7 * frames * self.pixels,
+            self.pixels * (18 * lights + 400) / GB,
+        )
         near = min(self.options.light_codes.search.neighbours, max(cameras // 2, 1))
         depths = 2.5e-4 / self.options.light_codes.search.step
-        add("depth", 0.0, 5e-6 * hair * near * depths, gb)
-        lines = min(0.5 * hair, 1.6e5)
-        add("connection", 0.0, 3.5e-9 * lines * lines + 5e-6 * hair, 1.0)
+        words = -(-lights // WORD)  # of a lightcode
+        each = DEPTHS * (1 + 0.5 * words) * depths * 2 / (os.cpu_count() or 2)
+        add("depth", 0.0, each * hair * near, 2.5e-7 * hair)
+        lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # fewer agree where pixels are wide
+        if method == "lmvs":
+            lines *= 0.03
+        add("segments", 0.0, 6.5e-7 * hair * cameras, 5e-7 * hair)
+        add("connection", 0.0, 8e-5 * lines, 5e-7 * hair)
+        return lines
 
     def row(self) -> float:
         """Seconds that one row of a sweep takes in one camera: of some in three places."""
@@ -304,11 +357,12 @@ class _Probe:
 
         return _seconds(searched) / sum(map(len, some))
 
-    def filtering(self) -> float:
-        """Seconds that the tangents' filter bank takes on one picture."""
+    def filtering(self, bank: LogGaborBank) -> float:
+        """Seconds that a filter bank takes on one picture."""
+        self.progress("filtering", 0.6)
         step, camera = self.a_frame("olat")
-        image, bank = self.capture.frame(step, camera).mean(axis=-1), self.options.measure.bank
-        few = replace(bank, count=min(bank.count, 8))  # one of three: large pictures take minutes
+        image = self.capture.frame(step, camera).mean(axis=-1)
+        few = replace(bank, count=min(bank.count, 8))  # a few of them: large pictures take minutes
         _ = responses(few, image)
         return _seconds(lambda: responses(few, image)) * bank.count / few.count
 

@@ -150,6 +150,21 @@ def write_opencv(folder: Path, cameras: Sequence[Camera]) -> None:
         storage.release()
 
 
+def write_opencv_json(path: Path, cameras: Sequence[Camera]) -> None:
+    """By OpenCV itself, a map for each camera in one file."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for camera in cameras:
+        storage.startWriteStruct(camera.name, cv2.FILE_NODE_MAP)
+        storage.write("image_width", camera.width)
+        storage.write("image_height", camera.height)
+        storage.write("camera_matrix", camera.K)
+        storage.write("distortion_coefficients", camera.distortion[None])
+        storage.write("R", camera.R)
+        storage.write("T", camera.t[:, None])
+        storage.endWriteStruct()
+    storage.release()
+
+
 def write_map(path: Path, cameras: Sequence[Camera]) -> None:
     """A map for each camera with its camera-to-world pose."""
     out = {}

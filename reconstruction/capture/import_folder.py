@@ -44,19 +44,28 @@ from reconstruction.capture.import_settings import (
     find,
     read_settings,
 )
-from reconstruction.capture.import_tables import cameras_of, lights_of, projectors_of
+from reconstruction.capture.import_tables import (
+    cameras_of,
+    check_metres,
+    head_of,
+    lights_of,
+    projectors_of,
+    scalp_of,
+)
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
+from reconstruction.files.masks import half_grey
 from reconstruction.files.pictures import PictureError, picture_size, read_picture
-from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
-from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.placement import PlacementError, resized
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
 
+FLAT_FULL = 0.01
+"""Share of a flat field that may saturate: specks."""
 BALL_FRAMES = 48
 """Frames that are read, evenly spread, for what a grey ball says."""
 
@@ -119,13 +128,14 @@ class Import:
         if not folder.is_dir():
             raise ImportProblem(f"{folder}: no such folder")
         settings = settings_of(folder) if settings is None else settings
-        if geometry is None:
-            geometry = Geometry(cameras_of(folder / "cameras.json"))
+        own = geometry is None
+        geometry = geometry or Geometry(cameras_of(folder / "cameras.json"))
         lights = geometry.lights or lights_of(
             folder / "lights.json", {id_: c.name for id_, c in geometry.cameras.items()}
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
+        check_metres(folder, given, "cameras" if own else "", "" if geometry.lights else "lights")
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
         found = find(folder, settings, given) if found is None else found
@@ -136,7 +146,7 @@ class Import:
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
         lit = {s.light for s in found.steps}
         rig = replace(given, cameras=kept, lights=tuple(x for x in given.lights if x.name in lit))
-        head, scalp = _head(folder / "head.obj"), _scalp(folder / "scalp.obj")
+        head, scalp = head_of(folder / "head.obj"), scalp_of(folder / "scalp.obj")
         ball = None
         if settings.grey_ball is not None:
             if settings.units == "relative" or settings.scale != 1:
@@ -306,9 +316,15 @@ class Import:
         for camera, path in self.found.flats.items():
             size = (self.shot[camera].width, self.shot[camera].height)
             try:
-                light = read_picture(path, self.settings.sensor, size).light
+                picture = read_picture(path, self.settings.sensor, size)
             except PictureError as error:
                 raise ImportProblem(str(error)) from error
+            light, full = picture.light, float(picture.saturated.mean())
+            if full > FLAT_FULL:
+                raise ImportProblem(
+                    f"{path}: a flat field must not saturate, {full:.0%} of it does: shoot it at a "
+                    "shorter exposure"
+                )
             mean = light.mean(axis=(0, 1))
             if not (mean > 0).all():
                 raise ImportProblem(f"{path}: a flat field shows light in every channel")
@@ -318,14 +334,20 @@ class Import:
     def _subjects(self, progress: Progress) -> dict[str, Bools]:
         """The subject's pixels, of the user or else by clean plates, in those of the pictures."""
         out = {n: _mask(p, self.shot[n]) for n, p in self.found.subjects.items()}
+        by_plates = {}
         for camera in {c for _, c in self.found.plates} - set(out):
             pairs, told = _with_plates(self.found, camera), Unchanged()
             for k, (picture, plate) in enumerate(pairs):
                 told.add(self.frame(picture, camera), self.frame(plate, camera))
                 progress("comparing with clean plates", (k + 1) / len(pairs))
             if pairs:
-                out[camera] = told.subject()
-        return out
+                by_plates[camera] = told.subject()
+        if by_plates and not any(mask.any() for mask in by_plates.values()):
+            raise ImportProblem(
+                f"pictures.clean_plate = {self.settings.pictures.clean_plate!r}: no pixel of a "
+                "frame differs from its clean plate: are they of the stage without the subject?"
+            )
+        return out | by_plates
 
     def _undistorted(self, masks: Mapping[str, Bools]) -> dict[str, Bools]:
         return {
@@ -391,22 +413,7 @@ def _mask(path: Path, camera: Camera) -> Bools:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if found == expected else None
     if image is None:
         raise ImportProblem(f"{path}: expected a PNG of {expected} pixels, got {found}")
-    return np.asarray(image) >= 128
-
-
-def _head(path: Path) -> Mesh | None:
     try:
-        return read_obj(path) if path.is_file() else None
+        return half_grey(np.asarray(image, np.uint8))
     except ValueError as error:
-        raise ImportProblem(str(error)) from error
-
-
-def _scalp(path: Path) -> str | None:
-    """The text of a file of points, once it could be read as such."""
-    if not path.is_file():
-        return None
-    try:
-        read_points(path)
-    except ValueError as error:
-        raise ImportProblem(str(error)) from error
-    return path.read_text()
+        raise ImportProblem(f"{path}: {error}") from error

@@ -39,7 +39,7 @@ class Patterns:
     `{camera}`, `{light}` and `{projector}` are names, or the number that a name ends in;
     `{exposure}` is seconds (`0.02`, `1-50`) or a name of `exposures`; `{row}` a projector's row;
     `{number}` counts what else there is several of, in the order of shooting: tracking frames and
-    rows in one count; `*` is any text.
+    rows in one count; of lights that are shot once cameras may count apart; `*` is any text.
     `clean_plate` shows the stage without the subject, `flat` an evenly lit field.
     """
 
@@ -148,11 +148,16 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     steps: list[Step] = []
     frames: dict[tuple[int, str], Bracket] = {}
     kinds: list[tuple[StepKind, tuple[Any, ...], list[_Match]]] = []
+    shots = matches.get("olat", [])
+    once = len({(m.light, m.camera, m.exposure) for m in shots}) == len(shots)
     for kind in get_args(StepKind):
         groups: dict[tuple[Any, ...], list[_Match]] = defaultdict(list)
         for match in matches.get(kind, []):
-            place = -1 if kind != "olat" else reader.lights.index(str(match.light))
-            groups[(place, *match.shot)].append(match)
+            if kind == "olat":  # of a light that is shot once cameras may have numbers of their own
+                place = reader.lights.index(str(match.light))
+                groups[(place,) if once else (place, *match.shot)].append(match)
+            else:
+                groups[match.shot].append(match)
         kinds += [(kind, key, group) for key, group in groups.items()]
     rank = {"dark": 0, "all_on": 1, "olat": 2, "tracking": 3, "scanline": 3}
     for kind, _, group in sorted(kinds, key=lambda k: (rank[k[0]], k[1], k[0])):
@@ -175,9 +180,11 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     }
     left = [n for n, p in names.items() if p not in used and p.suffix.lower() in FORMATS]
     shot = {s.light for s in steps}
+    without = sorted({c.name for c in rig.cameras} - {camera for _, camera in frames})
+    bare = [f"no picture of {_few(without)}: all its frames are missing"] if without else []
     return Found(
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
-        tuple(left), (*_notes(rig, shot, used, settings, left), *reader.notes()),
+        tuple(left), (*bare, *_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""cameras.json, lights.json and projectors.json of a folder to import."""
+"""cameras.json, lights.json, projectors.json, head.obj and scalp.obj of a folder to import."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from reconstruction.arrays import Array
 from reconstruction.capture.import_settings import ImportProblem
 from reconstruction.containment import is_file_name
+from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
+from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.placement import FURTHEST, NEAREST, PlacementError, Sight, length
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig, RigError
 from reconstruction.reading import read_json
+
+SMALLEST, LARGEST = 0.03, 2.5
+"""Metres across a part of a scalp, and a head on its body."""
 
 
 def _entries(path: Path, key: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -135,3 +142,58 @@ def projectors_of(path: Path) -> tuple[Projector, ...]:
         return Rig.from_dict({"cameras": [camera], "projectors": entries}).projectors
     except (RigError, ValueError, TypeError, LookupError) as error:
         raise ImportProblem(f"{path}: {error}") from error
+
+
+def check_metres(folder: Path, rig: Rig, *own: str) -> None:
+    """Whether the folder's `own` files ("cameras", "lights") can count in metres.
+
+    Raises `ImportProblem` where most are too far from what the cameras look at, or too near.
+    """
+    try:
+        sight = Sight.of(rig.cameras)
+    except PlacementError:
+        return
+    lights = np.array([x.position for x in rig.lights])
+    far = {"cameras": sight.distance, "lights": np.linalg.norm(lights - sight.point, axis=1)}
+    for kind in filter(None, own):
+        distance = float(np.median(far[kind]))
+        if sight.whole and not NEAREST <= distance <= FURTHEST:
+            raise ImportProblem(
+                f"{folder / kind}.json: the {kind} stand {length(distance)} from what the "
+                "cameras look at: its numbers must be metres, with z up, whatever the unit of "
+                "other files"
+            )
+
+
+def _check_size(path: Path, points: Array) -> None:
+    """Whether `points (N, 3)` of a head, or of a part of one, can be metres."""
+    wide = float(np.ptp(points, axis=0).max())
+    if not SMALLEST <= wide <= LARGEST:
+        raise ImportProblem(
+            f"{path}: is {length(wide)} wide: its numbers must be metres, with z up, whatever the "
+            "unit of cameras and lights"
+        )
+
+
+def head_of(path: Path) -> Mesh | None:
+    """The mesh of head.obj; None where there is no file."""
+    if not path.is_file():
+        return None
+    try:
+        head = read_obj(path)
+    except ValueError as error:
+        raise ImportProblem(str(error)) from error
+    _check_size(path, head.vertices)
+    return head
+
+
+def scalp_of(path: Path) -> str | None:
+    """The text of a file of points, once it could be read as such."""
+    if not path.is_file():
+        return None
+    try:
+        points, _ = read_points(path)
+    except ValueError as error:
+        raise ImportProblem(str(error)) from error
+    _check_size(path, points)
+    return path.read_text()

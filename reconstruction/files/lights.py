@@ -3,8 +3,8 @@
 `.json`: a list of positions, a name for each, or a list under `lights`, `light_positions` or
 `positions`; a light may be an object with `position` and what `Light` has of `name` (or `id`),
 `intensity`, `colocated_camera`. `.csv` and `.txt`: x, y, z, before them a name where there is one,
-after them an intensity; a first line may name the columns. `.npy`: (N, 3). `.obj`, `.pc`: lines
-`v x y z`.
+after them an intensity; a first line may name the columns; beside semicolons a comma is a decimal
+one. `.npy`: (N, 3). `.obj`, `.pc`: lines `v x y z`.
 """
 
 from __future__ import annotations
@@ -141,11 +141,12 @@ def _vertices(path: Path) -> list[dict[str, Any]]:
 def _table(path: Path) -> list[dict[str, Any]]:
     text = plain_file(path).read_text(encoding="utf-8-sig")  # as spreadsheets write it
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = (
-        list(csv.reader(lines, skipinitialspace=True))
-        if any("," in line for line in lines)
-        else [line.split() for line in lines]
-    )
+    if any(";" in line for line in lines):  # where numbers have a decimal comma
+        rows = list(csv.reader([x.replace(",", ".") for x in lines], delimiter=";"))
+    elif any("," in line for line in lines):
+        rows = list(csv.reader(lines, skipinitialspace=True))
+    else:
+        rows = [line.split() for line in lines]
     if rows and {"x", "y", "z"} <= {w.strip().lower() for w in rows[0]}:
         columns = [w.strip().lower() for w in rows.pop(0)]
         return [_named_row(dict(zip(columns, row, strict=False)), path) for row in rows]

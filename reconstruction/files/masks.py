@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from reconstruction.arrays import Bools
 from reconstruction.containment import plain_file
@@ -40,9 +41,23 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
     end = 8
     while end + _LENGTH.size <= len(data):
         end += 12 + _LENGTH.unpack_from(data, end)[0]  # a chunk's own three words, and its data
-    image = None
+    image: NDArray[np.uint8] | None = None
     if end <= len(data):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape != (height, width):
         raise ValueError(f"{expected}, got one that is damaged")
+    return half_grey(image)
+
+
+def half_grey(image: NDArray[np.uint8]) -> Bools:
+    """Where a grey picture `(H, W)` is half grey and above.
+
+    Raises `ValueError` where nothing is, though not all is black, as of labels 0 and 1.
+    """
+    brightest = int(image.max(initial=0))
+    if 0 < brightest < 128:
+        raise ValueError(
+            f"shows nothing: half grey (128) and above is taken, its brightest pixel is {brightest}"
+            ": write white (255) for a label"
+        )
     return np.asarray(image >= 128)

@@ -184,7 +184,7 @@ def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: st
     distance = float(np.median(sight.distance))
     if not NEAREST <= distance <= FURTHEST:
         scaled = {n: distance * m / metres(options.unit) for n, m in METRES.items()}
-        text = f"the cameras stand {_length(distance)} from what they look at"
+        text = f"the cameras stand {length(distance)} from what they look at"
         raise PlacementError(text + _right_unit(scaled, "--unit"))
     try:
         unsure = _check_up(cameras)
@@ -218,7 +218,7 @@ def check_lights(cameras: Sequence[Camera], lights: Sequence[Light], unit: Unit)
 
     if not NEAREST <= distance(1.0) <= FURTHEST:
         scaled = {n: distance(m / metres(unit)) for n, m in METRES.items()}
-        text = f"the lights stand {_length(distance(1.0))} from what the cameras look at"
+        text = f"the lights stand {length(distance(1.0))} from what the cameras look at"
         raise PlacementError(text + _right_unit(scaled, "--light-unit"))
 
 
@@ -232,7 +232,8 @@ def _right_unit(distances: dict[str, float], option: str) -> str:
     return "; their file counts in " + " or ".join(f"{names[n]}: give {option} {n}" for n in fits)
 
 
-def _length(value: float) -> str:
+def length(value: float) -> str:
+    """`value` metres, for people."""
     if value >= 1000:
         return f"{value / 1000:.3g} km"
     return f"{value:.3g} m" if value >= 0.1 else f"{1000 * value:.3g} mm"

@@ -226,31 +226,37 @@ def _angles(pictures: Array, where: Array) -> Array:
 
 
 def check_light_axes(pictures: Array, where: Array, towards: Array) -> list[str]:
-    """Whether lights in front of a camera are those under which its pictures are bright.
+    """Whether a light makes those pictures bright whose cameras it stands nearest to.
 
     `pictures (L, C, T)`, `where (L, 3)` and `towards (C, 3)`, places of lights and cameras, from
     the subject. Held against all exchanges and turnings round of the axes of the lights' world.
+    What all cameras see alike of a light says nothing: dark hair above bright skin is brighter
+    under lights from below.
     """
-    bright = np.log(np.maximum(pictures.mean(axis=2), 1e-12))
-    bright = bright - bright.mean(axis=0)
-    if not bright.std() > 0:
-        return []
+    bright = _apart(np.log(np.maximum(pictures.mean(axis=2), 1e-12)))
     places = where / np.linalg.norm(where, axis=1, keepdims=True)
     eyes = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     found = {}
     for axes in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             turned = places[:, axes] * signs
-            facing = turned @ eyes.T
+            facing = _apart(turned @ eyes.T)
             named = zip(axes, signs, strict=True)
             key = " ".join(("-" if s < 0 else "") + "xyz"[a] for a, s in named)
-            facing -= facing.mean(axis=0)
-            found[key] = float(np.corrcoef(facing.ravel(), bright.ravel())[0, 1])
+            both = float(np.linalg.norm(facing) * np.linalg.norm(bright))
+            found[key] = float((facing * bright).sum()) / max(both, 1e-12)
     best = max(found, key=lambda k: found[k])
     if found[best] < 0.5 or found[best] < found["x y z"] + 0.15:
         return []
     return [
-        f"the pictures are bright under lights that stand elsewhere than in front of the cameras "
+        f"pictures are brighter than other cameras' under lights that do not stand before theirs "
         f"(correlation {found['x y z']:.2f}); were the lights' axes {best}, it would be "
         f"{found[best]:.2f}: turn the file of lights so"
     ]
+
+
+def _apart(values: Array) -> Array:
+    """What of `values (L, C)` is neither a light's in all cameras nor a camera's under all."""
+    return np.asarray(
+        values - values.mean(axis=0) - values.mean(axis=1, keepdims=True) + values.mean()
+    )

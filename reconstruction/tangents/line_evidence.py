@@ -124,17 +124,18 @@ def _line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
 def pool(points: AnyFloats, radius: float, most: int = 24) -> sparse.csr_array:
     """Weights `(N, N)` that average over neighbours within `radius` metres: a Gaussian of half it.
 
-    Each row sums to 1. At most `most` neighbours count.
+    Each row sums to 1. At most `most` neighbours count. They are single, as scores are: double ones
+    would make a double copy of all scores, and of the means.
     """
     if not len(points):
-        return sparse.csr_array((0, 0))
+        return sparse.csr_array((0, 0), dtype=np.float32)
     k = min(most, len(points))
     distance, index = cKDTree(points).query(points, k=np.arange(1, k + 1))
     weight = np.where(distance <= radius, np.exp(-2 * (distance / radius) ** 2), 0)
     weight /= weight.sum(axis=1, keepdims=True)
     rows = np.repeat(np.arange(len(points)), k)
     table = sparse.csr_array(
-        (weight.ravel(), (rows, index.ravel())), shape=(len(points), len(points))
+        (weight.astype(np.float32).ravel(), (rows, index.ravel())), shape=(len(points), len(points))
     )
     table.eliminate_zeros()
     return table

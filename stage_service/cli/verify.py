@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stage_service.cli.support.commands import FAILED, Commands, Output, add_command, progress_bar
+from stage_service.cli.support.commands import (
+    FAILED,
+    BadArgument,
+    Commands,
+    Output,
+    add_command,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from reconstruction.capture.import_folder import Import
@@ -85,7 +92,9 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     for note in notes:
         output.note(note)
     if args.dry_run:
-        sheet = args.out.with_name(f"{args.out.name}-contact-sheet.png")
+        out = args.out.resolve()  # "." has a name, too
+        sheet = out.with_name(f"{out.name}-contact-sheet.png")
+        sheet.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(understood, sheet)
         text = "\n".join([*understood.said(), f"{sheet}: what the pictures look like"])
         output.result({"sheet": str(sheet), **understood.counts(), "notes": notes}, text)
@@ -118,6 +127,11 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
 
     where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
     given = {f: value for f, value in where.items() if value is not None}
+    if args.take is not None and args.preset != "faceolat":
+        raise BadArgument("--take goes with --preset faceolat")
+    for name in ("settings", "pictures", "light_distance") if args.preset else ():
+        if getattr(args, name) is not None:
+            raise BadArgument(f"--{name.replace('_', '-')} does not go with --preset: leave it out")
     if args.preset is not None:
         parse_options(PlacementOptions, given, "import")
         of_set = PresetFiles(args.folder, args.take, args.cameras, args.lights)
@@ -135,6 +149,11 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     named = {**vars(said), **asked, "placement": {**where_said, **given}}
     files = files_in(args.folder, parse_options(GeometryFiles, named, "import"))
     geometry = read_geometry(files) if files.cameras or files.lights else None
+    if geometry is None and files != GeometryFiles():
+        raise BadArgument(
+            "units, light distance, up and camera axes go with --cameras; cameras.json and "
+            "lights.json are in metres, z up, with OpenCV's axes"
+        )
     if args.pictures is not None:
         patterns = replace(settings.pictures, olat=args.pictures)
         settings = replace(settings, pictures=patterns)

@@ -85,7 +85,7 @@ def _read_json(path: Path) -> CameraFile:
     if isinstance(data, dict) and "frames" in data:
         return read_transforms(path, data)
     if isinstance(data, dict):
-        return CameraFile(cameras_from(path, data))
+        return cameras_from(path, data)
     raise CameraFileError(f"{path}: expected an object, with 'frames' or a map for each camera")
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import Array
@@ -20,6 +19,7 @@ from reconstruction.files.cameras.errors import (
     camera_of,
     pinhole_K,
 )
+from reconstruction.files.pictures import picture_size
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens_models import LensModel
 
@@ -102,9 +102,8 @@ def _size(path: Path, picture: str, fields: dict[str, Any], where: str) -> tuple
         return int(_number(fields, "w", where)), int(_number(fields, "h", where))
     for suffix in ("", ".png", ".jpg", ".exr"):
         there = path.parent / (picture + suffix)
-        image = cv2.imread(str(there), cv2.IMREAD_UNCHANGED) if there.is_file() else None
-        if image is not None:
-            return image.shape[1], image.shape[0]
+        if there.is_file():
+            return picture_size(there)
     raise CameraFileError(
         f"{where}: neither the fields 'w' and 'h' nor a picture {picture} say how large it is: "
         "add w and h"

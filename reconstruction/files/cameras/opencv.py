@@ -36,24 +36,26 @@ def read_opencv(path: Path) -> CameraFile:
 
     Raises `CameraFileError` naming the field.
     """
-    data = _storage(path)
-    if any(k in data for k in _K):
-        return CameraFile([camera_from(str(path), path.stem, data)])
-    return CameraFile(cameras_from(path, data))
+    return cameras_from(path, _storage(path))
 
 
 def read_opencv_folder(folder: Path, files: list[Path]) -> CameraFile:
     """A camera from each file."""
-    cameras = [camera for file in files for camera in read_opencv(file).cameras]
-    return CameraFile(cameras)
+    read = [read_opencv(file) for file in files]
+    return CameraFile([c for r in read for c in r.cameras], [n for r in read for n in r.notes])
 
 
-def cameras_from(path: Path, data: Mapping[str, Any]) -> list[Camera]:
-    """A camera for each map in `data`, by its name."""
+def cameras_from(path: Path, data: Mapping[str, Any]) -> CameraFile:
+    """The camera of `data`, called after the file, or one for each map in it, by its name."""
+    if any(k in data for k in _K):
+        return CameraFile([camera_from(str(path), path.stem, data)])
     maps = {k: v for k, v in data.items() if isinstance(v, Mapping) and any(f in v for f in _K)}
     if not maps:
         raise CameraFileError(f"{path}: neither it nor a map in it has one of {', '.join(_K)}")
-    return [camera_from(f"{path}: {name}", name, table) for name, table in maps.items()]
+    left = [k for k, v in data.items() if isinstance(v, Mapping) and k not in maps]
+    notes = [f"{path}: left out, as none of {', '.join(_K)} is there: {', '.join(left)}"]
+    cameras = [camera_from(f"{path}: {name}", name, table) for name, table in maps.items()]
+    return CameraFile(cameras, notes if left else [])
 
 
 def camera_from(where: str, name: str, table: Mapping[str, Any]) -> Camera:
@@ -105,9 +107,12 @@ def _array(
     name = next((n for n in names if n in table), None)
     if name is None:
         raise CameraFileError(f"{where}: has none of {', '.join(names)}")
+    said = table[name]
     try:
-        value = np.array(table[name], dtype=np.float64)
-    except (TypeError, ValueError):
+        if isinstance(said, Mapping):  # as OpenCV writes matrices in JSON
+            said = np.reshape(said["data"], (said["rows"], said["cols"]))
+        value = np.array(said, dtype=np.float64)
+    except (TypeError, ValueError, LookupError):
         value = np.full(1, np.nan)
     if (shapes and value.shape not in shapes) or not np.isfinite(value).all():
         expected = " or ".join(map(str, shapes or ()))

@@ -169,10 +169,48 @@ def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "masks" / "left.png"), np.zeros((3, 3), np.uint8))
     with pytest.raises(ImportProblem, match=r"left\.png: expected a PNG"):
         import_folder(folder, tmp_path / "out")
+    cv2.imwrite(str(folder / "masks" / "left.png"), np.ones((6, 8), np.uint8))
+    with pytest.raises(ImportProblem, match=r"left\.png: shows nothing: .* brightest pixel is 1"):
+        import_folder(folder, tmp_path / "out")
     (folder / "head.obj").write_text("v 0 0 0\n")
     (folder / "masks" / "left.png").unlink()
     with pytest.raises(ImportProblem, match=r"head\.obj: no faces"):
         import_folder(folder, tmp_path / "out")
+
+
+def test_what_does_not_count_in_metres_is_named(folder: Path, tmp_path: Path) -> None:
+    """Files of our own layout have no unit that an option could give."""
+
+    def refused(words: str) -> None:
+        with pytest.raises(ImportProblem, match=f"{words}.*must be metres, with z up"):
+            import_folder(folder, tmp_path / "out")
+
+    def scaled(kind: str, field: str, by: float) -> None:
+        edit(
+            folder / f"{kind}.json",
+            lambda d: [x.update({field: [by * v for v in x[field]]}) for x in d[kind]],
+        )
+
+    def turned(data: dict[str, Any]) -> None:
+        for entry in data["cameras"]:
+            del entry["center"]
+        data["cameras"][1]["R"] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+
+    edit(folder / "cameras.json", turned)  # both look at the origin
+    scaled("cameras", "t", 1000)
+    refused(r"cameras\.json: the cameras stand 1\.5 km from what the cameras look at")
+    scaled("cameras", "t", 1e-3)
+    scaled("lights", "position", 1000)
+    refused(r"lights\.json: the lights stand 1 km")
+    scaled("lights", "position", 1e-3)
+    corners = "v 0 0 0\nv 180 0 0\nv 0 230 0\n"
+    (folder / "head.obj").write_text(corners + "f 1 2 3\n")
+    refused(r"head\.obj: is 230 m wide")
+    (folder / "head.obj").unlink()
+    (folder / "scalp.obj").write_text(corners)
+    refused(r"scalp\.obj: is 230 m wide")
+    (folder / "scalp.obj").unlink()
+    import_folder(folder, tmp_path / "out")
 
 
 def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:

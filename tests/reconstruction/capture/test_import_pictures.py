@@ -20,6 +20,7 @@ from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
 from reconstruction.files.pictures import PictureError, Sensor, read_picture
 from reconstruction.images.silhouettes import silhouette
+from stage_service.cli import main
 
 SIZE = 24  # pixels on a side
 CAMERAS, LIGHTS = ("left", "right"), ("light_000", "light_001", "light_002")
@@ -233,6 +234,12 @@ def test_missing_frames_are_values(folder, tmp_path):
     assert not capture.has_light("light_001", "left")
     assert capture.has_light("light_001", "right")
     assert any("light_002" in note for note in capture.plan["import"]["notes"])
+    assert not any("no picture of" in note for note in capture.plan["import"]["notes"])
+    for picture in (folder / "images" / "right").iterdir():
+        picture.unlink()
+    capture = import_folder(folder, tmp_path / "again")
+    said = "no picture of right: all its frames are missing"
+    assert said in capture.plan["import"]["notes"]
 
 
 def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
@@ -284,6 +291,42 @@ def test_clean_plates_that_match_no_frame_are_told(folder, tmp_path):
     assert [p.name for p in capture.path.glob("subjects/*")] == ["left.png"]
 
 
+def test_clean_plates_that_show_the_subject_are_refused(folder, tmp_path):
+    for name in ("plate", "olat"):
+        everywhere(lambda c, n, x, at=name: save(folder / at / c / f"{n}.png", x, np.uint16))
+    text = 'pictures.olat = "olat/{camera}/{light}.png"\n'
+    settings(folder, text + 'pictures.clean_plate = "plate/{camera}/{light}.png"')
+    with pytest.raises(ImportProblem, match="no pixel of a frame differs from its clean plate"):
+        import_folder(folder, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        (["--unit", "mm"], "up and camera axes go with --cameras; cameras.json"),
+        (["--up", "y"], "up and camera axes go with --cameras; cameras.json"),
+        (["--light-distance", "2"], "light distance, up and camera axes go with --cameras"),
+        (["--take", "ID20001"], "--take goes with --preset faceolat"),
+        (["--preset", "humanolat", "--pictures", "x"], "--pictures does not go with --preset"),
+    ],
+)
+def test_options_that_nothing_would_read_are_refused(folder, tmp_path, capsys, asked, says):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    assert main(["import", str(folder), "--out", str(tmp_path / "out"), *asked]) != 0
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_draws_beside_a_folder_that_is_not_there(folder, tmp_path, monkeypatch):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    assert main(["import", str(folder), "--out", str(tmp_path / "new/out"), "--dry-run"]) == 0
+    assert (tmp_path / "new" / "out-contact-sheet.png").is_file()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert main(["import", str(folder), "--out", ".", "--dry-run"]) == 0
+    assert (tmp_path / "here-contact-sheet.png").is_file()
+
+
 def test_a_flat_field_evens_the_lens(folder, tmp_path):
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     falls = (1 - 0.4 * (x**2 + y**2) / (x**2 + y**2).max())[..., None].astype(np.float32)
@@ -296,6 +339,17 @@ def test_a_flat_field_evens_the_lens(folder, tmp_path):
     capture = import_folder(folder, tmp_path / "out")
     expected = light_of(0, 1) * falls.mean()
     np.testing.assert_allclose(capture.light("light_001", "left")[0], expected, rtol=2e-3)
+
+
+def test_a_flat_field_that_saturates_is_refused(folder, tmp_path):
+    """It would say that the lens darkens nothing."""
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    falls = np.linspace(0.5, 1.6, SIZE)[:, None, None] * np.ones((1, SIZE, 3), np.float32)
+    for camera in CAMERAS:
+        save(folder / f"flat_{camera}.png", falls, np.uint16)
+    settings(folder, 'pictures.flat = "flat_{camera}.png"')
+    with pytest.raises(ImportProblem, match=r"flat_.*\.png: a flat field must not saturate, 5\d% "):
+        import_folder(folder, tmp_path / "out")
 
 
 def cut_off(path: Path) -> None:
@@ -370,6 +424,23 @@ def test_a_raw_file_of_a_sensor_that_is_not_known_is_refused(tmp_path, sensor, s
     write_dng(tmp_path / "odd.dng", np.full((24, 32), 1000, np.uint16), **sensor)
     with pytest.raises(PictureError, match=says):
         read_picture(tmp_path / "odd.dng", Sensor(), (32, 24))
+
+
+def test_numbers_of_each_camera_are_one_step_of_a_light(folder, tmp_path):
+    """A counter of the camera's own says nothing of a light that is shot once."""
+    numbers = iter(range(900))
+    everywhere(
+        lambda c, n, x: save(folder / "images" / c / f"{next(numbers)}_{n}.png", x, np.uint16)
+    )
+    settings(folder, "[pictures]\nolat = 'images/{camera}/{number}_{light}.png'\n")
+    capture = import_folder(folder, tmp_path / "out")
+    assert [s.light for s in capture.steps] == list(LIGHTS)
+    assert all(capture.has(s, c) for s in capture.steps for c in CAMERAS)
+    # where one is shot twice the number tells which is which
+    save(folder / "images/left/1000_0.png", light_of(0, 0), np.uint16)
+    save(folder / "images/right/1000_0.png", light_of(1, 0), np.uint16)
+    again = import_folder(folder, tmp_path / "again")
+    assert [s.light for s in again.steps if again.has(s, "left")] == [LIGHTS[0], *LIGHTS]
 
 
 def test_two_files_for_one_frame(folder, tmp_path):

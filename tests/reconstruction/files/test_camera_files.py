@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction import Camera
+from reconstruction import Camera, write_exr
 from reconstruction.files.cameras import CameraFileError, read_cameras
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModel, LensModelCamera
@@ -53,6 +53,7 @@ WRITERS: dict[str, Callable[[Path, list[Camera]], object]] = {
     "cameras.xml": writers.write_metashape,
     "2.xml": lambda path, cameras: writers.write_metashape(path, cameras, component=True),
     "opencv": writers.write_opencv,
+    "opencv.json": writers.write_opencv_json,
     "map.json": writers.write_map,
 }
 
@@ -156,6 +157,21 @@ def test_what_opencv_did_not_write_is_refused(tmp_path: Path) -> None:
             read_cameras(path)
 
 
+def test_a_camera_alone_and_a_map_without_a_camera_in_json(tmp_path: Path) -> None:
+    first, second, *_ = stage()
+    path = tmp_path / "cameras.json"
+    writers.write_map(path, [first, second])
+    data = json.loads(path.read_text())
+    data[second.name]["intrinsics"] = data[second.name].pop("K")
+    path.write_text(json.dumps(data))
+    found = read_cameras(path)
+    assert_same_pixels(found.cameras, [first])
+    assert [n.endswith(f"is there: {second.name}") for n in found.notes] == [True]
+    alone = tmp_path / f"{first.name}.json"
+    alone.write_text(json.dumps(data[first.name]))
+    assert_same_pixels(read_cameras(alone).cameras, [first])
+
+
 def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
     """As files have it that list a frame for each camera and light."""
     path = tmp_path / "transforms.json"
@@ -166,6 +182,24 @@ def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
         for i, frame in enumerate(data["frames"])
         for k in range(3)
     }
+    path.write_text(json.dumps(data))
+    assert_same_pixels(read_cameras(path).cameras, stage())
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".tif", ".png"])
+def test_pictures_say_how_large_they_are_where_the_file_does_not(suffix, tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    writers.write_transforms(path, stage())
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        del frame["w"], frame["h"]
+        frame["file_path"] = frame["file_path"].replace(".png", suffix)
+        there = tmp_path / frame["file_path"]
+        there.parent.mkdir(exist_ok=True)
+        if suffix == ".exr":
+            write_exr(there, np.zeros((480, 640, 3), np.float32))
+        else:
+            cv2.imwrite(str(there), np.zeros((480, 640, 3), np.uint8))
     path.write_text(json.dumps(data))
     assert_same_pixels(read_cameras(path).cameras, stage())
 

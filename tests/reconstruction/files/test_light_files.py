@@ -18,6 +18,15 @@ def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[1].position, (3, 4, 5))
 
 
+def test_a_spreadsheet_may_have_semicolons_and_decimal_commas(tmp_path: Path) -> None:
+    path = tmp_path / "lights.csv"
+    path.write_text("name;x;y;z;intensity\nkey;1,5;-2;0,25;3\nfill; 0;1,0;2;0,5\n")
+    key, fill = read_lights(path).lights
+    assert (key.name, fill.name) == ("key", "fill")
+    assert key.position.tolist() == [1.5, -2, 0.25]
+    assert fill.intensity.tolist() == [0.5, 0.5, 0.5]
+
+
 def test_four_numbers_are_a_name_and_a_place_only_where_the_first_may_be_a_name(
     tmp_path: Path,
 ) -> None:

@@ -21,6 +21,14 @@ def test_half_grey_and_above_is_the_mask(png, tmp_path):
     assert mask.tolist() == [[False, False, True], [True, False, True]]
 
 
+def test_labels_are_no_mask(tmp_path):
+    """0 and 1, as programs for marking write them, were taken for a mask that shows nothing."""
+    labels = np.array([[0, 1, 1], [0, 0, 1]], np.uint8)
+    with pytest.raises(ValueError, match="its brightest pixel is 1: write white"):
+        decode_mask(bytes(cv2.imencode(".png", labels)[1]), 3, 2)
+    assert not decode_mask(bytes(cv2.imencode(".png", 0 * labels)[1]), 3, 2).any()
+
+
 def test_what_a_file_says_of_its_sizes_is_not_believed(png, monkeypatch):
     with pytest.raises(ValueError, match="expected a PNG of 2x3 pixels, got 3x2"):
         decode_mask(png, 2, 3)

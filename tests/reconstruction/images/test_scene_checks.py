@@ -72,9 +72,12 @@ def test_a_camera_that_looks_elsewhere_is_named() -> None:
 
 @pytest.fixture(scope="module")
 def lit() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return shown(cameras()[::2])
+
+
+def shown(stage: list[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tiles (L, C, T) of the lumps, matte, under 120 lights; places of lights and cameras."""
-    stage, lights = cameras()[::2], dome_positions(120, 1.5)
-    pictures = []
+    lights, pictures = dome_positions(120, 1.5), []
     for camera in stage:
         depth, normal = hits(camera)
         shade = np.maximum(normal @ (lights / 1.5).T, 0) * np.isfinite(depth)[..., None]
@@ -117,9 +120,21 @@ def test_lights_in_another_world_than_the_cameras_are_told(lit, axes, signs, nam
     assert f"were the lights' axes {named}, it would be" in said
 
 
+def test_dark_hair_above_bright_skin_turns_no_axis_round() -> None:
+    places = [[np.cos(a), np.sin(a), 0.5 - 0.2 * (a > 2)] for a in (0, 0.8, 1.6, 2.4)]
+    above = [Camera.look_at(f"cam_{i}", 96, 80, p, [0, 0, 0], 28) for i, p in enumerate(places)]
+    pictures, lights, eyes = shown(above)
+    answers = np.exp(-2.0 * lights[:, 2] / 1.5)  # from below, where skin is, 50 times as bright
+    pictures = pictures * answers[:, None, None]
+    assert check_light_axes(pictures, lights, eyes) == []
+    (said,) = check_light_axes(pictures, lights[:, [1, 0, 2]] * [-1, 1, 1], eyes)
+    assert "were the lights' axes y -x z, it would be" in said
+
+
 def test_pictures_that_show_nothing_say_nothing() -> None:
     places = dome_positions(30, 1.5)
     assert check_light_axes(np.full((30, 2, 9), 3.0), places, np.eye(3)[:2]) == []
+    assert check_light_axes(1 + places[:, :1, None], places, np.eye(3)[:1]) == []  # one camera
 
 
 def test_a_whole_capture_is_held_against_its_pictures(tmp_path: Path) -> None:

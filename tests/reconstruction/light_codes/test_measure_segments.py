@@ -22,6 +22,7 @@ from reconstruction import (
     read_strands,
     reconstruct,
 )
+from reconstruction.estimate import estimate
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank, SearchOptions
@@ -47,6 +48,8 @@ def test_photometric_finds_the_fibres_and_reports_what_it_saw(
     shot: Capture, fibres: Any, tmp_path: Path
 ) -> None:
     report = run(shot, tmp_path)
+    told = [s.name for s in estimate(shot, method="photometric", options=QUICK).stages]
+    assert told == [s.name for s in report.stages]
     strands = read_strands(tmp_path / "strands.npz")
     figures = compare_strands(strands, fibres.strands, samples=None)["all"]
     assert figures["2mm_20deg"]["f"] > 0.6

@@ -260,9 +260,15 @@ def test_scores_are_made_and_decided_without_many_times_their_memory() -> None:
     tracemalloc.reset_peak()
     decide(scores, candidates)
     of_deciding = tracemalloc.get_traced_memory()[1] - scores.nbytes
+    near = pool(points, 1e-3, 8)
+    tracemalloc.reset_peak()
+    before = tracemalloc.get_traced_memory()[0]
+    _ = near @ scores
+    of_averaging = tracemalloc.get_traced_memory()[1] - before
     tracemalloc.stop()
     assert of_making < 5 * scores.nbytes
     assert of_deciding < 2 * scores.nbytes
+    assert of_averaging < 1.5 * scores.nbytes  # the means themselves, and no copy
 
 
 def test_views_that_see_noise_do_not_outvote_one_that_sees_the_highlight() -> None:
