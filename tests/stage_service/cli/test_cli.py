@@ -289,6 +289,21 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
     assert "root to tip" in printed
 
 
+def test_another_unit_is_told_before_what_it_makes_long(capsys, tmp_path, monkeypatch):
+    line = np.array([[0, 0, 0], [0, 0, 0.1]])
+    write_strands(tmp_path / "true.npz", Strands.from_list([line]))
+    write_strands(tmp_path / "mm.npz", Strands.from_list([1e3 * line]))
+
+    def endless(*_args, **_more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("reconstruction.evaluation.assessment.assess_strands", endless)
+    assert (
+        main(["evaluate", "geometry", *(str(tmp_path / f"{n}.npz") for n in ("mm", "true"))]) == 130
+    )
+    assert "both in metres?" in capsys.readouterr().err
+
+
 def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(200, 3))
