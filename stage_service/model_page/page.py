@@ -34,7 +34,7 @@ from stage_service.model_page.names import (
 )
 from stage_service.model_page.plots import error_plots, time_bars
 
-PAGE = "index.html"
+PAGE, FIELD_FILE = "index.html", "field.npz"
 HERO = ("relit.png", "render.png", "comparison.png")
 """The picture at the top: the first that is there."""
 SHOWN = {
@@ -184,16 +184,14 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
         said.append("" if error is None else f" ± {error:.0%}")
     yield "colour", [*said, "" if known else ", no error known"]
     yield "skin", [_swatch(fit["skin"]), ", ".join(f"{x:.2f}" for x in fit["skin"])]
-    if model.has("rejected"):
-        yield (
-            "not used",
-            [
-                "inverse rendering: Sun's fit is better on validation frames; "
-                "the maps are in rejected"
-            ],
-        )
-    elif _by_inverse_rendering(model):
+    if _by_inverse_rendering(model):
         yield "rendered", ["inverse rendering; the roughness and colour above are its start"]
+    if model.has(FIELD_FILE):
+        yield "field", [link(FIELD_FILE), ": what the hair reflects beyond that is rendered too"]
+    rejected = {"hair_maps.npz": "inverse rendering", FIELD_FILE: "the field of reflectance"}
+    for name, what in rejected.items():
+        if model.rejected().has(name):
+            yield "not used", [f"{what}, not clearly better: ", link(f"rejected/{name}")]
 
 
 def _swatch(linear: Sequence[float]) -> Html:

@@ -118,6 +118,28 @@ def test_a_plot_is_an_svg_in_which_time_goes_right_and_error_up(model):
     assert svg.attrib["aria-label"].startswith("growth of strands: <img")
 
 
+def test_what_is_rendered_and_what_is_not_is_said_of_each_fit_by_itself(model):
+    report = model.report()
+    with report.stage("inverse_rendering"):
+        pass
+    model.write_report(report)
+    for name in ("hair_maps.npz", "field.npz"):
+        model.write_arrays(name, {"a": np.zeros(1)})
+    assert "not used" not in (text := Page(model_page(model)).text)
+    assert "rendered inverse rendering" in text.replace("renderedinverse", "rendered inverse")
+    assert "what the hair reflects beyond that is rendered too" in text
+    model.reject("field.npz")
+    page = Page(model_page(model))
+    assert "inverse rendering; the roughness and colour above are its start" in page.text
+    assert "not usedthe field of reflectance, not clearly better" in page.text
+    assert "inverse rendering, not clearly better" not in page.text
+    assert "rejected/field.npz" in page.values("href")
+    model.reject("hair_maps.npz")
+    text = Page(model_page(model)).text
+    assert "not usedinverse rendering, not clearly better" in text
+    assert "validation frames" not in text  # the frames need not have preferred the other
+
+
 def test_a_page_of_little_is_a_page(tmp_path, capsys):
     empty = Model(tmp_path / "empty").create()
     assert "There are no strands yet" in Page(model_page(empty)).text

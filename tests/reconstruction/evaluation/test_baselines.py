@@ -195,7 +195,7 @@ def test_true_directions_are_the_mean_over_a_cube() -> None:
 def test_what_lies_a_world_away_keeps_its_direction() -> None:
     true = Strands.from_list([np.array([[0.002, 0.002, 0.002], [0.002, 0.002, 0.1]])])
     at = np.array([[0.001, 0.001, 0.05], [1e5, 1e5, 1e5]])
-    ours = Strands.from_list([np.array([p, p + (0.02, 0, 0)]) for p in at])
+    ours = Strands.from_list([np.array([p, p + np.array([0.02, 0, 0])]) for p in at])
     pieces = with_true_directions(ours, true, 4e-3)
     middle, tangent = pieces.points[::2], np.abs(pieces.tangents()[::2])
     inside = (middle[:, 0] < 3.9e-3) & (tangent[:, 2] > 0.999)
