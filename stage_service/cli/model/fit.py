@@ -72,6 +72,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     if args.field_options and args.field in (None, "none"):
         raise BadArgument("--field-options says how a field is fitted: say which with --field")
+    of_field = read_json(args.field_options)
+    if "field" in of_field:
+        raise BadArgument("--field says which field is fitted, not --field-options")
     model, inverse = Model(args.model), args.method == "inverse_rendering"
     asked = {
         "held_out_cameras": args.hold_out_camera,
@@ -80,7 +83,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "environment": args.environment,
         "seed": args.seed,
         "inverse_rendering" if inverse else "fit": read_json(args.options),
-        "fields": {"field": args.field or "none", **read_json(args.field_options)},
+        "fields": {"field": args.field or "none", **of_field},
     }
     options = parse_options(JobOptions, asked)
     environment_map(options.environment)  # not after all of the fits

@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -287,6 +288,32 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
     assert printed.count("100.0 / 100.0 / 100.0") >= 9
     assert "equal length" in printed
     assert "root to tip" in printed
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("fit c m --field best --field-options {tmp}/list.json", "list.json: expected an object"),
+        ("fit c m --options {tmp}/bytes", "bytes is not JSON"),
+        ('fit c m --field best --field-options \'{{"field": "none"}}\'', "--field says which"),
+        ("rig check demo --radius nan", "radius > 0"),
+        ("head mark {tmp}/bytes --out {tmp}/h.obj", "bytes is no Wavefront OBJ"),
+        ("head fit {tmp}/bytes --out {tmp}/h.obj --turn-deg inf", "--turn-deg inf: expected"),
+        ("evaluate images {tmp} {tmp}/absent", "absent: no such picture or folder"),
+        ("render m --capture c --field interpolation --guide model", "--guide model: for a"),
+        ("calibrate rig c --truth {tmp}/absent.json --out {tmp}/r.json", "absent.json: no such"),
+        ("calibrate board {tmp}/b.xyz", "b.xyz: expected a file ending in .png"),
+        ("calibrate board {tmp}/b.png --dpi inf", "--dpi inf: squares of 8 to"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence_that_names_it_before_any_work(
+    capsys, tmp_path, command, said
+):
+    (tmp_path / "list.json").write_text("[1]")
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe")
+    code, data = run(capsys, *shlex.split(command.format(tmp=tmp_path)))
+    assert code == 3
+    assert said in data["error"]["detail"]
 
 
 def test_another_unit_is_told_before_what_it_makes_long(capsys, tmp_path, monkeypatch):

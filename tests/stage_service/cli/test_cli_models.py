@@ -290,6 +290,14 @@ def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
 
 
 @pytest.mark.usefixtures("fitted")
+def test_a_picture_makes_its_folder(made, capsys, tmp_path):
+    out = tmp_path / "new" / "picture.png"
+    code, found = run(capsys, "render", made.model, "--size", 16, "--spp", 1, "--out", out)
+    assert (code, found.get("image")) == (0, str(out))
+    assert out.is_file()
+
+
+@pytest.mark.usefixtures("fitted")
 def test_exports_tell_of_what_they_do_not_hold(made, capsys, tmp_path, monkeypatch):
     model = Model(shutil.copytree(made.model.path, tmp_path / "model"))
     capture = shutil.copytree(made.capture, tmp_path / "moved")
