@@ -29,7 +29,9 @@ from reconstruction import (
     write_exr,
     write_strands,
 )
+from simulators.subject.grooms import GROOMS
 from stage_service.cli import build_parser, main
+from stage_service.cli.stage.processes import SUBJECTS
 from stage_service.cli.support.children import Children
 from stage_service.cli.support.commands import CommandError, rig_path, run_command
 
@@ -201,6 +203,31 @@ def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
     assert code == 3
     assert "no demo wrote" in data["error"]["detail"]
     assert (tmp_path / "mine.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--seed", "-1"), "--seed -1: expected 0 or more"),
+        (("--subject", "curlyy"), "--subject curlyy: there is no such file"),
+        (("--head", "none.obj"), "wavy brings its own"),
+        (("--environment", "nosuch"), "nosuch: no such environment map"),
+        (("--subject", "{tmp}/broken.npz", "--head", "none.obj"), "broken.npz"),
+    ],
+)
+def test_a_word_that_is_wrong_costs_no_earlier_demo(capsys, tmp_path, monkeypatch, words, said):
+    def prepared(out: Path) -> None:
+        raise AssertionError("what was there would be gone")
+
+    monkeypatch.setattr("stage_service.cli.demo._prepare", prepared)
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    code, data = run(capsys, "demo", "--out", tmp_path, *(w.format(tmp=tmp_path) for w in words))
+    assert code == 3
+    assert said in data["error"]["detail"]
+
+
+def test_the_subjects_are_those_that_a_simulated_rig_has():
+    assert set(SUBJECTS) == set(GROOMS)
 
 
 def test_an_unreachable_service_is_exit_code_4(capsys):
