@@ -264,7 +264,11 @@ def _strand_table(found: Mapping[str, Any]) -> Html:
     scored = table(["", "", *heads], rows, "figures")
     if "lengths" not in first:
         return scored  # of an earlier version
-    rows = [[_ours(name, STRANDS), *strand_cells(figures)] for name, figures in found.items()]
+    rows = [
+        [_ours(name, STRANDS), *strand_cells(figures)]
+        for name, figures in found.items()
+        if "lengths" in figures
+    ]
     truth = strand_cells(first, [OF_TRUTH.get(title, ()) for title, *_ in STRAND_FIGURES])
     heads = [title for title, *_ in STRAND_FIGURES]
     whole = table(["", *heads], [*rows, ["the truth", *truth]], "figures")
@@ -295,13 +299,21 @@ def _appearance_table(fits: Mapping[str, Mapping[str, Any]]) -> Html:
     names = {key: None for figures in fits.values() for key in figures}
     rows = []
     for key in names:
-        rows.append([words(key), *(_numbers(figures.get(key, "–")) for figures in fits.values())])
+        said = _shares if key.endswith("_error") else _numbers
+        cells = (said(figures[key]) if key in figures else "–" for figures in fits.values())
+        rows.append([words(key), *cells])
     return table(["", *(PICTURES.get(n, words(n)) for n in fits)], rows, "figures")
 
 
 def _ours(name: str, titles: Mapping[str, str]) -> str:
     title = titles.get(name, words(name))
     return element("b", title) if name == "ours" else title
+
+
+def _shares(value: Any) -> str:
+    """Errors of logarithms."""
+    values = value if isinstance(value, list) else [value]
+    return ", ".join("not known" if x is None else f"± {x:.1%}" for x in values)
 
 
 def _numbers(value: Any) -> str:

@@ -118,6 +118,15 @@ def test_a_plot_is_an_svg_in_which_time_goes_right_and_error_up(model):
     assert svg.attrib["aria-label"].startswith("growth of strands: <img")
 
 
+def test_an_error_of_a_logarithm_is_a_share(model):
+    results = model.json("results.json")
+    fitted = {"beta_m": 0.33, "beta_m_error": 0.068, "sigma_a_error": [0.02, None, 0.1]}
+    model.write_json("results.json", {**results, "appearance": {"fitted": fitted}})
+    text = Page(model_page(model)).text
+    assert "beta m error± 6.8%" in text
+    assert "± 2.0%, not known, ± 10.0%" in text
+
+
 def test_what_is_rendered_and_what_is_not_is_said_of_each_fit_by_itself(model):
     report = model.report()
     with report.stage("inverse_rendering"):
