@@ -89,6 +89,11 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
             for key in ("devices", "capture", "safety")
             if (table := getattr(file, key)) is not None
         }
+    if truth is not None:
+        try:
+            compare_rigs(nominal, truth)  # what it lacks is told before the work
+        except KeyError as error:
+            raise BadArgument(f"--truth {args.truth}: {error.args[0]}") from error
     targets = Targets(
         _board(args),
         args.paper_albedo,

@@ -54,7 +54,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     "lights"}}', of hair that varies over the scalp and along strands, and the lights as they are
     found, in MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With --field,
     MODEL/field.npz holds what the hair reflects beyond that, on top of a fit that is there already
-    where it held out the same and --options ask for no other. With held-out cameras or lights, judge the model on them.
+    where it held out the same and --options ask for no other. With held-out cameras or lights,
+    judge the model on them.
     """
     from appearance import HeldOut
     from appearance.model.relight import environment_map

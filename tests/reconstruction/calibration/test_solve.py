@@ -9,6 +9,7 @@ import pytest
 
 from reconstruction import Capture, Rig
 from reconstruction.calibration.boards import CalibrationError
+from reconstruction.calibration.rig_comparison import compare_rigs
 from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
 from stage_service.cli import main
 from stage_service.config import load_rig_file
@@ -43,6 +44,29 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
     assert [s["name"] for s in report["stages"]] == ["cameras", "projectors", "lights"]
     assert "rows say nothing" in said["stages"]["projectors"]["undetermined"]["beam"]
     assert said["stages"]["lights"]["undetermined"] == {}
+
+
+def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None:
+    part = Rig("part", true_rig.cameras[:0:-1], true_rig.lights[2:], ())
+    errors = compare_rigs(part, true_rig)
+    assert set(errors["cameras"]) == {"cam_1", "cam_2"}
+    assert max(c["centre_mm"] for c in errors["cameras"].values()) < 1e-6
+    assert max(x["position"] for x in errors["lights"].values()) < 1e-9
+    with pytest.raises(KeyError, match="no camera 'cam_0' in this rig"):
+        compare_rigs(true_rig, part)
+
+
+def test_a_device_that_the_truth_lacks_is_told_before_the_work(
+    tmp_path: Path,
+    true_rig: Rig,
+    board_captures: list[Capture],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    truth = tmp_path / "truth.json"
+    truth.write_text(json.dumps(Rig("part", true_rig.cameras[1:], (), ()).to_dict()))
+    command = ["calibrate", "rig", str(board_captures[0].path), "--out", str(tmp_path / "r.json")]
+    assert main([*command, "--truth", str(truth), "--json"]) == 3
+    assert f"--truth {truth}: no camera 'cam_0'" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
