@@ -13,7 +13,7 @@ from reconstruction import Model, Report, Strands
 from reconstruction.report.report import Series
 from stage_service.cli import main
 from stage_service.model_page import model_page, write_page
-from stage_service.model_page.html import flat, number
+from stage_service.model_page.html import flat, number, size
 from stage_service.model_page.plots import error_plots
 
 EVIL = "<img src=x onerror=alert(1)> & \"'"
@@ -186,3 +186,11 @@ def test_figures_of_any_depth_become_rows():
         ("a · d", "1, 2"),
         ("e", "1 entries in report.json"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1 kB"), (999_400, "999 kB"), (999_999, "1 MB")],
+)
+def test_sizes_read_well(count, text):
+    assert size(count) == text
