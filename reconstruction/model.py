@@ -42,7 +42,7 @@ FILES = {
     "hair_maps.npz": "the hair's material over the scalp (inverse rendering)",
     "lights.json": "the lights as inverse rendering found them",
     "field.npz": "what the hair reflects beyond its material (hairstage fit --field)",
-    "rejected": "the same three files, where validation frames prefer going without",
+    "rejected": "the same three files, where pictures are not clearly better with them",
     "samples": "captured frames by camera, for pictures that interpolate them",
     "comparison.png": "held-out frames, captured and rendered",
     "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",

@@ -7,13 +7,17 @@ import importlib.util
 import re
 import shlex
 from collections.abc import Iterator
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 from benchmarks.__main__ import MODULES
 
+from appearance import HairAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
 from reconstruction.model import FILES
+from reconstruction.report.report import LeftOut, Series, Stage
 from stage_service.cli import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -138,6 +142,18 @@ def test_a_model_has_the_files_that_the_page_lists() -> None:
     table = page.split("## A model folder")[1].split("\n\n")[1]
     rows = re.findall(r"^- `([^`]+)`: (.*)$", table, re.MULTILINE)
     assert dict(rows) == FILES
+
+
+def test_the_fields_of_a_models_json_files_are_on_the_page() -> None:
+    page = (ROOT / "docs" / "files.md").read_text()
+    records = {
+        "appearance.json": (FittedAppearance, Uncertainty, HairAppearance),
+        "report.json": (Stage, Series, LeftOut),
+    }
+    for name, kinds in records.items():
+        said = page.split(f"\n- `{name}`: `")[1].split("\n- ")[0]
+        names = {field.name for kind in kinds for field in fields(kind)}
+        assert names - set(CODE.findall("`" + said)) == set(), name
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ class Solution:
 
     `conditioning` is the smallest eigenvalue over the mean one of the normal matrix with unit
     diagonal, 0 where the data leaves a direction open; `weakest (N,)` is that direction, in units
-    of the parameters. The covariance is not finite along it then.
+    of the parameters. The covariance is huge along it then.
     """
 
     x: Array

@@ -22,6 +22,7 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     `turn_deg`. By projector: the rows' error over the same points, `plane_mm` what that is where
     they are, `axis_mm` and `along_axis_mm` of its centre across and along its x axis, `turn_deg`.
     By light: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
+    Devices are matched by name; raises `KeyError` for one that `truth` lacks.
     """
     ball = _ball()
     frame = _align(found, truth, ball)
@@ -54,8 +55,9 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
 
 def _align(found: Rig, truth: Rig, ball: Array) -> Rigid:
     """The motion after which `ball` is seen alike: poses alone trade turns for principal points."""
-    start = align_devices(found.cameras, truth.cameras)
-    true = [truth.camera(c.name).project(ball)[0] for c in found.cameras]
+    same = [truth.camera(c.name) for c in found.cameras]
+    start = align_devices(found.cameras, same)
+    true = [c.project(ball)[0] for c in same]
 
     def residual(x: Array) -> Array:
         back = (Rigid.from_vector(x) @ start).inverse()

@@ -44,7 +44,8 @@ class Targets:
     """What stood on the stage: the board, its paper's albedo, the spheres' radii and albedo.
 
     Metres. The diffuse sphere's albedo scales all lights' intensities, the paper's all projectors';
-    None leaves the projectors' intensities nominal.
+    None leaves the projectors' intensities nominal. Raises `CalibrationError` for a radius that is
+    no length, or an albedo out of (0, 1].
     """
 
     board: Board = Board()  # noqa: RUF009  frozen
@@ -52,6 +53,17 @@ class Targets:
     mirror_radius: float = 0.05
     diffuse_radius: float = 0.05
     diffuse_albedo: float = 0.8
+
+    def __post_init__(self) -> None:
+        for what in ("mirror", "diffuse"):
+            radius = getattr(self, f"{what}_radius")
+            if not 0 < radius < np.inf:
+                raise CalibrationError(f"{what} sphere: its radius is no length, {radius} m")
+        for what, albedo in (("paper", self.paper), ("diffuse sphere", self.diffuse_albedo)):
+            if albedo is not None and not 0 < albedo <= 1:
+                raise CalibrationError(
+                    f"{what}: expected an albedo above 0 and at most 1, got {albedo}"
+                )
 
 
 def calibrate(

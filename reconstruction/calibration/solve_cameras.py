@@ -132,18 +132,21 @@ def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Le
 
 
 def _open_lens(name: str, poses: int, deviation: float) -> CalibrationError:
+    known = f"known to {deviation:.1%} (limit {LOOSE:.0%})" if deviation < 1 else "not determined"
     return CalibrationError(
-        f"{name}: {poses} poses of the board leave the lens open: its focal length is known to "
-        f"{deviation:.1%} (limit {LOOSE:.0%}): tilt the board by 30° or more in several "
-        "directions, or keep the nominal lens"
+        f"{name}: {poses} poses of the board leave the lens open: its focal length is {known}: "
+        "tilt the board by 30° or more in several directions, or keep the nominal lens"
     )
 
 
-def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid:
-    """Board to camera."""
+def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid | None:
+    """Board to camera; None where the lens is none that could show it so."""
     seen = board.corners[sighting.ids], sighting.pixels, lens.matrix(), lens.values[4:]
-    _, turn, shift = cv2.solvePnP(*seen, flags=cv2.SOLVEPNP_IPPE)
-    _, turn, shift = cv2.solvePnP(*seen, turn, shift, useExtrinsicGuess=True)
+    found, turn, shift = cv2.solvePnP(*seen, flags=cv2.SOLVEPNP_IPPE)
+    if found:
+        found, turn, shift = cv2.solvePnP(*seen, turn, shift, useExtrinsicGuess=True)
+    if not (found and np.isfinite([turn, shift]).all()):
+        return None
     return Rigid(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
@@ -154,11 +157,12 @@ def _chain(
 
     A tree over the sightings, those with most corners first (Prim).
     """
-    edges = {
-        (name, pose): _pose(lens, board, s)
-        for (name, seen), lens in zip(usable.items(), lenses, strict=True)
-        for pose, s in seen.items()
-    }
+    edges = {}
+    for (name, seen), lens in zip(usable.items(), lenses, strict=True):
+        for pose, s in seen.items():
+            if (edge := _pose(lens, board, s)) is None:
+                raise _open_lens(name, len(seen), np.inf)
+            edges[name, pose] = edge
     first = next(iter(usable))
     cameras, boards = {first: Rigid.identity()}, dict[str, Rigid]()
     while True:

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Ints
+from reconstruction.evaluation.baselines import with_true_directions
 from reconstruction.evaluation.connectivity import spread
-from reconstruction.evaluation.matching import StrandComparison, scores
+from reconstruction.evaluation.matching import StrandComparison, compare_strands, scores
 from reconstruction.evaluation.oriented_points import Block, Drawn
 from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
 from reconstruction.evaluation.visibility import Visibility
@@ -19,6 +20,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
+from reconstruction.growth.hair_envelope import pixel_size
 from reconstruction.report.report import Progress, silent
 
 ROOTED = 5e-3  # metres: a strand that ends this near the scalp reaches it
@@ -94,6 +96,7 @@ def assess_strands(
     - `regions.scalp` and `regions.depth`: precision, recall and F of the parts of the hair. A true
       point belongs to where its strand grows from, a predicted one to where its nearest true one
       does. The hair that lies 5 mm and more below the hair's surface is `inner`;
+    - `true_directions`, where `cameras` are given: what `true_direction_figures` returns;
     - `warnings`: sentences about what looks wrong with the input.
 
     Raises as `compare_strands` does.
@@ -102,18 +105,23 @@ def assess_strands(
     visibility = Visibility(cameras, true, head) if cameras is not None and len(true) else None
     comparison = StrandComparison(pred, true, seed=seed, samples=samples, visibility=visibility)
     of_pred, of_true = (Nearest(matches.drawn) for matches in comparison.all)
-    progress("predicted points among the true ones", 0.2)
+    progress("predicted points among the true ones", 0.1)
     comparison.look_at_truth(of_pred)
-    progress("true points among the predicted ones", 0.5)
+    progress("true points among the predicted ones", 0.3)
     comparison.look_at_prediction(of_true)
     warnings = input_warnings(pred, true)
     sphere = HeadSphere.of(true)
     if sphere is None:
         warnings.append("the true roots do not lie on a head: there are no figures by scalp region")
-    progress("parts of the hair", 0.8)
+    progress("parts of the hair", 0.6)
     regions = _region_figures(comparison, of_pred, head, sphere)
-    figures = {
-        **comparison.figures(),
+    figures = comparison.figures()
+    if cameras is not None:
+        progress("with the true directions over a pixel", 0.7)
+        figures["true_directions"] = true_direction_figures(
+            pred, true, cameras, visibility=visibility, seed=seed, samples=samples
+        )
+    figures |= {
         "errors": {"pred": of_pred.figures(), "true": of_true.figures()} if len(pred) else {},
         "roots": root_figures(pred, true, head),
         "regions": regions,
@@ -121,6 +129,27 @@ def assess_strands(
     }
     progress("judged", 1.0)
     return Assessment(figures, of_pred, of_true, (1e3 * pred.lengths(), 1e3 * true.lengths()))
+
+
+def true_direction_figures(
+    pred: Strands,
+    true: Strands,
+    cameras: Sequence[Camera],
+    *,
+    visibility: Visibility | None = None,
+    seed: int = 0,
+    samples: int | None = 40_000,
+) -> dict[str, Any]:
+    """What `pred` would score with the true directions over a pixel (`with_true_directions`).
+
+    A pixel is as wide as at the middle of the true strands, the median over `cameras`. Returns the
+    `visible`, `all` and `equal_length` of `compare_strands`, and raises as it does: that pieces are
+    many and lie on no one strand says nothing.
+    """
+    pixel = pixel_size(cameras, true.points.mean(axis=0, dtype=float))
+    turned = with_true_directions(pred, true, pixel)
+    found = compare_strands(turned, true, visibility=visibility, seed=seed, samples=samples)
+    return {key: found[key] for key in ("visible", "all", "equal_length") if key in found}
 
 
 def input_warnings(pred: Strands, true: Strands) -> list[str]:

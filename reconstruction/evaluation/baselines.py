@@ -96,16 +96,20 @@ def with_true_directions(strands: Strands, true: Strands, width: float) -> Stran
     no finer than `width`. Where no true strand is in the cube a piece keeps its direction.
     """
     pieces, dense = strands.resampled(STEP), true.resampled(STEP)
-    cell = np.concatenate([np.floor(s.points / width) for s in (dense, pieces)]).astype(np.int64)
-    cell -= cell.min(axis=0)
-    flat = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
-    cell = np.unique(flat, return_inverse=True)[1]
-    of_true, of_piece = np.split(cell, [len(dense.points)])
-    t, count = dense.tangents().astype(float), int(cell.max()) + 1
+    true_cell, cell = (np.floor(s.points / width).astype(np.int64) for s in (dense, pieces))
+    low, high = true_cell.min(axis=0), true_cell.max(axis=0)
+    near = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
+    flat = np.ravel_multi_index(
+        tuple((np.concatenate([true_cell, cell[near]]) - low).T), tuple(high - low + 1)
+    )
+    index = np.unique(flat, return_inverse=True)[1]
+    of_true, of_near = np.split(index, [len(true_cell)])
+    t, count = dense.tangents().astype(float), int(index.max()) + 1
     sums = [np.bincount(of_true, t[:, i] * t[:, j], count) for i, j in np.ndindex(3, 3)]
     tensors = np.stack(sums, axis=1).reshape(-1, 3, 3)
-    known = np.trace(tensors, axis1=1, axis2=2)[of_piece] > 0
-    mean = np.linalg.eigh(tensors)[1][of_piece, :, -1]
-    half = np.where(known[:, None], mean, pieces.tangents()) * STEP / 2
+    known = np.trace(tensors, axis1=1, axis2=2)[of_near] > 0
+    direction = pieces.tangents().astype(float)
+    direction[near[known]] = np.linalg.eigh(tensors)[1][of_near[known], :, -1]
+    half = direction * STEP / 2
     ends = np.stack([pieces.points - half, pieces.points + half], axis=1)
     return Strands(ends.reshape(-1, 3).astype(np.float32), 2 * np.arange(len(ends) + 1), RADIUS)

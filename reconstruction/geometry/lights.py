@@ -104,7 +104,7 @@ def dome_positions(count: int, radius: float, lowest_deg: float = -90.0) -> Arra
 
     A Fibonacci spiral from the zenith down to the elevation `lowest_deg`; `radius` in metres.
     """
-    if count < 1 or radius <= 0 or not -90 <= lowest_deg < 90:
+    if count < 1 or not 0 < radius < np.inf or not -90 <= lowest_deg < 90:
         raise ValueError(
             f"a dome needs count >= 1, radius > 0 and -90 <= lowest_deg < 90, "
             f"got {count}, {radius}, {lowest_deg}"

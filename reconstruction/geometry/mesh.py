@@ -65,13 +65,17 @@ def read_obj(path: str | Path) -> Mesh:
 
     Faces in a group, object or material whose name contains "scalp" are marked as scalp; without
     such a name `scalp` is None. Raises `OSError`, and `ValueError` naming the file where it holds
-    no triangles, is no regular file or has more than 256 MiB.
+    no triangles, is no text, no regular file or has more than 256 MiB.
     """
+    try:
+        text = plain_file(path).read_text()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no Wavefront OBJ: {error}") from error
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
     scalp: list[bool] = []
     in_scalp = {"g": False, "o": False, "usemtl": False}
-    for number, line in enumerate(plain_file(path).read_text().splitlines(), 1):
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words:
             continue

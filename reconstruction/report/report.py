@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from reconstruction.files.durable import write_json
+from reconstruction.options import sentence
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share that is done, 0 to 1."""
@@ -168,7 +169,10 @@ class Report:
 
     @classmethod
     def load(cls, path: str | Path) -> Report:
-        """Read a report; an absent file gives an empty one."""
+        """Read a report; an absent file gives an empty one. `ValueError` names a damaged one."""
         if not Path(path).is_file():
             return cls()
-        return TypeAdapter(cls).validate_json(Path(path).read_bytes())
+        try:
+            return TypeAdapter(cls).validate_json(Path(path).read_bytes())
+        except ValidationError as error:
+            raise ValueError(f"{path} is no report: {sentence(error)}") from error

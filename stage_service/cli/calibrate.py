@@ -13,6 +13,7 @@ from stage_service.cli.support.commands import (
     add_command,
     add_group,
     progress_bar,
+    rig_path,
 )
 
 
@@ -21,7 +22,9 @@ def add(commands: Commands) -> None:
     group = add_group(commands, "calibrate", "calibrate a stage")
     rig = add_command(group, "rig", run_rig)
     rig.add_argument("boards", type=Path, nargs="+", metavar="CAPTURE", help="board, one a pose")
-    rig.add_argument("--rig", type=Path, help="the nominal rig file (default: the first capture's)")
+    rig.add_argument(
+        "--rig", type=rig_path, help="the nominal rig file (default: the first capture's)"
+    )
     rig.add_argument("--out", type=Path, required=True, help="rig file to write (.json)")
     rig.add_argument("--mirror", type=Path, nargs="+", default=[], metavar="CAPTURE")
     rig.add_argument("--diffuse", type=Path, nargs="+", default=[], metavar="CAPTURE")
@@ -32,7 +35,7 @@ def add(commands: Commands) -> None:
         "--paper-albedo", type=float, help="of the board; without it projectors stay as strong"
     )
     rig.add_argument("--keep-lens", action="store_true", help="K and distortion stay nominal")
-    rig.add_argument("--truth", type=Path, help="a rig file to compare with")
+    rig.add_argument("--truth", type=rig_path, help="a rig file to compare with")
     _board_options(rig)
 
     board = add_command(group, "board", run_board)
@@ -72,6 +75,8 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
 
     if args.out.suffix != ".json":
         raise BadArgument(f"--out must end in .json, got {args.out}")
+    truth = None if args.truth is None else Rig.load(args.truth)
+    args.out.parent.mkdir(parents=True, exist_ok=True)  # not after all of the work
     boards = [Capture(p) for p in args.boards]
     tables: dict[str, Any] = {}
     if args.rig is None:
@@ -84,6 +89,11 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
             for key in ("devices", "capture", "safety")
             if (table := getattr(file, key)) is not None
         }
+    if truth is not None:
+        try:
+            compare_rigs(nominal, truth)  # what it lacks is told before the work
+        except KeyError as error:
+            raise BadArgument(f"--truth {args.truth}: {error.args[0]}") from error
     targets = Targets(
         _board(args),
         args.paper_albedo,
@@ -111,8 +121,8 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
         "stages": {s.name: s.figures for s in report.stages},
         "warnings": [w for s in report.stages for w in s.warnings],
     }
-    if args.truth is not None:
-        data["errors"] = compare_rigs(rig, Rig.load(args.truth))
+    if truth is not None:
+        data["errors"] = compare_rigs(rig, truth)
     output.result(data)
 
 
@@ -121,11 +131,13 @@ def run_board(args: argparse.Namespace, output: Output) -> None:
     import cv2
 
     board = _board(args)
-    per_square = round(board.square / 0.0254 * args.dpi)
-    if per_square < 8 or not cv2.imwrite(str(args.out), board.picture(per_square)):
-        raise BadArgument(
-            f"{args.out}: cannot be written, or squares of {per_square} pixels are too small"
-        )
+    if args.out.suffix != ".png":
+        raise BadArgument(f"{args.out}: expected a file ending in .png")
+    wide = board.square / 0.0254 * args.dpi
+    if not 8 <= wide <= 8192:
+        raise BadArgument(f"--dpi {args.dpi}: squares of 8 to 8192 pixels are drawn, not {wide:g}")
+    if not cv2.imwrite(str(args.out), board.picture(round(wide))):
+        raise BadArgument(f"{args.out}: cannot be written: is its folder there?")
     width, height = (1e3 * board.size).tolist()
     output.result(
         {"picture": str(args.out), "width_mm": width, "height_mm": height},

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.stage.processes import add_subject, exit_on_sigterm
+from stage_service.cli.stage.processes import SUBJECTS, add_subject, exit_on_sigterm
 from stage_service.cli.support.commands import (
     FAILED,
     BadArgument,
@@ -76,13 +76,8 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     os.environ.setdefault("HAIRSTAGE_TOKEN_FILE", str((out / "token").resolve()))
     rig = Rig.load(args.rig)
     held_out = _held_out(rig, args.hold_out_camera)
-    for field in ("subject", "environment"):
-        value = getattr(args, field)
-        if "." in value or "/" in value:
-            if not Path(value).is_file():
-                raise BadArgument(f"--{field}: there is no file {value}")
-            setattr(args, field, str(Path(value).resolve()))
     chosen_variant()  # what is missing is told before anything is started
+    _check(args)
     _prepare(out)
 
     with Children(out / "logs") as children:
@@ -193,6 +188,31 @@ def _held_out(rig: Rig, camera: str | None) -> dict[str, list[str]]:
     every = min(EVERY_NTH_LIGHT, max(len(rig.lights) // 4, 1))
     lights = [light.name for light in rig.lights[every // 2 :: every]]
     return {"held_out_cameras": [name], "held_out_lights": lights}
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Read what was given, before an earlier demo goes, and make paths of it absolute."""
+    from appearance.model.relight import PROCEDURAL, environment_map
+    from reconstruction import read_obj, read_strands
+
+    if args.seed < 0:
+        raise BadArgument(f"--seed {args.seed}: expected 0 or more")
+    environment_map(args.environment)
+    if args.environment not in PROCEDURAL:
+        args.environment = str(Path(args.environment).resolve())
+    if args.subject in SUBJECTS:
+        if args.head is not None:
+            raise BadArgument(f"--head: the subject {args.subject} brings its own")
+        return
+    if not Path(args.subject).is_file():
+        names = ", ".join(SUBJECTS)
+        raise BadArgument(
+            f"--subject {args.subject}: there is no such file, and it is none of {names}"
+        )
+    read_strands(args.subject)
+    if args.head is not None:
+        read_obj(args.head)
+    args.subject = str(Path(args.subject).resolve())
 
 
 def _prepare(out: Path) -> None:

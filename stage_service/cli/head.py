@@ -47,6 +47,8 @@ def run_fit(args: argparse.Namespace, output: Output) -> None:
     from reconstruction.head.template import template
 
     _require_obj(args.out)
+    if args.turn_deg is not None and not np.isfinite(args.turn_deg):
+        raise BadArgument(f"--turn-deg {args.turn_deg}: expected a number of degrees")
     shape = generic_head() if args.mesh is None else template(read_obj(args.mesh))[0]
     points, normals = read_points(args.points)
     turn = None if args.turn_deg is None else float(np.radians(args.turn_deg))
@@ -94,3 +96,4 @@ def run_mark(args: argparse.Namespace, output: Output) -> None:
 def _require_obj(path: Path) -> None:
     if path.suffix != ".obj":
         raise BadArgument(f"--out must end in .obj, got {path}")
+    path.parent.mkdir(parents=True, exist_ok=True)

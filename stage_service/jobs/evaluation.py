@@ -27,15 +27,14 @@ def evaluate_geometry(
     not held out. `true_directions` are ours with the truth's over a pixel.
     """
     from reconstruction import read_strands
+    from reconstruction.evaluation.assessment import true_direction_figures
     from reconstruction.evaluation.baselines import (
         baseline_hull,
         hull_smooth_field,
         hull_vertical,
-        with_true_directions,
     )
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
-    from reconstruction.growth.hair_envelope import pixel_size
 
     true = read_strands(truth)
     cameras, head = capture.rig.cameras, model.head(capture)
@@ -50,10 +49,7 @@ def evaluate_geometry(
     figures = score(ours)
     progress("our strands with the true directions over a pixel", 0.3)
     used = [c for c in cameras if c.name not in held_out_cameras]
-    pixel = pixel_size(used, true.points.mean(axis=0, dtype=float))
-    turned = score(with_true_directions(ours, true, pixel))
-    # pieces: that they are many and lie on no one strand says nothing
-    turned = {key: turned[key] for key in ("visible", "all", "equal_length")}
+    turned = true_direction_figures(ours, true, used, visibility=visibility, seed=seed)
     baselines = {"true_directions": turned}
     progress("baseline: the hull filled with vertical lines", 0.4)
     masks = {c.name: model.mask(c.name, "hair", capture) for c in used}

@@ -93,7 +93,7 @@ def seconds(value: float) -> str:
 def size(count: int) -> str:
     """Bytes as people say them."""
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= scale:
+        if count >= 0.9995 * scale:  # 999,999 are no 1e+03 kB
             return f"{count / scale:.3g} {unit}"
     return f"{count} B"
 

@@ -34,7 +34,7 @@ from stage_service.model_page.names import (
 )
 from stage_service.model_page.plots import error_plots, time_bars
 
-PAGE = "index.html"
+PAGE, FIELD_FILE = "index.html", "field.npz"
 HERO = ("relit.png", "render.png", "comparison.png")
 """The picture at the top: the first that is there."""
 SHOWN = {
@@ -184,16 +184,14 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
         said.append("" if error is None else f" ± {error:.0%}")
     yield "colour", [*said, "" if known else ", no error known"]
     yield "skin", [_swatch(fit["skin"]), ", ".join(f"{x:.2f}" for x in fit["skin"])]
-    if model.has("rejected"):
-        yield (
-            "not used",
-            [
-                "inverse rendering: Sun's fit is better on validation frames; "
-                "the maps are in rejected"
-            ],
-        )
-    elif _by_inverse_rendering(model):
+    if _by_inverse_rendering(model):
         yield "rendered", ["inverse rendering; the roughness and colour above are its start"]
+    if model.has(FIELD_FILE):
+        yield "field", [link(FIELD_FILE), ": what the hair reflects beyond that is rendered too"]
+    rejected = {"hair_maps.npz": "inverse rendering", FIELD_FILE: "the field of reflectance"}
+    for name, what in rejected.items():
+        if model.rejected().has(name):
+            yield "not used", [f"{what}, not clearly better: ", link(f"rejected/{name}")]
 
 
 def _swatch(linear: Sequence[float]) -> Html:
@@ -266,7 +264,11 @@ def _strand_table(found: Mapping[str, Any]) -> Html:
     scored = table(["", "", *heads], rows, "figures")
     if "lengths" not in first:
         return scored  # of an earlier version
-    rows = [[_ours(name, STRANDS), *strand_cells(figures)] for name, figures in found.items()]
+    rows = [
+        [_ours(name, STRANDS), *strand_cells(figures)]
+        for name, figures in found.items()
+        if "lengths" in figures
+    ]
     truth = strand_cells(first, [OF_TRUTH.get(title, ()) for title, *_ in STRAND_FIGURES])
     heads = [title for title, *_ in STRAND_FIGURES]
     whole = table(["", *heads], [*rows, ["the truth", *truth]], "figures")
@@ -297,13 +299,21 @@ def _appearance_table(fits: Mapping[str, Mapping[str, Any]]) -> Html:
     names = {key: None for figures in fits.values() for key in figures}
     rows = []
     for key in names:
-        rows.append([words(key), *(_numbers(figures.get(key, "–")) for figures in fits.values())])
+        said = _shares if key.endswith("_error") else _numbers
+        cells = (said(figures[key]) if key in figures else "–" for figures in fits.values())
+        rows.append([words(key), *cells])
     return table(["", *(PICTURES.get(n, words(n)) for n in fits)], rows, "figures")
 
 
 def _ours(name: str, titles: Mapping[str, str]) -> str:
     title = titles.get(name, words(name))
     return element("b", title) if name == "ours" else title
+
+
+def _shares(value: Any) -> str:
+    """Errors of logarithms."""
+    values = value if isinstance(value, list) else [value]
+    return ", ".join("not known" if x is None else f"± {x:.1%}" for x in values)
 
 
 def _numbers(value: Any) -> str:

@@ -136,3 +136,10 @@ def test_a_stage_within_another_is_not_counted_twice(monkeypatch: pytest.MonkeyP
         "triangulation": 7.0,
         "motion": 3.0,
     }
+
+
+@pytest.mark.parametrize(("text", "said"), [('{"stages": 3}', "stages: "), ("{", "Invalid JSON")])
+def test_a_damaged_report_is_named(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "report.json").write_text(text)
+    with pytest.raises(ValueError, match=rf"report\.json is no report: .*{said}"):
+        Report.load(tmp_path / "report.json")

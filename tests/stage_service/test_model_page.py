@@ -13,7 +13,7 @@ from reconstruction import Model, Report, Strands
 from reconstruction.report.report import Series
 from stage_service.cli import main
 from stage_service.model_page import model_page, write_page
-from stage_service.model_page.html import flat, number
+from stage_service.model_page.html import flat, number, size
 from stage_service.model_page.plots import error_plots
 
 EVIL = "<img src=x onerror=alert(1)> & \"'"
@@ -118,6 +118,37 @@ def test_a_plot_is_an_svg_in_which_time_goes_right_and_error_up(model):
     assert svg.attrib["aria-label"].startswith("growth of strands: <img")
 
 
+def test_an_error_of_a_logarithm_is_a_share(model):
+    results = model.json("results.json")
+    fitted = {"beta_m": 0.33, "beta_m_error": 0.068, "sigma_a_error": [0.02, None, 0.1]}
+    model.write_json("results.json", {**results, "appearance": {"fitted": fitted}})
+    text = Page(model_page(model)).text
+    assert "beta m error± 6.8%" in text
+    assert "± 2.0%, not known, ± 10.0%" in text
+
+
+def test_what_is_rendered_and_what_is_not_is_said_of_each_fit_by_itself(model):
+    report = model.report()
+    with report.stage("inverse_rendering"):
+        pass
+    model.write_report(report)
+    for name in ("hair_maps.npz", "field.npz"):
+        model.write_arrays(name, {"a": np.zeros(1)})
+    assert "not used" not in (text := Page(model_page(model)).text)
+    assert "rendered inverse rendering" in text.replace("renderedinverse", "rendered inverse")
+    assert "what the hair reflects beyond that is rendered too" in text
+    model.reject("field.npz")
+    page = Page(model_page(model))
+    assert "inverse rendering; the roughness and colour above are its start" in page.text
+    assert "not usedthe field of reflectance, not clearly better" in page.text
+    assert "inverse rendering, not clearly better" not in page.text
+    assert "rejected/field.npz" in page.values("href")
+    model.reject("hair_maps.npz")
+    text = Page(model_page(model)).text
+    assert "not usedinverse rendering, not clearly better" in text
+    assert "validation frames" not in text  # the frames need not have preferred the other
+
+
 def test_a_page_of_little_is_a_page(tmp_path, capsys):
     empty = Model(tmp_path / "empty").create()
     assert "There are no strands yet" in Page(model_page(empty)).text
@@ -155,3 +186,11 @@ def test_figures_of_any_depth_become_rows():
         ("a · d", "1, 2"),
         ("e", "1 entries in report.json"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1 kB"), (999_400, "999 kB"), (999_999, "1 MB")],
+)
+def test_sizes_read_well(count, text):
+    assert size(count) == text

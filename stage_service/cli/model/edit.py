@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
     edit.add_argument(
         "--along",
         type=_numbers(2),
-        default=(0.0, 1.0),
+        default="0,1",
         metavar="FROM,TO",
         help="colour only this part of the strands, 0 <= FROM < TO <= 1, 0 the root and 1 the tip",
     )

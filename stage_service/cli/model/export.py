@@ -10,6 +10,7 @@ from stage_service.cli.support.commands import BadArgument, Commands, Output, ad
 
 if TYPE_CHECKING:
     from appearance.export.groom import Groom
+    from appearance.export.options import ExportOptions
     from reconstruction import Capture
 
 USD = (".usd", ".usda", ".usdc")
@@ -18,6 +19,12 @@ SUFFIXES = {
     "gltf": (".glb",),
 }
 FOLDERS = ("blender", "mitsuba", "maps")
+ONLY = {
+    "guides": ("usd", "houdini", "unreal", "blender"),
+    "cards": ("gltf",),
+    "environment": ("mitsuba",),
+}
+"""What takes these options."""
 STRANDS = ("abc", "hair")
 """What holds strands alone and needs no fit."""
 SIZE = 640
@@ -35,13 +42,13 @@ def add(commands: Commands) -> None:
         "--strands", type=int, help="so many, drawn at random, their radius larger to cover as much"
     )
     export.add_argument(
-        "--guides", type=int, default=0, help="strands that stand for clumps, given apart"
+        "--guides", type=int, help="strands that stand for clumps, given apart (default: 0)"
     )
-    export.add_argument("--cards", type=int, default=600, help="ribbons of gltf's finest level")
+    export.add_argument("--cards", type=int, help="ribbons of gltf's finest level (default: 600)")
     export.add_argument("--seed", type=int, default=0)
     export.add_argument("--camera", help="a camera of the rig for mitsuba's view")
     export.add_argument(
-        "--environment", default="studio", help="mitsuba's light: studio, sky, .hdr or .exr file"
+        "--environment", help="mitsuba's light: studio (default), sky, .hdr or .exr file"
     )
 
 
@@ -77,8 +84,12 @@ def run(args: argparse.Namespace, output: Output) -> None:
         )
     if args.camera is not None and (args.capture is None or args.to != "mitsuba"):
         raise BadArgument("--camera is a view for mitsuba, of the rig of --capture")
-    names = ("strands", "guides", "cards", "seed")
-    options = parse_options(ExportOptions, {n: getattr(args, n) for n in names}, "export")
+    for name, takers in ONLY.items():
+        if getattr(args, name) is not None and args.to not in takers:
+            raise BadArgument(f"--{name} is for --to {' or '.join(takers)}, not {args.to}")
+    given = {n: getattr(args, n) for n in ("strands", "guides", "cards", "seed")}
+    given = {n: value for n, value in given.items() if value is not None}
+    options = parse_options(ExportOptions, given, "export")
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
     moved = capture.plan.get("import", {}).get("origin") if capture is not None else None
     if moved is not None:
@@ -100,11 +111,13 @@ def run(args: argparse.Namespace, output: Output) -> None:
             output.note(f"warning: {model} renders with a field, of which exports know nothing")
         if groom.head is None:
             output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
-        files = _write(args, groom, capture)
+        files = _write(args, groom, capture, options)
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
 
 
-def _write(args: argparse.Namespace, groom: Groom, capture: Capture | None) -> list[Path]:
+def _write(
+    args: argparse.Namespace, groom: Groom, capture: Capture | None, options: ExportOptions
+) -> list[Path]:
     """Write the file or folder; returns what was written."""
     out: Path = args.out
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -124,7 +137,7 @@ def _write(args: argparse.Namespace, groom: Groom, capture: Capture | None) -> l
     if args.to == "gltf":
         from appearance.export.cards import export_gltf
 
-        export_gltf(groom, out, args.cards, args.seed)
+        export_gltf(groom, out, options.cards, options.seed)
         return [out]
     if args.to == "maps":
         from appearance.export.maps import export_maps
@@ -136,4 +149,4 @@ def _write(args: argparse.Namespace, groom: Groom, capture: Capture | None) -> l
     camera = three_quarter_view(groom.strands, SIZE)
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
-    return [export_mitsuba(groom, out, View(camera, environment_map(args.environment)))]
+    return [export_mitsuba(groom, out, View(camera, environment_map(args.environment or "studio")))]

@@ -54,7 +54,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     "lights"}}', of hair that varies over the scalp and along strands, and the lights as they are
     found, in MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With --field,
     MODEL/field.npz holds what the hair reflects beyond that, on top of a fit that is there already
-    where it held out the same. With held-out cameras or lights, judge the model on them.
+    where it held out the same and --options ask for no other. With held-out cameras or lights,
+    judge the model on them.
     """
     from appearance import HeldOut
     from appearance.model.relight import environment_map
@@ -72,6 +73,10 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     if args.field_options and args.field in (None, "none"):
         raise BadArgument("--field-options says how a field is fitted: say which with --field")
+    of_field = read_json(args.field_options)
+    if "field" in of_field:
+        raise BadArgument("--field says which field is fitted, not --field-options")
+    of_method = read_json(args.options)
     model, inverse = Model(args.model), args.method == "inverse_rendering"
     asked = {
         "held_out_cameras": args.hold_out_camera,
@@ -79,15 +84,15 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "reduced": args.reduce,
         "environment": args.environment,
         "seed": args.seed,
-        "inverse_rendering" if inverse else "fit": read_json(args.options),
-        "fields": {"field": args.field or "none", **read_json(args.field_options)},
+        "inverse_rendering" if inverse else "fit": of_method,
+        "fields": {"field": args.field or "none", **of_field},
     }
     options = parse_options(JobOptions, asked)
     environment_map(options.environment)  # not after all of the fits
     data: dict[str, Any] = {"model": str(model), "method": args.method}
     held_out = HeldOut(options.held_out_cameras, options.held_out_lights)
     there = FittedAppearance.is_of(model, held_out)
-    if not (there and (inverse or args.field)):
+    if not (there and (inverse or (args.field and not of_method))):
         with progress_bar("sun") as progress:
             fit(StepContext(args.capture, model, options, progress))
     if inverse:

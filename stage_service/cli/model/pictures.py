@@ -16,6 +16,9 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
 def pair_up(pred: Path, true: Path) -> list[tuple[str, Path, Path]]:
     """(name, predicted, true) for two files, or for the names that two folders share."""
+    for path in (pred, true):
+        if not path.exists():
+            raise ValueError(f"{path}: no such picture or folder")
     if pred.is_dir() != true.is_dir():
         raise ValueError(f"compare two files or two folders, got {pred} and {true}")
     if not pred.is_dir():

@@ -117,6 +117,9 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise ValueError("--guide and --refine go with --field interpolation")
     if args.refine and args.guide in ("none", "model"):
         raise ValueError(f"--refine turns kajiya_kay's tangents, not those of --guide {args.guide}")
+    only_lights = args.light and args.environment is None and args.strands is None
+    if args.guide == "model" and not (only_lights and args.camera):
+        raise ValueError("--guide model: for a --camera of the capture, its pose and --light")
     if args.size is not None and args.size < 16:
         raise ValueError(f"--size {args.size}: expected 16 or more")
     capture = Capture(args.capture) if args.capture is not None else None
@@ -127,6 +130,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     poses: list[Strands] = [] if args.strands is None else read_poses(args.strands)
     moves = args.turntable or args.turning_light or args.sway is not None or len(poses) > 1
     _check_animation(args, len(poses), moves)
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
     progress("building the scene", 0.0)
     model = Model(args.model)
     of_model = None if args.field == "interpolation" else args.field
@@ -238,8 +243,6 @@ def _still(
         return image, {}
     camera, lights, maps, _ = lit
     if args.guide == "model":
-        if args.camera is None or strands is not None or maps:
-            raise ValueError("--guide model: for a --camera of the capture, its pose and --light")
         mask = model.mask(camera.name, "hair", capture)
         guided = GuidedFrames(fitted.scene(), fitted, capture, camera, mask)
         return guided(image, lights), {"field": "interpolation", "guide": "model"}

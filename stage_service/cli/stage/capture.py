@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from stage_service.cli.stage.jobs import add_pipeline, wait_for_job
 from stage_service.cli.support.commands import (
     FAILED,
+    BadArgument,
     Commands,
     Output,
     add_group,
@@ -65,6 +66,8 @@ def wanted(args: argparse.Namespace) -> dict[str, Any]:
             body[field] = str(getattr(args, field).resolve())
     if args.upload is not None:
         body["upload"] = args.upload
+    if args.options is not None and args.pipeline is None:
+        raise BadArgument("--options are a job's: say which with --pipeline")
     if args.pipeline is not None:
         body["pipeline"] = {"name": args.pipeline, "options": read_json(args.options)}
     return body

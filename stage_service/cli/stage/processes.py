@@ -209,10 +209,14 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
         return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
 
 
+SUBJECTS = ("wavy", "straight", "curly")
+
+
 def add_subject(parser: argparse.ArgumentParser) -> None:
     """Add the options that say which subject sits in which rig."""
     parser.add_argument("--rig", type=rig_path, default="demo", help=RIG_HELP)
-    parser.add_argument("--subject", default="wavy", help="wavy, straight, curly or a strand file")
+    names = ", ".join(SUBJECTS)
+    parser.add_argument("--subject", default="wavy", help=f"{names} or a strand file")
     parser.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
     parser.add_argument("--seed", type=int, default=0)
 

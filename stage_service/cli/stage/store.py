@@ -95,9 +95,9 @@ def run_verify(args: argparse.Namespace, output: Output, service: ServiceClient)
 def run_upload(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Upload a subject's head and masks, for captures that name it."""
     files = {} if args.head is None else {"head.obj": args.head}
-    for mask in sorted(args.masks.glob("*.png")) if args.masks is not None else ():
-        files[f"masks/{mask.name}"] = mask
-    if not files:
+    masks = sorted(args.masks.glob("*.png")) if args.masks is not None else []
+    files |= {f"masks/{mask.name}": mask for mask in masks}
+    if not files or (args.masks is not None and not masks):
         raise BadArgument("nothing to upload: give --head, or --masks with <camera>.png in it")
     kept: dict[str, Any] = {}
     for name, file in files.items():

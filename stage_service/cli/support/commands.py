@@ -220,15 +220,18 @@ def whole(least: int, most: int = 1_000_000) -> Callable[[str], int]:
     return number
 
 
-def read_json(text: str | Path | None) -> Any:
-    """The JSON of an option: the text itself, or the file that it names; {} for None."""
+def read_json(text: str | Path | None) -> dict[str, Any]:
+    """The JSON object of an option: the text itself, or the file that it names; {} for None."""
     if text is None:
         return {}
     inline = str(text).lstrip().startswith("{")
     try:
-        return json.loads(str(text) if inline else Path(text).read_text())
-    except json.JSONDecodeError as error:
+        found = json.loads(str(text) if inline else Path(text).read_text())
+    except ValueError as error:
         raise BadArgument(f"{text} is not JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise BadArgument(f"{text}: expected an object, {{...}}, got {type(found).__name__}")
+    return found
 
 
 def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:

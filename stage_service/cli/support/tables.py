@@ -247,7 +247,10 @@ def assessment_text(figures: dict[str, Any]) -> Group:
         cells = [value(figures, which) for which in ("pred", "true")]
         if any(cells):
             more.add_row(name, *cells)
-    table = geometry_table({"as lines": figures, "root to tip": figures["directed"]})
+    rows = {"as lines": figures, "root to tip": figures["directed"]}
+    if "true_directions" in figures:
+        rows["true directions"] = figures["true_directions"]
+    table = geometry_table(rows)
     return Group(table, regions, more)
 
 

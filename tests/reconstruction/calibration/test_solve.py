@@ -9,7 +9,8 @@ import pytest
 
 from reconstruction import Capture, Rig
 from reconstruction.calibration.boards import CalibrationError
-from reconstruction.calibration.solve import TargetCaptures, calibrate
+from reconstruction.calibration.rig_comparison import compare_rigs
+from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
 from stage_service.cli import main
 from stage_service.config import load_rig_file
 
@@ -22,7 +23,7 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
     diffuse_captures: list[Capture],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    truth, out = tmp_path / "truth.json", tmp_path / "found.json"
+    truth, out = tmp_path / "truth.json", tmp_path / "new" / "found.json"
     truth.write_text(json.dumps(true_rig.to_dict()))
     command = ["calibrate", "rig", *[str(c.path) for c in board_captures], "--out", str(out)]
     command += ["--mirror", *[str(c.path) for c in mirror_captures]]
@@ -43,6 +44,44 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
     assert [s["name"] for s in report["stages"]] == ["cameras", "projectors", "lights"]
     assert "rows say nothing" in said["stages"]["projectors"]["undetermined"]["beam"]
     assert said["stages"]["lights"]["undetermined"] == {}
+
+
+def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None:
+    part = Rig("part", true_rig.cameras[:0:-1], true_rig.lights[2:], ())
+    errors = compare_rigs(part, true_rig)
+    assert set(errors["cameras"]) == {"cam_1", "cam_2"}
+    assert max(c["centre_mm"] for c in errors["cameras"].values()) < 1e-6
+    assert max(x["position"] for x in errors["lights"].values()) < 1e-9
+    with pytest.raises(KeyError, match="no camera 'cam_0' in this rig"):
+        compare_rigs(true_rig, part)
+
+
+def test_a_device_that_the_truth_lacks_is_told_before_the_work(
+    tmp_path: Path,
+    true_rig: Rig,
+    board_captures: list[Capture],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    truth = tmp_path / "truth.json"
+    truth.write_text(json.dumps(Rig("part", true_rig.cameras[1:], (), ()).to_dict()))
+    command = ["calibrate", "rig", str(board_captures[0].path), "--out", str(tmp_path / "r.json")]
+    assert main([*command, "--truth", str(truth), "--json"]) == 3
+    assert f"--truth {truth}: no camera 'cam_0'" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"paper": 80.0}, "paper: expected an albedo above 0 and at most 1, got 80"),
+        ({"paper": 0.0}, "paper: expected an albedo"),
+        ({"diffuse_albedo": float("nan")}, "diffuse sphere: expected an albedo"),
+        ({"mirror_radius": -0.05}, "mirror sphere: its radius"),
+        ({"diffuse_radius": float("inf")}, "diffuse sphere: its radius"),
+    ],
+)
+def test_what_no_target_can_be_is_refused(wrong: dict[str, float], said: str) -> None:
+    with pytest.raises(CalibrationError, match=said):
+        Targets(**wrong)  # type: ignore[arg-type]
 
 
 def test_what_no_capture_shows_stays_nominal_and_is_listed(

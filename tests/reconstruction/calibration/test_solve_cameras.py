@@ -102,6 +102,21 @@ def test_parallel_poses_leave_the_lens_open(board: Board) -> None:
         calibrate_cameras([camera], board, {"front": seen})
 
 
+@pytest.mark.parametrize("way", [(0, 0, 0), (0.02, 0, 0), (0, 0, 0.1)], ids=["same", "side", "far"])
+def test_what_parallel_poses_leave_open_is_not_told_in_per_cent(
+    board: Board, way: tuple[float, float, float]
+) -> None:
+    K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+    camera = Camera("front", 640, 480, K, np.eye(3), np.array([0, 0, 0.6]))
+    flat = board.corners - (*board.size / 2, 0)
+    seen = {
+        f"{k}": Sighting(np.arange(len(flat)), camera.project(flat + k * np.array(way))[0])
+        for k in range(3)
+    }
+    with pytest.raises(CalibrationError, match="its focal length is not determined: tilt"):
+        calibrate_cameras([camera], board, {"front": seen})
+
+
 def test_groups_of_cameras_without_a_common_pose_are_named(board: Board) -> None:
     front = Camera.look_at("front", 320, 256, (0.95, 0, 0), (0, 0, 0), 24.0)
     back = Camera.look_at("back", 320, 256, (-0.95, 0, 0), (0, 0, 0), 24.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruction import Mesh, Strands
+from reconstruction import Camera, Mesh, Strands
 from reconstruction.evaluation import oriented_points
 from reconstruction.evaluation import regions as hair_regions
 from reconstruction.evaluation.assessment import assess_strands, input_warnings, root_figures
@@ -60,6 +60,24 @@ def test_a_turn_is_the_angle_that_is_reported_and_turned_round_is_not_an_angle()
         assert errors["angle_deg"]["p5"] == pytest.approx(7, abs=0.05)
         assert errors["angle_deg"]["p95"] == pytest.approx(7, abs=0.05)
         assert errors["reversed"] == other_way
+
+
+def test_strands_in_place_that_lean_are_found_once_they_are_turned_as_the_truth_is() -> None:
+    camera = Camera.look_at("cam_0", 100, 100, [0.05, 0.04, 0.5], [0.05, 0.04, 0], 30)
+    pixel = 0.5 / camera.K[0, 0]  # each true strand in the middle of its cubes
+    true = row(20, apart=pixel).transformed(np.eye(3), [0, pixel / 2, pixel / 2])
+    places = true.resampled(4e-3).points.astype(float)
+    places = places[np.abs(places[:, 0] - 0.05) < 0.047]  # nothing beyond their ends
+    # 25° off, each within half a millimetre of a true strand
+    half = 1e-3 * np.array([np.cos(np.radians(25)), np.sin(np.radians(25)), 0])
+    cameras = [camera]
+    figures = assess_strands(lines(places - half, places + half), true, cameras=cameras).figures
+    for over in ("visible", "all"):
+        assert figures[over]["1mm_10deg"]["f"] == 0.0
+        for at in (figures["true_directions"], figures["true_directions"]["equal_length"]):
+            assert at[over]["1mm_10deg"]["precision"] == 1.0
+            assert at[over]["1mm_10deg"]["recall"] > 0.9
+    assert "true_directions" not in assess_strands(true, true).figures  # how wide is a pixel?
 
 
 def test_lengths_and_how_far_their_distributions_are_apart() -> None:

@@ -192,6 +192,18 @@ def test_true_directions_are_the_mean_over_a_cube() -> None:
         assert tangent[there, axis] == pytest.approx(1.0, abs=1e-4)
 
 
+def test_what_lies_a_world_away_keeps_its_direction() -> None:
+    true = Strands.from_list([np.array([[0.002, 0.002, 0.002], [0.002, 0.002, 0.1]])])
+    at = np.array([[0.001, 0.001, 0.05], [1e5, 1e5, 1e5]])
+    ours = Strands.from_list([np.array([p, p + np.array([0.02, 0, 0])]) for p in at])
+    pieces = with_true_directions(ours, true, 4e-3)
+    middle, tangent = pieces.points[::2], np.abs(pieces.tangents()[::2])
+    inside = (middle[:, 0] < 3.9e-3) & (tangent[:, 2] > 0.999)
+    assert inside.sum() >= 2
+    assert (tangent[(middle[:, 0] > 4.6e-3) & (middle[:, 0] < 1), 0] > 0.999).all()
+    assert (middle[:, 0] > 1).any()
+
+
 def test_true_directions_of_no_strands_are_none() -> None:
     true = Strands.from_list([np.array([[0, 0, 0], [0, 0, 0.1]])])
     assert len(with_true_directions(Strands.from_list([]), true, 1e-3)) == 0

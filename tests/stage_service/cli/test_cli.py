@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -28,7 +29,9 @@ from reconstruction import (
     write_exr,
     write_strands,
 )
+from simulators.subject.grooms import GROOMS
 from stage_service.cli import build_parser, main
+from stage_service.cli.stage.processes import SUBJECTS
 from stage_service.cli.support.children import Children
 from stage_service.cli.support.commands import CommandError, rig_path, run_command
 
@@ -202,6 +205,31 @@ def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
     assert (tmp_path / "mine.txt").read_text() == "precious"
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--seed", "-1"), "--seed -1: expected 0 or more"),
+        (("--subject", "curlyy"), "--subject curlyy: there is no such file"),
+        (("--head", "none.obj"), "wavy brings its own"),
+        (("--environment", "nosuch"), "nosuch: no such environment map"),
+        (("--subject", "{tmp}/broken.npz", "--head", "none.obj"), "broken.npz"),
+    ],
+)
+def test_a_word_that_is_wrong_costs_no_earlier_demo(capsys, tmp_path, monkeypatch, words, said):
+    def prepared(out: Path) -> None:
+        raise AssertionError("what was there would be gone")
+
+    monkeypatch.setattr("stage_service.cli.demo._prepare", prepared)
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    code, data = run(capsys, "demo", "--out", tmp_path, *(w.format(tmp=tmp_path) for w in words))
+    assert code == 3
+    assert said in data["error"]["detail"]
+
+
+def test_the_subjects_are_those_that_a_simulated_rig_has():
+    assert set(SUBJECTS) == set(GROOMS)
+
+
 def test_an_unreachable_service_is_exit_code_4(capsys):
     code, data = run(capsys, "capture", "list", "--url", "http://127.0.0.1:9")
     assert code == 4
@@ -287,6 +315,53 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
     assert printed.count("100.0 / 100.0 / 100.0") >= 9
     assert "equal length" in printed
     assert "root to tip" in printed
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("fit c m --field best --field-options {tmp}/list.json", "list.json: expected an object"),
+        ("fit c m --options {tmp}/bytes", "bytes is not JSON"),
+        ('fit c m --field best --field-options \'{{"field": "none"}}\'', "--field says which"),
+        ("rig check demo --radius nan", "radius > 0"),
+        ("head mark {tmp}/bytes --out {tmp}/h.obj", "bytes is no Wavefront OBJ"),
+        ("head fit {tmp}/bytes --out {tmp}/h.obj --turn-deg inf", "--turn-deg inf: expected"),
+        ("evaluate images {tmp} {tmp}/absent", "absent: no such picture or folder"),
+        ("export m --to usd --out {tmp}/a.usdc --cards 9", "--cards is for --to gltf, not usd"),
+        ("export m --to hair --out {tmp}/a.hair --guides 9", "--guides is for --to usd or houdini"),
+        ("export m --to maps --out {tmp}/a --environment sky", "--environment is for --to mitsuba"),
+        ("capture start --options '{{}}'", "--options are a job's: say which with --pipeline"),
+        ("queue add --options '{{}}'", "--options are a job's: say which with --pipeline"),
+        ("store upload anna --head {tmp}/bytes --masks {tmp}/absent", "<camera>.png in it"),
+        ("render m --capture c --field interpolation --guide model", "--guide model: for a"),
+        ("calibrate rig c --truth {tmp}/absent.json --out {tmp}/r.json", "absent.json: no such"),
+        ("calibrate board {tmp}/b.xyz", "b.xyz: expected a file ending in .png"),
+        ("calibrate board {tmp}/b.png --dpi inf", "--dpi inf: squares of 8 to"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence_that_names_it_before_any_work(
+    capsys, tmp_path, command, said
+):
+    (tmp_path / "list.json").write_text("[1]")
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe")
+    code, data = run(capsys, *shlex.split(command.format(tmp=tmp_path)))
+    assert code == 3
+    assert said in data["error"]["detail"]
+
+
+def test_another_unit_is_told_before_what_it_makes_long(capsys, tmp_path, monkeypatch):
+    line = np.array([[0, 0, 0], [0, 0, 0.1]])
+    write_strands(tmp_path / "true.npz", Strands.from_list([line]))
+    write_strands(tmp_path / "mm.npz", Strands.from_list([1e3 * line]))
+
+    def endless(*_args, **_more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("reconstruction.evaluation.assessment.assess_strands", endless)
+    assert (
+        main(["evaluate", "geometry", *(str(tmp_path / f"{n}.npz") for n in ("mm", "true"))]) == 130
+    )
+    assert "both in metres?" in capsys.readouterr().err
 
 
 def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):

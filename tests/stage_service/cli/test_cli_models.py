@@ -143,6 +143,20 @@ def test_inverse_rendering_runs_suns_fit_again_where_other_images_are_held_out(
     assert called[1:] == ["fit", "inverse_rendering", "assess"]
 
 
+@pytest.mark.usefixtures("fitted")
+def test_a_field_goes_on_the_fit_that_is_there_but_where_options_ask_for_another(
+    made, capsys, monkeypatch
+):
+    called = []
+    for name in ("fit", "fields"):
+        monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
+    words = (capsys, "fit", made.capture, made.model, "--field", "best")
+    assert run(*words)[0] == 0
+    assert called == ["fields"]
+    assert run(*words, "--options", '{"hair_pixels": 77}')[0] == 0
+    assert called[1:] == ["fit", "fields"]
+
+
 def dyed_points(before: FittedModel, folder: Path) -> np.ndarray:
     """Which points `(S, n)` of the same strands have another colour in the model `folder`."""
     looks = [
@@ -287,6 +301,14 @@ def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
     code, found = run(capsys, "render", *asked)
     assert code == 3
     assert said in found["error"]["detail"]
+
+
+@pytest.mark.usefixtures("fitted")
+def test_a_picture_makes_its_folder(made, capsys, tmp_path):
+    out = tmp_path / "new" / "picture.png"
+    code, found = run(capsys, "render", made.model, "--size", 16, "--spp", 1, "--out", out)
+    assert (code, found.get("image")) == (0, str(out))
+    assert out.is_file()
 
 
 @pytest.mark.usefixtures("fitted")
