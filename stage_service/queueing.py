@@ -35,7 +35,10 @@ class Queueing:
     def start(self, known: Sequence[CaptureStatus]) -> None:
         """Begin what waits; `known` are the captures on the disk."""
         begun = {str(c.request["queue"]): c.id for c in known if "queue" in c.request}
-        self._line.start(begun, {c.id for c in known if c.outcome != "completed"})
+        unfinished = {c.id for c in known if c.outcome != "completed"}
+        newest = sorted(known, key=lambda c: c.started or "")[-1:]
+        died = next((c.id for c in newest if c.outcome == "interrupted"), None)
+        self._line.start(begun, unfinished, died)
 
     def close(self) -> None:
         """Begin nothing any more."""

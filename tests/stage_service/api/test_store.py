@@ -182,11 +182,36 @@ def test_a_capture_is_read_again_beside_the_service_and_damage_is_told(http):
     ]
     assert capture["id"] in http.get("/health").json()["problems"][0]
     assert http.get("/health").json()["status"] == "degraded"
+    http.delete(path)
+    assert http.get("/health").json()["status"] == "ok"
 
 
 def _done(http: Client, path: str, after: str = "") -> Any:
     found = http.get(f"{path}/verification").json()
     return found if found["state"] == "done" and found["finished"] > after else None
+
+
+def test_damage_of_captures_that_are_gone_is_told_no_more(rig_file, tmp_path):
+    root = tmp_path / "root"
+    gone = {"capture": "20260101-000000-0000", "state": "done", "wrong": 1, "problems": ["it"]}
+    root.mkdir()
+    (root / "verified.json").write_text(json.dumps([gone]))
+    with serving(rig_file, root) as http:
+        assert http.get("/health").json()["status"] == "ok"
+        capture = shot(http)
+        verifier = http.service._verifier
+        verifier.ask(capture["id"], Path(capture["path"]).with_name("gone meanwhile"))
+        until(lambda: verifier.get(capture["id"]).state == "never")
+        assert http.get("/health").json()["status"] == "ok"
+
+
+def test_a_snapshot_is_nothing_to_keep(http):
+    http.post("/snapshot", json={})
+    until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
+    for answer in (http.delete("/captures/snapshot"), http.post("/captures/snapshot/verify")):
+        assert slug(answer) == "bad-input"
+        assert "kept until the next one only" in answer.json()["detail"]
+    assert http.get("/trash").json() == []
 
 
 def test_what_was_not_read_for_long_is_read_again_by_itself(rig_file, tmp_path):

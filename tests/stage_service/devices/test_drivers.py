@@ -265,11 +265,16 @@ def test_what_is_no_number_is_an_error_that_names_the_camera(rig_file, hello, fi
     with socket.create_server(("127.0.0.1", 0)) as listener:
         threading.Thread(target=peer, daemon=True).start()
         config = LinkCamerasConfig(port=listener.getsockname()[1])
-        with contextlib.closing(LinkCamera(config, rig_file.rig.cameras[0])) as camera:
-            with pytest.raises(DeviceError, match=r"^camera cam_0 "):
+        camera = LinkCamera(config, rig_file.rig.cameras[0])
+
+        def shoot() -> None:
+            with contextlib.closing(camera):
                 camera.connect()
                 camera.arm(0.02)
                 camera.read(NEVER)
+
+        with pytest.raises(DeviceError, match=r"^camera cam_0 "):
+            shoot()
 
 
 def test_mute_and_busy_cameras(stage, world):
