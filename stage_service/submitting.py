@@ -81,7 +81,7 @@ class Submitting:
             )
         with self.lock:
             other = self._queue.at_work_on(model)
-            if other is not None:
+            if other not in (None, job):  # itself: of the same key, enqueued a moment ago
                 raise ModelInUse(
                     f"model {model.path.name}: job {other} makes it; wait, or cancel it"
                 )

@@ -212,10 +212,14 @@ class CaptureManager:
             with self._lock:
                 if self._closed or self.blackouts != blackouts:
                     raise Busy("none, but the stage was put dark meanwhile")
-                self.catalogue.take(capture_id)
-                self._running = run
                 assert run.thread is not None
-                run.thread.start()
+                self._running = run  # first: its thread may end at once
+                try:
+                    run.thread.start()
+                except RuntimeError:  # none can be had
+                    self._running = None
+                    raise
+                self.catalogue.take(capture_id)
         except BaseException:
             if run is not None:
                 run.give_up()

@@ -102,8 +102,9 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             f"--host {args.host}: beyond this machine tokens are asked for and must not be "
             "overheard: leave out --no-auth, and give --tls-cert and --tls-key"
         )
-    if args.verify_days is not None and not args.verify_days > 0:
-        raise BadArgument(f"--verify-days: expected days above 0, got {args.verify_days:g}")
+    if args.verify_days is not None and not 0 < args.verify_days <= 10_000:
+        expected = "days above 0 and at most 10,000"
+        raise BadArgument(f"--verify-days: expected {expected}, got {args.verify_days:g}")
     _check_certificate(args)
     access = _access(args, output)
     rig_file = load_rig_file(args.rig, args.devices)

@@ -20,6 +20,7 @@ from reconstruction import Capture, Model, verify
 from stage_service.api import gate
 from stage_service.api.gate import Access
 from stage_service.cli import main
+from stage_service.jobs.queue import NoSuchJob
 from stage_service.records.tokens import Tokens
 
 SHORT = {"lights": ["light_003"], "projectors": []}
@@ -139,6 +140,22 @@ def test_what_is_in_use_stays(http, world):
     assert http.delete("/models/mine").json()["kind"] == "model"
     assert slug(http.get("/models/mine/archive.tar")) == "not-there"
     assert slug(http.delete("/models/..")) in ("http", "not-there")
+
+
+def test_a_job_that_was_just_enqueued_under_the_key_is_that_one(http, monkeypatch):
+    asked = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}}
+    key = {"Idempotency-Key": "once"}
+    job = http.post("/jobs", json=asked, headers=key).json()["id"]
+    get, not_yet = http.service._queue.get, iter([NoSuchJob("not yet")])
+
+    def looked(name: str) -> Any:
+        for error in not_yet:  # as when the first request is still under way
+            raise error
+        return get(name)
+
+    monkeypatch.setattr(http.service._queue, "get", looked)
+    again = http.post("/jobs", json=asked, headers=key)
+    assert (again.status_code, again.json().get("id")) == (202, job)
 
 
 def test_who_may_remove(rig_file, tmp_path):

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from waiting import until
 
-from stage_service.config import LinkCamerasConfig, RigFile, SerialConfig
+from stage_service.config import DmxConfig, LinkCamerasConfig, RigFile, SerialConfig
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.device_set import DeviceSet
@@ -30,6 +30,7 @@ from stage_service.devices.errors import (
     SafetyRefusal,
 )
 from stage_service.devices.heartbeat import Heartbeat
+from stage_service.devices.lights.dmx_enttec import DmxLightBank
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
@@ -187,6 +188,51 @@ def test_a_device_that_talks_on_and_on_is_given_up_at_its_deadline():
     assert [type(error) for error in found] == [DeviceError]
     assert "'temperature 23'. This is another device" in str(found[0])
     box.close()
+
+
+def test_a_widget_that_sends_on_and_on_does_not_hold_its_lamps():
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    asked, shown = 0, b""
+
+    def widget() -> None:
+        nonlocal asked, shown
+        with contextlib.suppress(OSError):
+            while True:
+                came = os.read(ours, 4096)
+                shown = came[: came.find(b"\xe7") + 1] if came[1] == 6 else shown
+                asked += (wanted := b"\x7e\x03" in came)
+                if wanted and asked == 1:  # without the bytes that were asked for
+                    os.write(ours, b"\x7e\x03\x05\x00\x90\x01\x09\x01\x28\xe7")
+                if asked > 2:  # what it hears of DMX, over and over
+                    while True:
+                        os.write(ours, 50 * b"\x7e\x05\x03\x00\x00\x00\x01\xe7")
+
+    threading.Thread(target=widget, daemon=True).start()
+    config = DmxConfig(
+        kind="dmx_enttec",
+        port=os.ttyname(theirs),
+        timeout_s=0.2,
+        accept_unverified_blackout=True,
+    )
+    bank = DmxLightBank(config, 8)
+    bank.connect()
+    with pytest.raises(DeviceTimeout, match="putting lamp 3 on"):
+        bank.select(3)
+    asked += 1
+    found: list[Exception] = []
+
+    def off() -> None:
+        try:
+            bank.off()
+        except Exception as error:
+            found.append(error)
+
+    thread = threading.Thread(target=off, daemon=True)
+    thread.start()
+    thread.join(30)
+    assert [type(error) for error in found] == [DeviceTimeout]
+    assert shown == b"\x7e\x06\x19\x00" + bytes(25) + b"\xe7"
 
 
 def test_projectors(stage, world):
