@@ -21,6 +21,7 @@ from reconstruction.reading import printable, read_json
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.background import Background
 from stage_service.records.events import EventLog
+from stage_service.signals import tied
 
 log = logging.getLogger("hairstage.verification")
 POLL_S = 0.3
@@ -135,7 +136,7 @@ class Verifier(Background):
         """What is wrong; None where the service ends first."""
         command = [sys.executable, "-m", "stage_service.cli", "verify", str(folder), "--json"]
         child = subprocess.Popen(
-            command,
+            tied(command, "KILL"),  # one that stands still would never end
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

@@ -5,7 +5,10 @@ from __future__ import annotations
 import fcntl
 import io
 import json
+import shutil
 import socket
+import subprocess
+import sys
 import tarfile
 import time
 from pathlib import Path
@@ -13,6 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from serving import Client, serving, slug
 from waiting import until
 
@@ -229,6 +233,35 @@ def test_a_snapshot_is_nothing_to_keep(http):
         assert slug(answer) == "bad-input"
         assert "kept until the next one only" in answer.json()["detail"]
     assert http.get("/trash").json() == []
+
+
+def test_what_reads_a_capture_again_ends_with_a_service_that_is_killed(tmp_path):
+    if shutil.which("setpriv") is None:
+        pytest.skip("there is no setpriv here: children outlive a service that is killed")
+    code = """
+import subprocess, sys, time
+from pathlib import Path
+from stage_service import verification
+from stage_service.records.events import EventLog
+
+class Told(subprocess.Popen):
+    def send_signal(self, number):
+        super().send_signal(number)
+        print(self.pid, flush=True)
+
+verification.subprocess.Popen = Told
+root = Path(sys.argv[1])
+one = verification.Verifier(root / "verified.json", EventLog(), lambda: True, list, None)
+one.start()
+one.ask("any", root)
+time.sleep(600)
+"""
+    words = [sys.executable, "-c", code, tmp_path]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
+        assert service.stdout is not None
+        stat = Path(f"/proc/{int(service.stdout.readline())}/stat")
+        service.kill()
+    until(lambda: not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX")
 
 
 def test_what_was_not_read_for_long_is_read_again_by_itself(rig_file, tmp_path):
