@@ -10,7 +10,9 @@ import socket
 import subprocess
 import sys
 import tarfile
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from serving import Client, serving, slug
 from waiting import until
 
 from reconstruction import Capture, Model, verify
+from stage_service.acquisition.states import CaptureStatus
 from stage_service.api import gate
 from stage_service.api.gate import Access
 from stage_service.cli import main
@@ -353,3 +356,48 @@ def test_the_command_line_of_the_store(http, tmp_path, capsys):
     until(lambda: _done(http, f"/captures/{name}"), pause=0.1)
     run("store", "remove", "capture", name)
     assert len(run("store", "empty", "--older-than-days", "0")["trash"]) == 1
+
+
+def test_the_command_line_takes_names_as_they_are(http, capsys):
+    capture = shot(http)
+    captures = Path(capture["path"]).parent
+    for name in ("anna", "anna#2", "anna?dry_run=true", "anna 100%"):
+        shutil.copytree(capture["path"], captures / name)
+        http.service._captures.catalogue.adopt(name)
+    for name in ("anna#2", "anna?dry_run=true", "anna 100%"):
+        assert main(["store", "remove", "capture", name, "--url", str(http.base_url)]) == 0
+        assert not (captures / name).exists()
+    assert (captures / "anna").is_dir()
+    assert main(["capture", "show", "anna#3", "--url", str(http.base_url)]) == 3
+    assert "there is no capture 'anna#3'" in capsys.readouterr().err
+
+
+def test_the_command_line_lists_all_there_are(http, capsys, monkeypatch):
+    capture = shot(http)
+    for i in range(1100):
+        one = CaptureStatus.model_validate(capture | {"id": f"c{i:04d}"})
+        http.service._captures.catalogue.put(one)
+    assert main(["capture", "list", "--json", "--url", str(http.base_url)]) == 0
+    listed = [c["id"] for c in json.loads(capsys.readouterr().out)["captures"]]
+    assert listed == [capture["id"], *(f"c{i:04d}" for i in range(1100))]
+
+
+def test_what_is_no_service_of_ours_is_told_so(capsys):
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(404 if self.path == "/health" else 200)
+            self.end_headers()
+            self.wfile.write(b"<html>")
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Page) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        for words in (["stage", "status"], ["lease", "show"]):
+            url = f"http://127.0.0.1:{server.server_port}"
+            assert main([*words, "--url", url]) == 4
+            told = capsys.readouterr().err
+            assert "not as hairstage does" in told
+            assert "Traceback" not in told
+        server.shutdown()

@@ -120,6 +120,15 @@ def test_a_number_that_cannot_be_is_wrong_usage(capsys, words, why):
     assert why in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("data", [b"\xff\xfe", b"{", b'{"rate_hz": NaN}', b'{"a": 1, "a": 2}'])
+def test_a_plan_that_cannot_be_read_is_named(capsys, tmp_path, data):
+    plan = tmp_path / "plan.json"
+    plan.write_bytes(data)
+    code, told = run(capsys, "capture", "check", "--rig", "demo", "--plan", plan)
+    assert code == 3
+    assert told["error"]["detail"].startswith(f"{plan} is not JSON: ")
+
+
 def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_path, monkeypatch):
     def never(*_: object, **_more: object) -> None:
         raise AssertionError("a service was made")
