@@ -94,7 +94,9 @@ def test_a_capture_by_the_keyboard_alone(console):
     tab_to(page, "x.textContent === 'Start now'")
     page.keyboard.press("Enter")
     page.wait_for_selector("dialog input:focus")
-    page.keyboard.type("Ada")
+    page.keyboard.type("  ")  # nobody's name: it is asked for again
+    page.keyboard.press("Enter")
+    page.keyboard.type("Ada ")
     page.keyboard.press("Enter")
     says(page, "Shooting")
     tab_to(page, "x.textContent === 'Pause'")
