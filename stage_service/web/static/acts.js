@@ -48,7 +48,7 @@ export async function blackout() {
       else notice(answer.detail, "bad");
       break;
     } catch (error) {
-      if (error.status) {
+      if (error.status && error.status !== 503) { // 503: there was no room to take it
         notice(`blackout refused: ${error.message}`, "bad");
         break;
       }

@@ -216,6 +216,26 @@ def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
     page.wait_for_selector("text=nobody steers")
 
 
+def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
+    http, pages = console()
+    page = pages.open()
+    says(page, "Dark, verified")
+    left = [503, 503]  # as where all connections are taken
+
+    def answer(route: Any) -> None:
+        if left:
+            route.fulfill(status=left.pop(), body="")
+        else:
+            route.continue_()
+
+    page.route("**/devices/blackout", answer)
+    page.keyboard.press("F9")
+    page.wait_for_selector(".notice:has-text('dark, verified')")
+    assert [a.action for a in http.service.audit(10)] == ["blackout"]
+    assert [c for c in pages.complaints if "503" not in c] == []
+    pages.complaints.clear()
+
+
 def test_three_pages_show_the_same_and_any_of_them_aborts(console):
     http, pages = console()
     three = [pages.open() for _ in range(3)]
