@@ -11,6 +11,7 @@ import logging
 import secrets
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -85,6 +86,7 @@ class Storage:
     ) -> None:
         self._root, self._captures, self._control, self._jobs = root, captures, control, jobs
         self._trash, self._uploads = root / "trash", root / "uploads"
+        self._uploading = threading.Lock()  # a file has one temporary name
 
     def models(self) -> list[Folder]:
         """The models, by name."""
@@ -228,7 +230,8 @@ class Storage:
         self.uploaded(subject)
         found = _listed(self._uploads / subject)
         work = partial(shutil.rmtree, self._uploads / subject)
-        self._control.do(by, "upload.delete", work, subject, steers=False)
+        with self._uploading:
+            self._control.do(by, "upload.delete", work, subject, steers=False)
         return found
 
     def _upload(self, subject: str, name: str, data: bytes, by: Caller) -> Folder:
@@ -242,7 +245,8 @@ class Storage:
             return _listed(folder)
 
         detail = f"{name}, {len(data):,} bytes"
-        return self._control.do(by, "upload", work, subject, detail=detail, steers=False)
+        with self._uploading:
+            return self._control.do(by, "upload", work, subject, detail=detail, steers=False)
 
     def _removal(self, kind: Kind, name: str, path: Path, by: Caller) -> Removed:
         size = _listed(path).bytes

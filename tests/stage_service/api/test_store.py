@@ -317,6 +317,23 @@ def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
     assert http.get("/uploads").json() == []
 
 
+def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
+    heads = [HEAD + n * b"# the same head again\n" for n in (1000, 20_000)]
+    answers: list[int] = []
+
+    def put(head: bytes) -> None:
+        answers.append(http.put("/uploads/anna/head.obj", content=head).status_code)
+
+    for _ in range(10):
+        threads = [threading.Thread(target=put, args=(head,)) for head in heads]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert (http.service.root / "uploads" / "anna" / "head.obj").read_bytes() in heads
+    assert answers == 20 * [200]
+
+
 def test_a_refusal_reaches_a_client_that_sends_on(http):
     """What a connection was told is lost where it is closed before all was read."""
     size = 4 * gate.MOST_BODY
