@@ -334,6 +334,36 @@ def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
     assert answers == 20 * [200]
 
 
+def test_what_is_deleted_twice_at_once_is_deleted_once(http):
+    root = http.service.root
+    removed = {"kind": "capture", "by": "eve", "removed": "2026-01-01T00:00:00.000+00:00"}
+    answers: list[int] = []
+
+    def delete(path: str) -> None:
+        answers.append(http.delete(path).status_code)
+
+    for _ in range(10):
+        for name in ("a", "b", "c"):
+            (root / "uploads" / name / "masks").mkdir(parents=True)
+            place = root / "trash" / f"20260101-000000-{name}"
+            (place / name).mkdir(parents=True)
+            told = {**removed, "name": place.name, "id": name, "bytes": 0}
+            (place / "removed.json").write_text(json.dumps(told))
+            for i in range(50):
+                (place / name / f"{i}").touch()
+                (root / "uploads" / name / "masks" / f"{i}.png").touch()
+        paths = [2 * ["/trash"], *(2 * [f"/uploads/{name}"] for name in ("a", "b", "c"))]
+        for twice in paths:
+            threads = [threading.Thread(target=delete, args=(path,)) for path in twice]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+    assert set(answers) <= {200, 404}
+    assert answers.count(404) <= 30
+    assert http.get("/trash").json() == http.get("/uploads").json() == []
+
+
 def test_a_refusal_reaches_a_client_that_sends_on(http):
     """What a connection was told is lost where it is closed before all was read."""
     size = 4 * gate.MOST_BODY
