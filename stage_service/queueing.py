@@ -36,9 +36,7 @@ class Queueing:
         """Begin what waits; `known` are the captures on the disk."""
         begun = {str(c.request["queue"]): c.id for c in known if "queue" in c.request}
         unfinished = {c.id for c in known if c.outcome != "completed"}
-        newest = sorted(known, key=lambda c: c.started or "")[-1:]
-        died = next((c.id for c in newest if c.outcome == "interrupted"), None)
-        self._line.start(begun, unfinished, died)
+        self._line.start(begun, unfinished, self._captures.died_in)
 
     def close(self) -> None:
         """Begin nothing any more."""
@@ -104,6 +102,7 @@ class Queueing:
     def go_on(self, by: Caller) -> QueueView:
         """Begin what waits again. Raises `Leased`."""
         self._control.do(by, "queue.go_on", self._line.go_on, "queue")
+        self._captures.forget_death()
         return self.view()
 
     def _begin(self, entry: Entry) -> str:

@@ -97,16 +97,18 @@ class CaptureQueue(Background):
         self, begun: Mapping[str, str], unfinished: Collection[str], died: str | None = None
     ) -> None:
         """Begin, with the captures that `begun` has by their entries' ids; hold where the last one
-        that was started from here is `unfinished`, or something waits and the service `died` in a
+        that was started from here is `unfinished`, or something waits and a service `died` in that
         capture."""
         with self._changed:
             for entry in list(self._kept.waiting):
                 if entry.id in begun:  # it died between the capture's first file and the queue's
                     self._to_history(entry, "started", begun[entry.id])
             started = (e.capture for e in reversed(self._kept.history) if e.capture is not None)
-            last = died if died is not None and self._kept.waiting else next(started, None)
-            if last in unfinished and self._kept.held is None:
-                self._kept.held = f"capture {last}, the last one, did not complete"
+            last = next(started, None)
+            if died is None or not self._kept.waiting:
+                died = last if last in unfinished else None
+            if died is not None and self._kept.held is None:
+                self._kept.held = f"capture {died}, the last one, did not complete"
                 self._unsaved = True
         self._thread.start()
 
