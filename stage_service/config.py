@@ -17,6 +17,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    StringConstraints,
     ValidationError,
     field_validator,
     model_validator,
@@ -32,7 +33,10 @@ Exposure = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Seconds = Annotated[float, Field(gt=0.0)]
+Baud = Annotated[int, Field(ge=300, le=100_000_000)]
 Address = Annotated[int, Field(ge=0, le=65535)]
+Text = StringConstraints(strip_whitespace=True)
+"""Of which blanks are nothing: they are nobody's name, and say nothing."""
 Names = Annotated[
     tuple[Annotated[str, Field(max_length=LONGEST_NAME)], ...], Field(max_length=4096)
 ]
@@ -132,7 +136,7 @@ class ModbusRtuConfig(_ModbusConfig):
 
     kind: Literal["modbus_rtu"]
     port: str = Field(min_length=1)
-    baud: int = Field(default=115200, ge=300)
+    baud: Baud = 115200
     parity: Literal["N", "E", "O"] = "E"
     stop_bits: Literal[1, 2] = 1
     unit: int = Field(default=1, ge=1, le=247)
@@ -168,7 +172,7 @@ class SerialConfig(Strict):
 
     kind: Literal["serial"] = "serial"
     port: str = Field(min_length=1)
-    baud: int = Field(default=115200, ge=300)
+    baud: Baud = 115200
     timeout_s: Seconds = 1.0
 
 

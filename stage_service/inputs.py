@@ -9,6 +9,7 @@ from reconstruction import Mesh, Rig, read_obj
 from reconstruction.arrays import Bools
 from reconstruction.containment import plain_file
 from reconstruction.files.masks import read_mask
+from stage_service.captures.snapshots import SNAPSHOT
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.records import PipelineRequest
 
@@ -39,6 +40,12 @@ def read_masks(folder: Path, rig: Rig) -> dict[str, Bools]:
     if not masks:
         raise BadInput(f"masks: {folder} has no <camera>.png of this rig's cameras")
     return masks
+
+
+def check_kept(capture: str) -> None:
+    """Raises `BadInput` for the snapshot, of which nothing is to be made that lasts."""
+    if capture == SNAPSHOT:
+        raise BadInput("capture: a snapshot is kept until the next one only: shoot a capture")
 
 
 def check_new(pipeline: PipelineRequest, rig: Rig, head: bool) -> None:

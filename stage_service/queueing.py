@@ -35,7 +35,8 @@ class Queueing:
     def start(self, known: Sequence[CaptureStatus]) -> None:
         """Begin what waits; `known` are the captures on the disk."""
         begun = {str(c.request["queue"]): c.id for c in known if "queue" in c.request}
-        self._line.start(begun, {c.id for c in known if c.outcome != "completed"})
+        unfinished = {c.id for c in known if c.outcome != "completed"}
+        self._line.start(begun, unfinished, self._captures.died_in)
 
     def close(self) -> None:
         """Begin nothing any more."""
@@ -101,6 +102,7 @@ class Queueing:
     def go_on(self, by: Caller) -> QueueView:
         """Begin what waits again. Raises `Leased`."""
         self._control.do(by, "queue.go_on", self._line.go_on, "queue")
+        self._captures.forget_death()
         return self.view()
 
     def _begin(self, entry: Entry) -> str:

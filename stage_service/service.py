@@ -22,7 +22,7 @@ from stage_service.captures.manager import CaptureManager
 from stage_service.captures.snapshots import SNAPSHOT, one_step
 from stage_service.config import RigFile
 from stage_service.frames import UnknownFrame, read_frame, steps_of
-from stage_service.inputs import BadInput, check_new, read_head, read_masks
+from stage_service.inputs import BadInput, check_kept, check_new, read_head, read_masks
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue, NoSuchJob
 from stage_service.jobs.slots import worker_is_alive
@@ -298,12 +298,20 @@ class Service:
         return path
 
     def remove_capture(self, capture_id: str, by: Caller, *, dry_run: bool) -> Removed:
-        """Put a capture into the trash. Raises as `Storage.remove_capture`."""
+        """Put a capture into the trash. Raises as `Storage.remove_capture`, and `BadInput` for a
+        snapshot."""
+        check_kept(capture_id)
+        owes = self._follower.owes
         with self.jobs.lock:
-            return self.storage.remove_capture(capture_id, self._follower.owes, by, dry_run=dry_run)
+            removed = self.storage.remove_capture(capture_id, owes, by, dry_run=dry_run)
+        if not dry_run:
+            self._verifier.forget(capture_id)
+        return removed
 
     def verify(self, capture_id: str, by: Caller) -> Verification:
-        """Have every file of a capture read again. Raises as `done_capture`."""
+        """Have every file of a capture read again. Raises as `done_capture`, and `BadInput` for a
+        snapshot."""
+        check_kept(capture_id)
         work = partial(self._verifier.ask, capture_id, self.done_capture(capture_id))
         return self._control.do(by, "capture.verify", work, capture_id, steers=False)
 

@@ -14,13 +14,13 @@ from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import Entry
 from stage_service.captures.latch import Latched
-from stage_service.config import CaptureDefaults, Exposure, Level, RigFile, Strict
+from stage_service.config import CaptureDefaults, Exposure, Level, RigFile, Strict, Text
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 
 FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$"
 FileName = Annotated[str, Field(pattern=FILE_NAME)]
-PersonName = Annotated[str, Field(min_length=1, max_length=100)]
+PersonName = Annotated[str, Text, Field(min_length=1, max_length=100)]
 Place = Annotated[int, Field(ge=0, le=10**6)]
 LeaseSeconds = Annotated[float, Field(ge=1.0, le=86400.0)]
 
@@ -151,8 +151,8 @@ class RenewRequest(Strict):
 class AcknowledgeRequest(Strict):
     """Who looked at the stage, and what they saw."""
 
-    name: Annotated[str, Field(min_length=2, max_length=100)]
-    note: Annotated[str, Field(min_length=4, max_length=2000)]
+    name: Annotated[str, Text, Field(min_length=2, max_length=100)]
+    note: Annotated[str, Text, Field(min_length=4, max_length=2000)]
 
 
 class CaptureView(CaptureStatus):

@@ -1,8 +1,9 @@
-"""Waiting for a signal without missing one."""
+"""Signals: waiting for one without missing it, and having one sent when somebody dies."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections.abc import Callable
 
@@ -24,3 +25,12 @@ def taken(*numbers: signal.Signals) -> Callable[[], None]:
             pass
 
     return wait
+
+
+def tied(command: list[str], how: str = "TERM") -> list[str]:
+    """`command`, to get the signal `how` when the thread that starts it is gone, even by SIGKILL.
+
+    By util-linux's `setpriv`, which becomes the command; where that is missing, as it is.
+    """
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", how, "--", *command] if setpriv else command

@@ -11,6 +11,7 @@ import logging
 import secrets
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -85,6 +86,8 @@ class Storage:
     ) -> None:
         self._root, self._captures, self._control, self._jobs = root, captures, control, jobs
         self._trash, self._uploads = root / "trash", root / "uploads"
+        self._uploading = threading.Lock()  # a file has one temporary name
+        self._emptying = threading.Lock()  # what is being deleted must not be restored
 
     def models(self) -> list[Folder]:
         """The models, by name."""
@@ -156,17 +159,22 @@ class Storage:
     def restore(self, name: str, by: Caller) -> Removed:
         """Put something back. Raises `NotThere`, `InUse` where its place is taken, `Forbidden`."""
         by.require("admin")
-        found = next((r for r in self.trash() if r.name == name), None)
-        if found is None:
-            raise NotThere(f"nothing in the trash is called {name!r}; GET /trash lists what is")
+        with self._emptying:
+            found = next((r for r in self.trash() if r.name == name), None)
+            if found is None:
+                raise NotThere(f"nothing in the trash is called {name!r}; GET /trash lists what is")
+            return self._restore(found, by)
+
+    def _restore(self, found: Removed, by: Caller) -> Removed:
+        place = self._trash / str(found.name)
 
         def work() -> Removed:
             to = self._root / f"{found.kind}s" / found.id
             if to.exists():
                 raise InUse(f"{found.kind} {found.id} is there again: remove that one first")
-            (self._trash / name / found.id).rename(to)
+            (place / found.id).rename(to)
             flush(to.parent)
-            shutil.rmtree(self._trash / name)
+            shutil.rmtree(place)
             if found.kind == "capture":
                 self._captures.catalogue.adopt(found.id)
             return found
@@ -177,13 +185,14 @@ class Storage:
         """Delete for good what was removed so many days ago; returns what was. `Forbidden`."""
         by.require("admin")
         before = (datetime.now(UTC) - timedelta(days=older_than_days)).isoformat()
-        old = [r for r in self.trash() if r.removed <= before]
-        for found in [] if dry_run else old:
-            work = partial(shutil.rmtree, self._trash / str(found.name))
-            detail = f"{found.bytes:,} bytes"
-            self._control.do(
-                by, f"{found.kind}.delete", work, found.id, detail=detail, steers=False
-            )
+        with self._emptying:
+            old = [r for r in self.trash() if r.removed <= before]
+            for found in [] if dry_run else old:
+                work = partial(shutil.rmtree, self._trash / str(found.name))
+                detail = f"{found.bytes:,} bytes"
+                self._control.do(
+                    by, f"{found.kind}.delete", work, found.id, detail=detail, steers=False
+                )
         return old
 
     def uploads(self) -> list[Folder]:
@@ -225,10 +234,11 @@ class Storage:
 
     def remove_upload(self, subject: str, by: Caller) -> Folder:
         """Delete what was uploaded; captures have copies of their own. Raises `NotThere`."""
-        self.uploaded(subject)
-        found = _listed(self._uploads / subject)
-        work = partial(shutil.rmtree, self._uploads / subject)
-        self._control.do(by, "upload.delete", work, subject, steers=False)
+        with self._uploading:
+            self.uploaded(subject)
+            found = _listed(self._uploads / subject)
+            work = partial(shutil.rmtree, self._uploads / subject)
+            self._control.do(by, "upload.delete", work, subject, steers=False)
         return found
 
     def _upload(self, subject: str, name: str, data: bytes, by: Caller) -> Folder:
@@ -242,7 +252,8 @@ class Storage:
             return _listed(folder)
 
         detail = f"{name}, {len(data):,} bytes"
-        return self._control.do(by, "upload", work, subject, detail=detail, steers=False)
+        with self._uploading:
+            return self._control.do(by, "upload", work, subject, detail=detail, steers=False)
 
     def _removal(self, kind: Kind, name: str, path: Path, by: Caller) -> Removed:
         size = _listed(path).bytes

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from reconstruction import Capture, Model
 from stage_service.captures.control import Caller, Control
-from stage_service.captures.snapshots import SNAPSHOT
-from stage_service.inputs import BadInput, check_named
+from stage_service.inputs import BadInput, check_kept, check_named
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
@@ -63,8 +62,7 @@ class Submitting:
         return self._control.do(by, "job.submit", work, job, detail=what, steers=False)
 
     def _submit(self, job: str, request: JobRequest) -> Job:
-        if request.capture == SNAPSHOT:
-            raise BadInput("capture: a snapshot is kept until the next one only: shoot a capture")
+        check_kept(request.capture)
         path = self._capture_path(request.capture)
         capture = Capture(path)
         if capture.manifest is None:
@@ -83,7 +81,7 @@ class Submitting:
             )
         with self.lock:
             other = self._queue.at_work_on(model)
-            if other is not None:
+            if other not in (None, job):  # itself: of the same key, enqueued a moment ago
                 raise ModelInUse(
                     f"model {model.path.name}: job {other} makes it; wait, or cancel it"
                 )

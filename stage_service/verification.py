@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
@@ -21,6 +21,7 @@ from reconstruction.reading import printable, read_json
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.background import Background
 from stage_service.records.events import EventLog
+from stage_service.signals import tied
 
 log = logging.getLogger("hairstage.verification")
 POLL_S = 0.3
@@ -44,7 +45,8 @@ class Verification(BaseModel):
 
 class Verifier(Background):
     """Reads captures again, one at a time, in a process of its own that stands still while
-    `busy()`; results are kept in `path`. With `days`, each of `due()` is read again so often.
+    `busy()`; results are kept in `path`, beside `captures/`. With `days`, each of `due()` is read
+    again so often.
 
     What is wrong is told by the event "capture.damaged".
     """
@@ -85,6 +87,15 @@ class Verifier(Background):
                 return last.model_copy(update={"state": "waiting"})
             return last
 
+    def forget(self, capture: str) -> None:
+        """It is here no more."""
+        with self._changed:
+            self._waiting.pop(capture, None)
+            if self._known.pop(capture, None) is None:
+                return
+            kept = self._kept()
+        self._write(kept)
+
     @property
     def damaged(self) -> list[str]:
         """The captures with which something was wrong when they were last read."""
@@ -108,7 +119,8 @@ class Verifier(Background):
             except OSError as error:  # there is no process to be had: the next one may have one
                 log.exception("%s", folder)
                 found = [f"it could not be read again: {printable(str(error))}"]
-            self._learn(self._running, found)
+            # One that was removed meanwhile is nobody's damage.
+            self._learn(self._running, found if folder.is_dir() else None)
 
     def _overdue(self) -> dict[str, Path]:
         """The one that was read longest ago, where that is too long."""
@@ -124,7 +136,7 @@ class Verifier(Background):
         """What is wrong; None where the service ends first."""
         command = [sys.executable, "-m", "stage_service.cli", "verify", str(folder), "--json"]
         child = subprocess.Popen(
-            command,
+            tied(command, "KILL"),  # one that stands still would never end
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -168,15 +180,23 @@ class Verifier(Background):
                 problems=[printable(p) for p in problems[:MOST_PROBLEMS]],
             )
             self._known[capture] = found
-            kept = [v.model_dump(mode="json") for v in self._known.values()]
+            kept = self._kept()
         kind = "capture.damaged" if problems else "capture.verified"
         self._events.publish(kind, {"id": capture, "wrong": len(problems)})
+        self._write(kept)
+
+    def _kept(self) -> list[dict[str, Any]]:
+        return [v.model_dump(mode="json") for v in self._known.values()]
+
+    def _write(self, kept: list[dict[str, Any]]) -> None:
         try:
             write_json(self._path, kept)
         except OSError:
             log.exception("%s cannot be written", self._path)
 
     def _read(self) -> dict[str, Verification]:
+        """What is kept, of captures that are still there."""
+        captures = self._path.parent / "captures"
         try:
             kept = TypeAdapter(list[Verification]).validate_python(read_json(self._path))
         except FileNotFoundError:
@@ -184,4 +204,4 @@ class Verifier(Background):
         except (OSError, ValueError, ValidationError) as error:
             log.warning("%s cannot be read: %s", self._path, error)
             return {}
-        return {v.capture: v for v in kept}
+        return {v.capture: v for v in kept if (captures / v.capture).is_dir()}

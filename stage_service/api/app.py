@@ -139,13 +139,18 @@ class Endpoint:
     @property
     def local(self) -> bool:
         """Whether it is reached from this machine alone."""
-        return self.socket is not None or self.host in OWN_NAMES
+        return self.socket is not None or self.name in OWN_NAMES
+
+    @property
+    def name(self) -> str:
+        """The host as a request names it."""
+        return f"[{self.host}]" if ":" in self.host else self.host.lower()
 
     def url(self, port: int) -> str:
         """Where it is asked when it listens on `port`."""
         if self.socket is not None:
             return f"unix:{self.socket.resolve()}"
-        return f"http{'s' if self.certificate else ''}://{self.host}:{port}"
+        return f"http{'s' if self.certificate else ''}://{self.name}:{port}"
 
 
 def serve_viewer(

@@ -35,8 +35,8 @@ UPLOADS, MOST_UPLOAD, UPLOAD_S = ("/uploads/", f"{VIEW}/models/"), 32 << 20, 120
 
 @dataclass(frozen=True)
 class Access:
-    """Who gets in: by host names that are this service's, and by `tokens`, sent with each request
-    or once to log in; None: everybody."""
+    """Who gets in: by host names that are this service's (in lower case), and by `tokens`, sent
+    with each request or once to log in; None: everybody."""
 
     tokens: Tokens | None = None
     names: frozenset[str] = OWN_NAMES
@@ -49,7 +49,7 @@ class Access:
         elsewhere, open in a browser here, can post to it, or point its own host name at it.
         """
         host = headers.get("host", "")
-        if _name(host) not in self.names:
+        if _name(host).lower() not in self.names:
             return "http", f"host {host!r} is not a name of this service", 421
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:

@@ -93,16 +93,22 @@ class CaptureQueue(Background):
         self._unsaved = False
         self._kept = self._read()
 
-    def start(self, begun: Mapping[str, str], unfinished: Collection[str]) -> None:
+    def start(
+        self, begun: Mapping[str, str], unfinished: Collection[str], died: str | None = None
+    ) -> None:
         """Begin, with the captures that `begun` has by their entries' ids; hold where the last one
-        of the history is `unfinished`."""
+        that was started from here is `unfinished`, or something waits and a service `died` in that
+        capture."""
         with self._changed:
             for entry in list(self._kept.waiting):
                 if entry.id in begun:  # it died between the capture's first file and the queue's
                     self._to_history(entry, "started", begun[entry.id])
-            last = self._kept.history[-1].capture if self._kept.history else None
-            if last in unfinished and self._kept.held is None:
-                self._kept.held = f"capture {last}, the last one, did not complete"
+            started = (e.capture for e in reversed(self._kept.history) if e.capture is not None)
+            last = next(started, None)
+            if died is None or not self._kept.waiting:
+                died = last if last in unfinished else None
+            if died is not None and self._kept.held is None:
+                self._kept.held = f"capture {died}, the last one, did not complete"
                 self._unsaved = True
         self._thread.start()
 

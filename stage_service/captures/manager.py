@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 from reconstruction import Capture, CaptureWriter, Mesh
 from reconstruction.arrays import Bools
 from reconstruction.capture.writer import utc_now
+from reconstruction.files.durable import write_whole
+from reconstruction.reading import printable
 from stage_service.acquisition.safety import blackout, off_on_exit
 from stage_service.acquisition.states import (
     CaptureStatus,
@@ -105,6 +107,8 @@ class CaptureManager:
         self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
         self._unread = 0  # of these, those whose devices have not all answered
+        self._shooting = root / "shooting"  # names the capture under way
+        self.died_in = _text(self._shooting)  # in which a service ended, until the next
         self.catalogue = Catalogue(self.folder, root / "captures.index")
         self._tally = Tally()
         self._looked = -APART_S
@@ -209,15 +213,22 @@ class CaptureManager:
         try:
             self.stage.take()  # the bank may have been switched off, and its owner forgotten
             run = make(self.stage.devices)  # no folder is made where there are none
+            write_whole(self._shooting, f"{capture_id}\n".encode())
             with self._lock:
                 if self._closed or self.blackouts != blackouts:
                     raise Busy("none, but the stage was put dark meanwhile")
-                self.catalogue.take(capture_id)
-                self._running = run
                 assert run.thread is not None
-                run.thread.start()
+                self._running = run  # first: its thread may end at once
+                try:
+                    run.thread.start()
+                except RuntimeError:  # none can be had
+                    self._running = None
+                    raise
+                self.catalogue.take(capture_id)
+                self.died_in = None
         except BaseException:
             if run is not None:
+                self._shooting.unlink(missing_ok=True)
                 run.give_up()
                 if capture_id != SNAPSHOT:
                     self.catalogue.adopt(capture_id)
@@ -225,6 +236,13 @@ class CaptureManager:
         finally:
             with self._lock:
                 self._preparing = None
+
+    def forget_death(self) -> None:
+        """Somebody has said that it may go on."""
+        with self._lock:
+            died, self.died_in = self.died_in, None
+        if died is not None and _text(self._shooting) == died:  # not that of another by now
+            self._shooting.unlink(missing_ok=True)
 
     def _check_free(self) -> None:
         if self._closed:
@@ -474,6 +492,9 @@ class CaptureManager:
             except Exception as error:
                 data = {"id": run.id, "error": f"{type(error).__name__}: {error}"}
                 self.events.publish("capture.follow_up_failed", data)
+        if result == "completed" or not self._closed:  # else the next service has to know
+            with suppress(OSError):  # the disk is gone
+                self._shooting.unlink(missing_ok=True)
         with self._lock:
             self._tally.add(run, result if kept else None)
             if kept or result != "completed":
@@ -481,6 +502,14 @@ class CaptureManager:
             self.catalogue.put(status)
             self._running = None
         self.events.publish("capture.over", {"id": run.id, "outcome": result})
+
+
+def _text(path: Path) -> str | None:
+    """What a file of one line says; None where there is none."""
+    try:
+        return printable(path.read_text(errors="replace").strip()) or "of no name"
+    except OSError:
+        return None
 
 
 def _not_yet_over(status: CaptureStatus) -> CaptureStatus:

@@ -8,8 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from stage_service.cli.support.children import tied
 from stage_service.cli.support.commands import FAILED, CommandError, Commands, Output
+from stage_service.signals import tied
 
 BENCHMARKS = {
     "acquisition": "steps and bytes a second beside what wires and disk allow",

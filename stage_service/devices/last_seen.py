@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 WAIT_S = 2.0
@@ -33,8 +34,10 @@ class LastSeen:
         """What was seen last and, as "age_s", how many seconds ago (None: not yet)."""
         with self._changed:
             if not self._looking:
-                self._looking, self._began = True, time.monotonic()
-                threading.Thread(target=self._run, name="device-look", daemon=True).start()
+                self._began = time.monotonic()
+                with suppress(RuntimeError):  # no thread can be had: its age tells
+                    threading.Thread(target=self._run, name="device-look", daemon=True).start()
+                    self._looking = True
             self._changed.wait_for(lambda: not self._looking, self._wait_s)
             age = None if self._at is None else time.monotonic() - self._at
             return {**self._seen, "age_s": age}

@@ -36,7 +36,7 @@ class Ownership:
     """
 
     def __init__(self, config: LightBankConfig, root: Path, take_over: bool = False) -> None:
-        self._host = socket.gethostname()[:24]
+        self._host = _host()
         self._name = f"{self._host}:{os.getpid()}"
         # The same after a restart, so that what this service has left is its own.
         self._number = zlib.crc32(f"{self._host}:{root.resolve()}".encode()) % 0xFFFF + 1
@@ -82,6 +82,12 @@ class Ownership:
             bank.close()
         except DeviceError:  # it is gone; so is whoever could have had it
             pass
+
+
+def _host() -> str:
+    """This machine's name in 24 characters, of which the last tell long ones apart."""
+    host = socket.gethostname()
+    return host if len(host) <= 24 else f"{host[:15]}-{zlib.crc32(host.encode()):08x}"
 
 
 def _in_use(bank: str, holder: str) -> StageInUse:

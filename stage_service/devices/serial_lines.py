@@ -19,6 +19,8 @@ from stage_service.devices.errors import (
 )
 
 LONGEST_LINE = 4096
+MOST_LINES = 1000
+"""A device that has sent so many without its identity is another, however fast it goes on."""
 REFUSED_BY_SAFETY = 3
 WATCHDOG_S = (0.1, 60.0)
 
@@ -125,19 +127,21 @@ class SerialLines:
         # "?" ends what a device may hold of a request that was cut off; the two make no request.
         self._send("?\nID?", doing)
         deadline = time.monotonic() + self.config.timeout_s
-        seen: list[str] = []
-        while True:
+        seen: str | None = None
+        for _ in range(MOST_LINES):
             try:
                 line = self._line(deadline, doing)
-            except DeviceTimeout as error:
-                if not seen:
+            except DeviceTimeout:
+                if seen is None:
                     raise
-                expected = f"an identity like {self._identity.pattern!r}"
-                todo = "This is another device: check the ports in the rig file."
-                raise self._error(DeviceError, doing, expected, repr(seen[-1]), todo) from error
+                break
             if match := self._identity.fullmatch(line):
                 return match
-            seen.append(line)
+            seen = line
+        self.close()
+        expected = f"an identity like {self._identity.pattern!r}"
+        todo = "This is another device: check the ports in the rig file."
+        raise self._error(DeviceError, doing, expected, repr(seen), todo)
 
     def _send(self, request: str, doing: str) -> None:
         assert self._port is not None

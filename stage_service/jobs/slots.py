@@ -8,6 +8,7 @@ import re
 import secrets
 import socket
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -102,14 +103,14 @@ def workers_seen(root: Path) -> list[WorkerSeen]:
     for path in sorted(root.glob("worker-*.lock")):
         name, _, host = path.stem.partition("@")
         age = max(0.0, time.time() - path.stat().st_mtime)
+        alive = age < SILENT_S
         if host == HOST:
-            # Shared, so that several may look at once.
-            file = _hold(path, fcntl.LOCK_SH)
-            alive = file is None
-            if file is not None:
-                file.close()
-        else:
-            alive = age < SILENT_S
+            with suppress(PermissionError):  # another user's: by its heartbeat
+                # Shared, so that several may look at once.
+                file = _hold(path, fcntl.LOCK_SH)
+                alive = file is None
+                if file is not None:
+                    file.close()
         found.append(WorkerSeen(host, name, alive, age))
     return found
 

@@ -80,6 +80,15 @@ def test_a_second_service_says_who_has_the_stage_and_darkens_nothing(
     begin(rig_file, "two").close()
 
 
+def test_machines_whose_names_begin_alike_are_not_one(simulated, begin, elsewhere):
+    rig_file, _ = simulated()
+    elsewhere("hairstage-studio-control-1.example.org")
+    begin(rig_file, "one")
+    elsewhere("hairstage-studio-control-2.example.org")
+    with pytest.raises(StageInUse, match="held by hairstage-studi"):
+        begin(other_serial_ports(rig_file), "two")
+
+
 def test_a_dead_machine_has_the_stage_until_somebody_says_so(simulated, begin, elsewhere):
     rig_file, _ = simulated()
     elsewhere("left")

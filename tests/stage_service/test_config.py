@@ -68,6 +68,7 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
         ("watchdog_s = 2.0", "watchdog_s = 0.6", "at most half of watchdog_s"),
         ("olat = 0.02", "olat = 0.0", "capture.exposure.olat"),
         ("[capture]", "[captures]", "captures"),
+        ("[devices.trigger]", "[devices.trigger]\nbaud = 3000000000", "devices.trigger.baud"),
     ],
 )
 def test_errors_name_file_and_field(tmp_path, old, new, names):

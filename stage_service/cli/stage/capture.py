@@ -14,6 +14,7 @@ from stage_service.cli.support.commands import (
     Output,
     add_group,
     add_remote,
+    in_url,
     progress_bar,
     read_json,
     rig_path,
@@ -131,7 +132,7 @@ def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) 
 
 def run_list_captures(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """List captures, oldest first."""
-    captures = service.get("/captures?limit=1000")
+    captures = [c for page in reversed(service.all("/captures")) for c in page]
     lines = [
         f"{c['id']}  {c['outcome'] or c['state']}  {c['frames_written']}/{c['frames_planned']} "
         f"frames  {c['path']}"
@@ -144,7 +145,7 @@ def run_list_captures(args: argparse.Namespace, output: Output, service: Service
 
 def run_capture_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Show, pause, resume or abort."""
-    path = f"/captures/{args.capture}"
+    path = f"/captures/{in_url(args.capture)}"
     if args.action == "show":
         output.result(service.get(path))
         return

@@ -11,6 +11,7 @@ from stage_service.cli.support.commands import (
     Output,
     add_group,
     add_remote,
+    in_url,
     progress_bar,
     read_json,
 )
@@ -62,14 +63,14 @@ def run_submit(args: argparse.Namespace, output: Output, service: ServiceClient)
 
 def run_list_jobs(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """List jobs, newest first."""
-    jobs = service.get("/jobs")
+    jobs = [j for page in service.all("/jobs") for j in page]
     lines = [f"{j['id']}  {j['pipeline']}  {j['outcome'] or j['state']}" for j in jobs]
     output.result({"jobs": jobs}, "\n".join(lines) or "no jobs")
 
 
 def run_job_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
     """Show, wait for, cancel, or read what a job left."""
-    path = f"/jobs/{args.job}"
+    path = f"/jobs/{in_url(args.job)}"
     if args.action == "wait":
         return wait_for_job(service, args.job, output, {})
     if args.action == "artifacts":

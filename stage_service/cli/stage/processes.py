@@ -96,16 +96,17 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
 
     exit_on_sigterm()
     os.umask(PRIVATE)
-    endpoint = Endpoint(args.host, args.port, args.socket, args.tls_cert, args.tls_key)
+    endpoint = Endpoint(args.host.strip("[]"), args.port, args.socket, args.tls_cert, args.tls_key)
     if not endpoint.local and (args.no_auth or args.tls_cert is None):
         raise BadArgument(
             f"--host {args.host}: beyond this machine tokens are asked for and must not be "
             "overheard: leave out --no-auth, and give --tls-cert and --tls-key"
         )
-    if args.verify_days is not None and not args.verify_days > 0:
-        raise BadArgument(f"--verify-days: expected days above 0, got {args.verify_days:g}")
+    if args.verify_days is not None and not 0 < args.verify_days <= 10_000:
+        expected = "days above 0 and at most 10,000"
+        raise BadArgument(f"--verify-days: expected {expected}, got {args.verify_days:g}")
     _check_certificate(args)
-    access = _access(args, output)
+    access = _access(args, {endpoint.name, *args.name}, output)
     rig_file = load_rig_file(args.rig, args.devices)
     try:
         service = Service(
@@ -145,11 +146,11 @@ def _check_certificate(args: argparse.Namespace) -> None:
         ) from error
 
 
-def _access(args: argparse.Namespace, output: Output) -> Access:
+def _access(args: argparse.Namespace, named: set[str], output: Output) -> Access:
     from stage_service.api.gate import OWN_NAMES, Access
     from stage_service.records.tokens import Tokens, own_file, own_token
 
-    names = OWN_NAMES | {args.host, *args.name}
+    names = OWN_NAMES | {name.lower() for name in named}
     if args.no_auth:
         output.note("no tokens are asked for: everybody on this machine may do everything")
         return Access(None, names)

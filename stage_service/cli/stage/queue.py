@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.stage.capture import add_wanted, wanted
-from stage_service.cli.support.commands import Commands, Output, add_group, add_remote
+from stage_service.cli.support.commands import Commands, Output, add_group, add_remote, in_url
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -56,12 +56,12 @@ def run_history(_args: argparse.Namespace, output: Output, service: ServiceClien
 
 def run_move(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Put what waits at another place."""
-    output.result(service.ask("PATCH", f"/queue/{args.entry}", json={"place": args.place}))
+    output.result(service.ask("PATCH", f"/queue/{in_url(args.entry)}", json={"place": args.place}))
 
 
 def run_remove(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Take out what waits."""
-    output.result(service.ask("DELETE", f"/queue/{args.entry}"))
+    output.result(service.ask("DELETE", f"/queue/{in_url(args.entry)}"))
 
 
 def run_start_one(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
@@ -69,7 +69,7 @@ def run_start_one(args: argparse.Namespace, output: Output, service: ServiceClie
 
     The only way for a plan that flashes: --armed-by says who at the stage answers for it.
     """
-    started = service.post(f"/queue/{args.entry}/start", {"armed_by": args.armed_by})
+    started = service.post(f"/queue/{in_url(args.entry)}/start", {"armed_by": args.armed_by})
     output.result(started, f"capture {started['capture']} runs")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from stage_service.cli.support.commands import (
     BadArgument,
@@ -12,6 +13,7 @@ from stage_service.cli.support.commands import (
     Output,
     add_group,
     add_remote,
+    in_url,
     progress_bar,
 )
 
@@ -52,13 +54,13 @@ def run_download(args: argparse.Namespace, output: Output, service: ServiceClien
     """
     out = args.out or Path(f"{args.name}.tar")
     with progress_bar("download") as progress:
-        size = service.download(f"/{args.kind}s/{args.name}/archive.tar", out, progress)
+        size = service.download(f"/{args.kind}s/{in_url(args.name)}/archive.tar", out, progress)
     output.result({"file": str(out), "bytes": size}, f"{out}: {size:,} bytes")
 
 
 def run_remove(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Put a capture or a model into the trash."""
-    path = f"/{args.kind}s/{args.name}?dry_run={args.dry_run}"
+    path = f"/{args.kind}s/{in_url(args.name)}?dry_run={args.dry_run}"
     found = service.ask("DELETE", path)
     told = "would go into the trash" if args.dry_run else f"is in the trash as {found['name']}"
     stay = f"; its models stay: {', '.join(found['models'])}" if found["models"] else ""
@@ -72,7 +74,7 @@ def run_trash(_args: argparse.Namespace, output: Output, service: ServiceClient)
 
 def run_restore(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Put something back from the trash, as admin."""
-    found = service.post(f"/trash/{args.name}/restore")
+    found = service.post(f"/trash/{in_url(args.name)}/restore")
     output.result(found, f"{found['kind']} {found['id']} is back")
 
 
@@ -85,9 +87,9 @@ def run_empty(args: argparse.Namespace, output: Output, service: ServiceClient) 
 def run_verify(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Have the service read every file of a capture again, beside all else."""
     if args.show:
-        found = service.get(f"/captures/{args.capture}/verification")
+        found = service.get(f"/captures/{in_url(args.capture)}/verification")
     else:
-        found = service.post(f"/captures/{args.capture}/verify")
+        found = service.post(f"/captures/{in_url(args.capture)}/verify")
     last = f"{found['wrong']} wrong at {found['finished']}" if found["finished"] else "never read"
     output.result(found, "\n".join([f"{found['state']}; {last}", *found["problems"]]))
 
@@ -101,7 +103,8 @@ def run_upload(args: argparse.Namespace, output: Output, service: ServiceClient)
         raise BadArgument("nothing to upload: give --head, or --masks with <camera>.png in it")
     kept: dict[str, Any] = {}
     for name, file in files.items():
-        kept = service.ask("PUT", f"/uploads/{args.subject}/{name}", content=file.read_bytes())
+        path = f"/uploads/{in_url(args.subject)}/{quote(name)}"
+        kept = service.ask("PUT", path, content=file.read_bytes())
     output.result(kept, f"{args.subject}: {', '.join(kept['files'])}")
 
 

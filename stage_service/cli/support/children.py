@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import select
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from stage_service.cli.support.commands import BAD_INPUT, UNREACHABLE, CommandError
+from stage_service.signals import tied
 
 GRACE_S = 40.0
 """How long a child may take to end by itself: the service puts the lights off in that time."""
@@ -128,15 +128,6 @@ def end(child: subprocess.Popen[str]) -> None:
             child.wait()
     if child.stdout is not None:
         child.stdout.close()
-
-
-def tied(command: list[str], how: str = "TERM") -> list[str]:
-    """`command`, to get the signal `how` when the thread that starts it is gone, even by SIGKILL.
-
-    By util-linux's `setpriv`, which becomes the command; where that is missing, as it is.
-    """
-    setpriv = shutil.which("setpriv")
-    return [setpriv, "--pdeathsig", how, "--", *command] if setpriv else command
 
 
 def own_command(*arguments: str | Path) -> list[str]:

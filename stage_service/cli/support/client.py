@@ -16,7 +16,13 @@ import httpx
 
 from reconstruction import Progress
 from reconstruction.files.durable import writing
-from stage_service.cli.support.commands import BAD_INPUT, FAILED, UNREACHABLE, CommandError
+from stage_service.cli.support.commands import (
+    BAD_INPUT,
+    FAILED,
+    UNREACHABLE,
+    CommandError,
+    in_url,
+)
 from stage_service.records.tokens import own_file, own_token
 
 DEFAULT_URL = "http://127.0.0.1:8331"
@@ -59,6 +65,13 @@ class ServiceClient:
         """The JSON at `path`."""
         return self.ask("GET", path)
 
+    def all(self, path: str, most: int = 1000) -> list[list[Any]]:
+        """The whole list at `path`, in pages of `most`, the first one that of the newest."""
+        pages: list[list[Any]] = []
+        while not pages or len(pages[-1]) == most:
+            pages.append(self.get(f"{path}?limit={most}&offset={most * len(pages)}"))
+        return pages
+
     def post(self, path: str, body: Any = None) -> Any:
         """Post `body` and return the answer's JSON."""
         return self.ask("POST", path, json=body)
@@ -75,7 +88,7 @@ class ServiceClient:
                 "Unreachable",
             ) from error
         if response.is_success:
-            return response.json()
+            return _json(response)
         raise _problem(response)
 
     def download(self, path: str, out: Path, progress: Progress) -> int:
@@ -158,7 +171,7 @@ class ServiceClient:
             else:
                 progress(f"{p['step']}: {p['what']}", p["share"])
 
-        return self._follow(f"/jobs/{job}", show, check)
+        return self._follow(f"/jobs/{in_url(job)}", show, check)
 
     def _follow(
         self, path: str, show: Callable[[dict[str, Any]], None], check: Callable[[], None]
@@ -189,10 +202,25 @@ def _capture_told(status: dict[str, Any]) -> tuple[str, float]:
 
 
 def _problem(response: httpx.Response) -> CommandError:
-    problem = response.json()
+    problem = _json(response)
     code = BAD_INPUT if response.status_code in (404, 422) else FAILED
     return CommandError(
         f"{problem['title']}: {problem['detail']}", code, "Problem", problem=problem
+    )
+
+
+def _json(response: httpx.Response) -> Any:
+    try:
+        answer = response.json()
+        if response.is_success or "title" in answer:
+            return answer
+    except (ValueError, TypeError):
+        pass
+    raise CommandError(
+        f"{response.url} answers {response.status_code}, not as hairstage does: check --url and "
+        "HAIRSTAGE_URL",
+        UNREACHABLE,
+        "Unreachable",
     )
 
 

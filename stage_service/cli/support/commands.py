@@ -14,8 +14,10 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from reconstruction import Progress
+from reconstruction.reading import parse_json
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -226,12 +228,17 @@ def read_json(text: str | Path | None) -> dict[str, Any]:
         return {}
     inline = str(text).lstrip().startswith("{")
     try:
-        found = json.loads(str(text) if inline else Path(text).read_text())
+        found = parse_json(str(text) if inline else Path(text).read_bytes())
     except ValueError as error:
         raise BadArgument(f"{text} is not JSON: {error}") from error
     if not isinstance(found, dict):
         raise BadArgument(f"{text}: expected an object, {{...}}, got {type(found).__name__}")
     return found
+
+
+def in_url(name: str) -> str:
+    """A name as one part of a URL's path, in which `#`, `?`, `%` and `/` say something else."""
+    return quote(name, safe="")
 
 
 def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:

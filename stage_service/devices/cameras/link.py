@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from reconstruction import Camera
+from reconstruction.reading import parse_json
 from stage_service.config import LinkCamerasConfig
 from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
@@ -149,7 +150,7 @@ class LinkCamera:
                 (length,) = struct.unpack(">I", self._receive(4, deadline))
                 if length > LONGEST_HEADER:
                     raise ValueError(f"a message of {length} bytes")
-                answer = json.loads(self._receive(length, deadline))
+                answer = parse_json(self._receive(length, deadline))
                 length = int(answer.get("bytes", 0))
                 if not 0 <= length <= LONGEST_PAYLOAD:
                     raise ValueError(f"a payload of {length} bytes")
@@ -161,7 +162,7 @@ class LinkCamera:
                 came = "nothing, or not all of it" if late else str(error) or "a closed connection"
                 todo = "Check the camera's power and network, and start again."
                 raise kind(self.device, doing, "an answer", came, todo, timeout_s) from error
-            except (ValueError, AttributeError) as error:
+            except (ValueError, AttributeError, TypeError) as error:
                 self.close()
                 todo = "Check the port in [devices.cameras]: this is another device."
                 raise self._error(doing, "length-prefixed JSON", str(error), todo) from error

@@ -29,6 +29,8 @@ CHANNELS, FEWEST_CHANNELS = 512, 24
 GET_PARAMETERS, SEND_DMX = 3, 6
 _START, _END, _START_CODE = 0x7E, 0xE7, 0
 _MOST_USER_DATA = 32
+_MOST_QUIET = 4
+"""Time-outs, within which a widget that an answer is missing of must be silent for one."""
 _STILL_LIT = "Its lamps may still be lit."
 SLOWEST_FRAME_S = 0.023
 """A frame of 512 channels at full speed (ANSI E1.11)."""
@@ -154,7 +156,7 @@ class DmxLightBank:
         for as many as it can."""
         assert self._port is not None
         if self._late and self._bare:
-            self._drain()
+            self._drain(doing)
         self._asked = self._asked % _MOST_USER_DATA + 1
         self._late = True
         self._send(GET_PARAMETERS, struct.pack("<H", self._asked), doing)
@@ -183,12 +185,21 @@ class DmxLightBank:
                 return rate
         return None
 
-    def _drain(self) -> None:
+    def _drain(self, doing: str) -> None:
         """Drop what comes until nothing has come for as long as an answer may take."""
         assert self._port is not None
         quiet = self.config.timeout_s
-        while select.select([self._port], [], [], quiet)[0]:
-            self._port.read(max(1, self._port.in_waiting))
+        deadline = time.monotonic() + _MOST_QUIET * quiet
+        try:
+            while select.select([self._port], [], [], quiet)[0]:
+                came = self._port.read(max(1, self._port.in_waiting))
+                if time.monotonic() > deadline:
+                    self.close()
+                    got, most = came[:32].hex(" "), _MOST_QUIET * quiet
+                    todo = f"{_STILL_LIT} Take it off other DMX lines: it passes on what it hears."
+                    raise DeviceTimeout(self.name, doing, "a moment's silence", got, todo, most)
+        except OSError as error:
+            raise self._lost(doing, error) from error
 
     def _lost(self, doing: str, error: Exception) -> DeviceUnreachable:
         self.close()

@@ -48,7 +48,7 @@ export async function blackout() {
       else notice(answer.detail, "bad");
       break;
     } catch (error) {
-      if (error.status) {
+      if (error.status && error.status !== 503) { // 503: there was no room to take it
         notice(`blackout refused: ${error.message}`, "bad");
         break;
       }
@@ -70,14 +70,14 @@ export function left(c) {
 
 /** Who steers, as the others see it. Raises `LEFT` where nobody says. */
 export async function askName() {
-  const known = localStorage.getItem("name") ?? S.who?.name ?? "";
+  const known = (localStorage.getItem("name") ?? S.who?.name ?? "").trim();
   if (known) return known;
   return new Promise((done, left_) => {
-    const field = h("input", { name: "holder", required: true, maxlength: 100, autocomplete: "name" });
+    const field = h("input", { name: "holder", required: true, maxlength: 100, pattern: ".*\\S.*", title: "a name", autocomplete: "name" });
     const box = h("dialog", { "aria-label": "who steers" }, h("form", { onsubmit: (event) => {
       event.preventDefault();
-      localStorage.setItem("name", field.value);
-      done(field.value);
+      localStorage.setItem("name", field.value.trim());
+      done(field.value.trim());
       box.close();
     } }, h("label", "Your name, as the others see it", field), h(".line", h("button.go", "Steer"), button("Cancel", () => box.close()))));
     box.addEventListener("close", () => { box.remove(); left_(LEFT); }); // nothing, after `done`

@@ -168,6 +168,31 @@ def test_a_burst_of_connections_leaves_descriptors_too(rig_file, tmp_path):
         assert "Too many open files" not in errors.read_text()
 
 
+@pytest.mark.parametrize("host", ["::1", "[::1]"])
+def test_serve_answers_on_loopback_in_ipv6_by_names_in_any_case(rig_file, tmp_path, host):
+    command = [sys.executable, "-m", "stage_service.cli", "serve", "--json", "--port", "0"]
+    command += ["--rig", str(rig_file.path), "--root", str(tmp_path / "root"), "--no-auth"]
+    command += ["--host", host, "--name", "Stage-PC"]
+    service = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        assert service.stdout is not None
+        url = json.loads(service.stdout.readline())["url"]
+        assert url.startswith("http://[::1]:")
+        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+            assert http.get("/health").json()["status"] == "ok"
+            for name in ("stage-pc", "Stage-PC", "STAGE-PC:80"):  # browsers send the first
+                assert http.get("/health", headers={"Host": name}).status_code == 200
+            assert http.get("/health", headers={"Host": "stage"}).status_code == 421
+        service.terminate()
+        assert service.wait(60) == 0
+    finally:
+        service.kill()
+        service.wait()
+        service.stdout.close()
+
+
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl here")
 def test_serve_speaks_tls_and_nothing_else_where_it_has_a_certificate(rig_file, tmp_path):
     """The command itself, from its first line to SIGTERM."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -152,6 +153,55 @@ def test_a_restart_keeps_what_waits_and_shoots_nothing_twice(rig_file, tmp_path)
     with serving(rig_file, root) as http:
         assert "broken" in http.get("/queue").json()["held"]
         assert len(list(root.glob("queue.json.broken-*"))) == 1
+
+
+@pytest.mark.parametrize("then_removed", [True, False])
+def test_nothing_begins_after_a_service_that_died_in_a_capture(rig_file, tmp_path, then_removed):
+    root = tmp_path / "root"
+    with serving(rig_file, root) as http:
+        http.post("/queue:hold")
+        a, b, c = (add(http, plan(i)) for i in range(3))
+        if then_removed:  # from the queue, of which another entry is removed meanwhile
+            http.post(f"/queue/{a}/start")
+            http.delete(f"/queue/{b}")
+        else:
+            http.post("/captures", json=plan(4))
+        (capture,) = ended(http, 1)
+    # As if it had died in the capture.
+    (Path(capture["path"]) / "manifest.json").unlink()
+    assert not (root / "shooting").exists()
+    if not then_removed:
+        (root / "shooting").write_text(f"{capture['id']}\n")
+    kept = json.loads((root / "queue.json").read_text())
+    (root / "queue.json").write_text(json.dumps(kept | {"held": None}))
+    with serving(rig_file, root) as http:
+        assert capture["id"] in http.get("/queue").json()["held"]
+        assert c in [e["id"] for e in http.get("/queue").json()["waiting"]]
+        assert len(http.get("/captures").json()) == 1
+        http.post("/queue:go-on")
+        ended(http, 2 + (not then_removed) * 2)
+    with serving(rig_file, root) as http:  # once somebody has said so, it is over
+        assert http.get("/queue").json()["held"] is None
+
+
+def test_nothing_begins_after_a_service_that_was_ended_in_a_capture(rig_file, tmp_path):
+    root = tmp_path / "root"
+    with serving(rig_file, root) as http:
+        capture = http.post("/captures", json={"plan": LONG}).json()["id"]
+        entry = add(http, plan(1))
+    with serving(rig_file, root) as http:
+        assert capture in http.get("/queue").json()["held"]
+        assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [entry]
+        http.post("/queue:go-on")
+        ended(http, 2)
+
+
+def test_what_is_being_shot_is_known_to_the_next_service(http, world):
+    world.busy = {"cam_1": 10**9}
+    capture = http.post("/captures", json=plan(1)).json()["id"]
+    assert (http.service.root / "shooting").read_text() == f"{capture}\n"
+    http.post("/devices/blackout")
+    until(lambda: not (http.service.root / "shooting").exists())
 
 
 def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, tmp_path):

@@ -274,7 +274,14 @@ def test_flashes_in_the_band_need_consent_and_somebody_who_arms_them(rig_file, w
         begun = http.post("/captures", json={"plan": agreed, "armed_by": "Ada"})
         assert begun.status_code == 202
         http.post(f"/captures/{begun.json()['id']}/abort")
-        refused(http.post("/captures", json={"plan": agreed, "armed_by": ""}), "invalid-request")
+        for nobody in (
+            {"plan": agreed, "armed_by": " "},
+            {"plan": IN_BAND | {"consent": 12 * " "}},
+        ):
+            refused(http.post("/captures", json={"armed_by": "Ada", **nobody}), "invalid-request")
+        nothing = {"name": "  ", "note": "    "}
+        refused(http.post("/devices/acknowledge", json=nothing), "invalid-request")
+        refused(http.post("/lease", json={"holder": " "}), "invalid-request")
         armed = [a for a in http.get("/audit").json() if a["action"] == "flash.armed"]
         assert [a["detail"] for a in armed] == [f"armed by Ada; consent: {CONSENT}"]
 

@@ -5,21 +5,29 @@ from __future__ import annotations
 import fcntl
 import io
 import json
+import shutil
 import socket
+import subprocess
+import sys
 import tarfile
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from serving import Client, serving, slug
 from waiting import until
 
 from reconstruction import Capture, Model, verify
+from stage_service.acquisition.states import CaptureStatus
 from stage_service.api import gate
 from stage_service.api.gate import Access
 from stage_service.cli import main
+from stage_service.jobs.queue import NoSuchJob
 from stage_service.records.tokens import Tokens
 
 SHORT = {"lights": ["light_003"], "projectors": []}
@@ -141,6 +149,22 @@ def test_what_is_in_use_stays(http, world):
     assert slug(http.delete("/models/..")) in ("http", "not-there")
 
 
+def test_a_job_that_was_just_enqueued_under_the_key_is_that_one(http, monkeypatch):
+    asked = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}}
+    key = {"Idempotency-Key": "once"}
+    job = http.post("/jobs", json=asked, headers=key).json()["id"]
+    get, not_yet = http.service._queue.get, iter([NoSuchJob("not yet")])
+
+    def looked(name: str) -> Any:
+        for error in not_yet:  # as when the first request is still under way
+            raise error
+        return get(name)
+
+    monkeypatch.setattr(http.service._queue, "get", looked)
+    again = http.post("/jobs", json=asked, headers=key)
+    assert (again.status_code, again.json().get("id")) == (202, job)
+
+
 def test_who_may_remove(rig_file, tmp_path):
     tokens = Tokens(tmp_path / "tokens.json", "own")
     steers = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'steer'))}"}
@@ -182,11 +206,65 @@ def test_a_capture_is_read_again_beside_the_service_and_damage_is_told(http):
     ]
     assert capture["id"] in http.get("/health").json()["problems"][0]
     assert http.get("/health").json()["status"] == "degraded"
+    http.delete(path)
+    assert http.get("/health").json()["status"] == "ok"
 
 
 def _done(http: Client, path: str, after: str = "") -> Any:
     found = http.get(f"{path}/verification").json()
     return found if found["state"] == "done" and found["finished"] > after else None
+
+
+def test_damage_of_captures_that_are_gone_is_told_no_more(rig_file, tmp_path):
+    root = tmp_path / "root"
+    gone = {"capture": "20260101-000000-0000", "state": "done", "wrong": 1, "problems": ["it"]}
+    root.mkdir()
+    (root / "verified.json").write_text(json.dumps([gone]))
+    with serving(rig_file, root) as http:
+        assert http.get("/health").json()["status"] == "ok"
+        capture = shot(http)
+        verifier = http.service._verifier
+        verifier.ask(capture["id"], Path(capture["path"]).with_name("gone meanwhile"))
+        until(lambda: verifier.get(capture["id"]).state == "never")
+        assert http.get("/health").json()["status"] == "ok"
+
+
+def test_a_snapshot_is_nothing_to_keep(http):
+    http.post("/snapshot", json={})
+    until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
+    for answer in (http.delete("/captures/snapshot"), http.post("/captures/snapshot/verify")):
+        assert slug(answer) == "bad-input"
+        assert "kept until the next one only" in answer.json()["detail"]
+    assert http.get("/trash").json() == []
+
+
+def test_what_reads_a_capture_again_ends_with_a_service_that_is_killed(tmp_path):
+    if shutil.which("setpriv") is None:
+        pytest.skip("there is no setpriv here: children outlive a service that is killed")
+    code = """
+import subprocess, sys, time
+from pathlib import Path
+from stage_service import verification
+from stage_service.records.events import EventLog
+
+class Told(subprocess.Popen):
+    def send_signal(self, number):
+        super().send_signal(number)
+        print(self.pid, flush=True)
+
+verification.subprocess.Popen = Told
+root = Path(sys.argv[1])
+one = verification.Verifier(root / "verified.json", EventLog(), lambda: True, list, None)
+one.start()
+one.ask("any", root)
+time.sleep(600)
+"""
+    words = [sys.executable, "-c", code, tmp_path]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
+        assert service.stdout is not None
+        stat = Path(f"/proc/{int(service.stdout.readline())}/stat")
+        service.kill()
+    until(lambda: not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX")
 
 
 def test_what_was_not_read_for_long_is_read_again_by_itself(rig_file, tmp_path):
@@ -239,6 +317,53 @@ def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
     assert http.get("/uploads").json() == []
 
 
+def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
+    heads = [HEAD + n * b"# the same head again\n" for n in (1000, 20_000)]
+    answers: list[int] = []
+
+    def put(head: bytes) -> None:
+        answers.append(http.put("/uploads/anna/head.obj", content=head).status_code)
+
+    for _ in range(10):
+        threads = [threading.Thread(target=put, args=(head,)) for head in heads]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert (http.service.root / "uploads" / "anna" / "head.obj").read_bytes() in heads
+    assert answers == 20 * [200]
+
+
+def test_what_is_deleted_twice_at_once_is_deleted_once(http):
+    root = http.service.root
+    removed = {"kind": "capture", "by": "eve", "removed": "2026-01-01T00:00:00.000+00:00"}
+    answers: list[int] = []
+
+    def delete(path: str) -> None:
+        answers.append(http.delete(path).status_code)
+
+    for _ in range(10):
+        for name in ("a", "b", "c"):
+            (root / "uploads" / name / "masks").mkdir(parents=True)
+            place = root / "trash" / f"20260101-000000-{name}"
+            (place / name).mkdir(parents=True)
+            told = {**removed, "name": place.name, "id": name, "bytes": 0}
+            (place / "removed.json").write_text(json.dumps(told))
+            for i in range(50):
+                (place / name / f"{i}").touch()
+                (root / "uploads" / name / "masks" / f"{i}.png").touch()
+        paths = [2 * ["/trash"], *(2 * [f"/uploads/{name}"] for name in ("a", "b", "c"))]
+        for twice in paths:
+            threads = [threading.Thread(target=delete, args=(path,)) for path in twice]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+    assert set(answers) <= {200, 404}
+    assert answers.count(404) <= 30
+    assert http.get("/trash").json() == http.get("/uploads").json() == []
+
+
 def test_a_refusal_reaches_a_client_that_sends_on(http):
     """What a connection was told is lost where it is closed before all was read."""
     size = 4 * gate.MOST_BODY
@@ -278,3 +403,48 @@ def test_the_command_line_of_the_store(http, tmp_path, capsys):
     until(lambda: _done(http, f"/captures/{name}"), pause=0.1)
     run("store", "remove", "capture", name)
     assert len(run("store", "empty", "--older-than-days", "0")["trash"]) == 1
+
+
+def test_the_command_line_takes_names_as_they_are(http, capsys):
+    capture = shot(http)
+    captures = Path(capture["path"]).parent
+    for name in ("anna", "anna#2", "anna?dry_run=true", "anna 100%"):
+        shutil.copytree(capture["path"], captures / name)
+        http.service._captures.catalogue.adopt(name)
+    for name in ("anna#2", "anna?dry_run=true", "anna 100%"):
+        assert main(["store", "remove", "capture", name, "--url", str(http.base_url)]) == 0
+        assert not (captures / name).exists()
+    assert (captures / "anna").is_dir()
+    assert main(["capture", "show", "anna#3", "--url", str(http.base_url)]) == 3
+    assert "there is no capture 'anna#3'" in capsys.readouterr().err
+
+
+def test_the_command_line_lists_all_there_are(http, capsys, monkeypatch):
+    capture = shot(http)
+    for i in range(1100):
+        one = CaptureStatus.model_validate(capture | {"id": f"c{i:04d}"})
+        http.service._captures.catalogue.put(one)
+    assert main(["capture", "list", "--json", "--url", str(http.base_url)]) == 0
+    listed = [c["id"] for c in json.loads(capsys.readouterr().out)["captures"]]
+    assert listed == [capture["id"], *(f"c{i:04d}" for i in range(1100))]
+
+
+def test_what_is_no_service_of_ours_is_told_so(capsys):
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(404 if self.path == "/health" else 200)
+            self.end_headers()
+            self.wfile.write(b"<html>")
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Page) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        for words in (["stage", "status"], ["lease", "show"]):
+            url = f"http://127.0.0.1:{server.server_port}"
+            assert main([*words, "--url", url]) == 4
+            told = capsys.readouterr().err
+            assert "not as hairstage does" in told
+            assert "Traceback" not in told
+        server.shutdown()

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,28 @@ def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, wo
         "detail": "every lamp and projector was read back dark",
     }
     assert manager.wait(capture_id, 20).outcome == "aborted"
+
+
+def test_a_capture_for_which_no_thread_can_be_had_keeps_nobody_from_anything(
+    manager, world, completed, monkeypatch
+):
+    begin = threading.Thread.start
+
+    def none_left(thread: threading.Thread) -> None:
+        if thread.name.startswith("capture-"):
+            raise RuntimeError("can't start new thread")
+        begin(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", none_left)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        manager.start(SHORT)
+    assert manager.running is None
+    assert manager.blackout()["safe"]
+    (status,) = manager.list()
+    assert status.outcome == "interrupted"
+    monkeypatch.undo()
+    manager.resume(status.id)
+    assert manager.wait(status.id, 20).outcome == "completed"
 
 
 def test_blackout_without_a_capture(manager, world):

@@ -123,6 +123,15 @@ def test_a_number_that_cannot_be_is_wrong_usage(capsys, words, why):
     assert why in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("data", [b"\xff\xfe", b"{", b'{"rate_hz": NaN}', b'{"a": 1, "a": 2}'])
+def test_a_plan_that_cannot_be_read_is_named(capsys, tmp_path, data):
+    plan = tmp_path / "plan.json"
+    plan.write_bytes(data)
+    code, told = run(capsys, "capture", "check", "--rig", "demo", "--plan", plan)
+    assert code == 3
+    assert told["error"]["detail"].startswith(f"{plan} is not JSON: ")
+
+
 def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_path, monkeypatch):
     def never(*_: object, **_more: object) -> None:
         raise AssertionError("a service was made")
@@ -134,7 +143,9 @@ def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_
         (["--tls-cert", tmp_path / "none.pem"], "none.pem: no such file"),
         (["--tls-cert", junk, "--tls-key", junk], "not a certificate with its key"),
         (["--tls-key", junk], "without --tls-cert"),
-        (["--verify-days", "-1"], "above 0, got -1"),
+        (["--verify-days", "-1"], "above 0 and at most 10,000, got -1"),
+        (["--verify-days", "1e6"], "above 0 and at most 10,000, got 1e+06"),
+        (["--verify-days", "inf"], "above 0 and at most 10,000, got inf"),
     ):
         code, data = run(capsys, "serve", "--rig", "demo", "--root", root, *words)
         assert code == 3

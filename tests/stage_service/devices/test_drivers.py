@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
+import os
+import pty
+import socket
+import struct
 import threading
 import time
+import tty
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from waiting import until
 
-from stage_service.config import RigFile, SerialConfig
+from stage_service.config import DmxConfig, LinkCamerasConfig, RigFile, SerialConfig
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.device_set import DeviceSet
@@ -22,6 +30,7 @@ from stage_service.devices.errors import (
     SafetyRefusal,
 )
 from stage_service.devices.heartbeat import Heartbeat
+from stage_service.devices.lights.dmx_enttec import DmxLightBank
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
@@ -152,6 +161,80 @@ def test_serial_ports_that_are_not_there_or_another_device(rig_file, world):
     controller.close()
 
 
+def test_a_device_that_talks_on_and_on_is_given_up_at_its_deadline():
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    over = threading.Event()
+
+    def talk() -> None:
+        with contextlib.suppress(OSError):
+            while not over.is_set():
+                os.write(ours, 50 * b"temperature 23\n")
+
+    threading.Thread(target=talk, daemon=True).start()
+    box = SerialTriggerBox(SerialConfig(port=os.ttyname(theirs), timeout_s=0.2))
+    found: list[Exception] = []
+
+    def connect() -> None:
+        try:
+            box.connect()
+        except Exception as error:
+            found.append(error)
+
+    thread = threading.Thread(target=connect, daemon=True)
+    thread.start()
+    thread.join(30)
+    over.set()
+    assert [type(error) for error in found] == [DeviceError]
+    assert "'temperature 23'. This is another device" in str(found[0])
+    box.close()
+
+
+def test_a_widget_that_sends_on_and_on_does_not_hold_its_lamps():
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    asked, shown = 0, b""
+
+    def widget() -> None:
+        nonlocal asked, shown
+        with contextlib.suppress(OSError):
+            while True:
+                came = os.read(ours, 4096)
+                shown = came[: came.find(b"\xe7") + 1] if came[1] == 6 else shown
+                asked += (wanted := b"\x7e\x03" in came)
+                if wanted and asked == 1:  # without the bytes that were asked for
+                    os.write(ours, b"\x7e\x03\x05\x00\x90\x01\x09\x01\x28\xe7")
+                if asked > 2:  # what it hears of DMX, over and over
+                    while True:
+                        os.write(ours, 50 * b"\x7e\x05\x03\x00\x00\x00\x01\xe7")
+
+    threading.Thread(target=widget, daemon=True).start()
+    config = DmxConfig(
+        kind="dmx_enttec",
+        port=os.ttyname(theirs),
+        timeout_s=0.2,
+        accept_unverified_blackout=True,
+    )
+    bank = DmxLightBank(config, 8)
+    bank.connect()
+    with pytest.raises(DeviceTimeout, match="putting lamp 3 on"):
+        bank.select(3)
+    asked += 1
+    found: list[Exception] = []
+
+    def off() -> None:
+        try:
+            bank.off()
+        except Exception as error:
+            found.append(error)
+
+    thread = threading.Thread(target=off, daemon=True)
+    thread.start()
+    thread.join(30)
+    assert [type(error) for error in found] == [DeviceTimeout]
+    assert shown == b"\x7e\x06\x19\x00" + bytes(25) + b"\xe7"
+
+
 def test_projectors(stage, world):
     assert stage.projectors is not None
     stage.projectors.line("right", 7, 0.5)
@@ -205,6 +288,39 @@ def test_cameras_of_another_rig_are_refused(rig_file, stage):
     with pytest.raises(DeviceError, match="received no camera cam_9"):
         camera.connect()
     camera.close()
+
+
+HELLO = {"width": 8, "height": 6, "full_scale": 4095, "black": 64, "gain": 1e4, "bytes": 0}
+FRAME = {"block_id": 1, "timestamp": 2.5, "exposure": 0.02, "left": 0, "bytes": 288}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, None])
+@pytest.mark.parametrize(
+    ("hello", "field"), [*((True, f) for f in HELLO), *((False, f) for f in FRAME)]
+)
+def test_what_is_no_number_is_an_error_that_names_the_camera(rig_file, hello, field, value):
+    told = [HELLO | {field: value}, {}] if hello else [HELLO, {}, FRAME | {field: value}]
+
+    def peer() -> None:
+        with contextlib.suppress(OSError, struct.error), listener.accept()[0] as link:
+            for fields in told:
+                link.recv(struct.unpack(">I", link.recv(4, socket.MSG_WAITALL))[0])
+                text = json.dumps({"ok": True, "status": "frame", **fields}).encode()
+                link.sendall(struct.pack(">I", len(text)) + text + bytes(288 * ("left" in fields)))
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=peer, daemon=True).start()
+        config = LinkCamerasConfig(port=listener.getsockname()[1])
+        camera = LinkCamera(config, rig_file.rig.cameras[0])
+
+        def shoot() -> None:
+            with contextlib.closing(camera):
+                camera.connect()
+                camera.arm(0.02)
+                camera.read(NEVER)
+
+        with pytest.raises(DeviceError, match=r"^camera cam_0 "):
+            shoot()
 
 
 def test_mute_and_busy_cameras(stage, world):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from waiting import until
@@ -195,3 +197,19 @@ def test_workers_of_one_root_have_names_of_their_own(tmp_path: Path) -> None:
     assert third.name == "worker-0"
     for slot in (second, third):
         slot.release()
+
+
+def test_another_user_s_worker_is_told_by_its_heartbeat(tmp_path: Path, monkeypatch) -> None:
+    slot = WorkerSlot(tmp_path)
+    opened = Path.open
+
+    def refused(path: Path, *how: Any, **more: Any) -> Any:
+        if path.name.startswith("worker-"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *how, **more)
+
+    monkeypatch.setattr(Path, "open", refused)
+    assert worker_is_alive(tmp_path)
+    os.utime(next(tmp_path.glob("worker-*.lock")), (0, 0))
+    assert not worker_is_alive(tmp_path)
+    slot.release()

@@ -94,7 +94,9 @@ def test_a_capture_by_the_keyboard_alone(console):
     tab_to(page, "x.textContent === 'Start now'")
     page.keyboard.press("Enter")
     page.wait_for_selector("dialog input:focus")
-    page.keyboard.type("Ada")
+    page.keyboard.type("  ")  # nobody's name: it is asked for again
+    page.keyboard.press("Enter")
+    page.keyboard.type("Ada ")
     page.keyboard.press("Enter")
     says(page, "Shooting")
     tab_to(page, "x.textContent === 'Pause'")
@@ -212,6 +214,26 @@ def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
     says(page, "Dark, verified")
     http.delete("/lease", headers=mine)
     page.wait_for_selector("text=nobody steers")
+
+
+def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
+    http, pages = console()
+    page = pages.open()
+    says(page, "Dark, verified")
+    left = [503, 503]  # as where all connections are taken
+
+    def answer(route: Any) -> None:
+        if left:
+            route.fulfill(status=left.pop(), body="")
+        else:
+            route.continue_()
+
+    page.route("**/devices/blackout", answer)
+    page.keyboard.press("F9")
+    page.wait_for_selector(".notice:has-text('dark, verified')")
+    assert [a.action for a in http.service.audit(10)] == ["blackout"]
+    assert [c for c in pages.complaints if "503" not in c] == []
+    pages.complaints.clear()
 
 
 def test_three_pages_show_the_same_and_any_of_them_aborts(console):

@@ -1,0 +1,19 @@
+"""What was seen last of devices and disk."""
+
+from __future__ import annotations
+
+import threading
+
+from stage_service.devices.last_seen import LastSeen
+
+
+def test_who_found_no_thread_to_look_with_looks_the_next_time(monkeypatch):
+    def none_left(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    seen = LastSeen(lambda: {"free": 5}, {"free": None})
+    with monkeypatch.context() as full:
+        full.setattr(threading.Thread, "start", none_left)
+        assert seen.get() == {"free": None, "age_s": None}
+        assert seen.looking_s() == 0
+    assert seen.get()["free"] == 5
