@@ -185,17 +185,22 @@ class LightPairs:
         """
         a, b = (np.asarray(self.scale * x, float).ravel() for x in (one, other))
         i, j, k = self.first, self.second, self.sample
-        of_pairs, of_samples = len(EDGES) - 1, len(_DEVIATIONS) - 1
         products = 0.5 * (a[i] * b[j] + a[j] * b[i])
-        own, other = slice(None, self.own), slice(self.own, None)
+        own, apart = slice(None, self.own), slice(self.own, None)
+
+        def of_pairs(values: Array, which: slice) -> Array:
+            return _summed(self.bin_of_pair[which], values[which], len(EDGES) - 1)
+
+        def of_samples(values: Array) -> Array:
+            return _summed(self.bin_of_sample, values, len(_DEVIATIONS) - 1)
+
         return Highlight(
-            *(
-                _summed(self.bin_of_pair[which], values[which], of_pairs)
-                for which in (own, other)
-                for values in (products, np.ones(len(i)))
-            ),
-            _summed(self.bin_of_sample, 0.5 * (a[k] + b[k]), of_samples),
-            _summed(self.bin_of_sample, np.ones(len(k)), of_samples),
+            of_pairs(products, own),
+            of_pairs(np.ones(len(i)), own),
+            of_pairs(products, apart),
+            of_pairs(np.ones(len(i)), apart),
+            of_samples(0.5 * (a[k] + b[k])),
+            of_samples(np.ones(len(k))),
         )
 
 

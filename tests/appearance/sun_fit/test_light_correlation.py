@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
+from appearance.observations import Observed
 from appearance.sun_fit.light_correlation import (
     EDGES,
     SIDE,
     WINDOW,
     Highlight,
     LightPairs,
+    beside,
+    match_disorder,
     match_roughness,
 )
+from reconstruction import Camera
 
 BETAS = (0.04, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.95)
 PIXELS, LIGHTS, VIEWS = 450, 24, 2
@@ -39,17 +43,21 @@ def highlight(beta, shift_deg=0.0, noise=0.0, floor=0.1, seed=0):
 
 
 def pairs(deviation):
-    """Every pair of lights in every pixel, the pixels dealt out to the parts in turn."""
+    """Every pair of lights in every pixel, and in every second pixel and the next one.
+
+    The pixels are dealt out to the parts in turn.
+    """
     index = np.arange(deviation.size).reshape(deviation.shape)
     one, other = np.triu_indices(LIGHTS, 1)
-    angle = np.abs(deviation[one] - deviation[other])
+    first = np.concatenate([index[one].ravel(), index[one, ::2].ravel()])
+    second = np.concatenate([index[other].ravel(), index[other, 1::2].ravel()])
+    angle = np.abs(deviation.flat[first] - deviation.flat[second])
     part = np.arange(PIXELS) % SIDE**2
     of_sample = part * 30 + np.minimum(((deviation + WINDOW) / (2 * WINDOW) * 30).astype(int), 29)
-    of_pair = part * 10 + np.digitize(angle, EDGES[1:-1])
+    of_pair = part[first % PIXELS] * 10 + np.digitize(angle, EDGES[1:-1])
+    own = len(one) * PIXELS
     return LightPairs(
-        *(x.ravel() for x in (index, of_sample, index[one], index[other], of_pair)),
-        of_pair.size,
-        np.ones(deviation.shape),
+        index.ravel(), of_sample.ravel(), first, second, of_pair, own, np.ones(deviation.shape)
     )
 
 
@@ -83,6 +91,39 @@ def test_a_profile_alone_would_read_tangents_that_are_off_as_roughness(family):
     off = highlight(0.2, 20, seed=4).profiles(np.ones((1, 2 * SIDE**2)))[0, 0]
     nearest = int(np.argmin([((p - off) ** 2).sum() for p in profile]))
     assert BETAS[nearest] > 1.4 * 0.2
+
+
+@pytest.mark.parametrize("turn_deg", [0, 9, 20])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_pixels_beside_each_other_tell_how_far_strands_turn(turn_deg, noise):
+    """Whatever the roughness that the rendered strands are given."""
+    rendered = [(d, highlight(0.35, d, seed=7 + k)) for k, d in enumerate((0, 6, 12, 18, 24))]
+    found = match_disorder(highlight(0.28, turn_deg, noise, seed=4), rendered)
+    assert found is not None
+    assert found.degrees == pytest.approx(turn_deg, abs=2)
+    assert abs(found.degrees - turn_deg) <= 3 * found.error
+
+
+def test_alike_are_pixels_of_one_highlight_and_not_those_of_strangers():
+    whole = np.ones((1, VIEWS * SIDE**2))
+    assert highlight(0.1).likeness(whole) == pytest.approx(1, abs=0.05)
+    assert abs(highlight(0.1, 300).likeness(whole)) < 0.1
+    assert match_disorder(replace(highlight(0.1), pairs_beside=np.zeros((18, 10))), []) is None
+
+
+def test_more_disorder_than_was_rendered_is_a_warning(family):
+    rendered = [(d, highlight(0.3, d, seed=7 + k)) for k, d in enumerate((0, 3, 6))]
+    about = match_roughness(highlight(0.3, 20, seed=4), family)
+    found = about.after(about, match_disorder(highlight(0.3, 20, seed=4), rendered))
+    assert any("turned by 6°" in w for w in found.warnings())
+
+
+def test_what_lies_beside_a_pixel():
+    """In rows of ten: 7 would be beyond the row's end, and 26 is where 27 has none."""
+    camera = Camera.look_at("cam", 10, 10, (0, -1, 0), (0, 0, 0), 10)
+    pixels = np.array([40, 7, 10, 4, 37, 26])
+    seen = Observed(camera, (), pixels, np.zeros((0, 6, 3)), np.zeros((0, 6), bool))
+    assert sorted(map(tuple, pixels[beside(seen)].tolist())) == [(4, 7), (7, 37), (10, 40)]
 
 
 def test_an_answer_at_an_end_of_the_range_is_a_warning(family):

@@ -118,7 +118,7 @@ def test_visible_fibres_know_position_and_direction(wisp):
     strands, camera, _ = wisp
     scene = build_scene(strands, None, hair=HairAppearance((0.1, 0.1, 0.1), 0.3, 0.2))
     fibres = visible_fibres(scene, camera, np.arange(256), samples=9)
-    assert fibres.share.min() > 0.85  # one of nine samples may pass between the fibres
+    assert fibres.share.min() > 0.7  # two of nine samples may pass between the fibres
     met = fibres.hair
     np.testing.assert_allclose(np.linalg.norm(fibres.tangent[met], axis=1), 1, atol=1e-5)
     assert (fibres.tangent[met][:, 2] < -0.9).all()  # root to tip is down
