@@ -403,10 +403,11 @@ class SunFit:
 
     def _halves(self, scene: HairScene, o: Observed, number: int) -> Floats:
         """Two renderings `(2, L, P, 3)` of a view, half the samples and own noise each."""
-        spp = max(self.options.roughness_spp // 2, 1)
-        spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 12)))
-        twice = render_olat(scene, o.camera, o.lights, pixels=np.tile(o.pixels, 2), **spent)
-        return np.stack(np.split(twice, 2, axis=1))
+        spp, views = max(self.options.roughness_spp // 2, 1), []
+        for half in range(2):  # of one rendering, the noise of two pixels may go together
+            spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (2 * number + half << 11)))
+            views.append(render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent))
+        return np.stack(views)
 
     @property
     def _tilt(self) -> float:
