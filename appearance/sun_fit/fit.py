@@ -12,6 +12,7 @@ import numpy as np
 from appearance.bsdf.longitudinal import (
     absorption_of_colour,
     roughness_of_variance,
+    roughness_without_scatter,
     variance_of_roughness,
 )
 from appearance.metrics.scores import Exposure
@@ -21,13 +22,9 @@ from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
+from appearance.sun_fit.highlights import BESIDE, WINDOW, Highlight, Highlights, beside
 from appearance.sun_fit.light_correlation import (
-    BESIDE,
-    WINDOW,
-    Highlight,
-    Highlights,
     Roughness,
-    beside,
     disordered,
     match_disorder,
     match_roughness,
@@ -208,7 +205,7 @@ def _some(rows: Ints, most: int) -> Ints:
 
 
 def _with_those_beside(pixels: Ints, mask: Bools) -> Ints:
-    """`pixels (P,)` and, of as many as are matched, those of the mask that lie beside them."""
+    """`pixels (P,)` and, of as many as are matched or more, the mask's that lie beside them."""
     width = mask.shape[1]
     few = pixels[:: max(1, len(pixels) // ROUGHNESS_PIXELS)]
     right = few[::2][few[::2] % width + BESIDE < width] + BESIDE
@@ -301,10 +298,13 @@ class SunFit:
         family: list[tuple[float, Highlight]] = []
         about, scene, disorder = matched(self.scene, ROUGHNESSES), self.scene, None
         if self.disordered is not None:
-            turned = {d: self.disordered(float(np.radians(d))) for d in DISORDERS}
-            disorder = match_disorder(
-                captured, [(d, rendered(scene, about.beta_m)) for d, scene in turned.items()]
+            # the turns depend on the roughness a little: without what the tangents' error adds
+            smoother = roughness_without_scatter(
+                about.beta_m, float(np.radians(about.tangents_deg))
             )
+            beta = max(smoother or about.beta_m, ROUGHNESSES[0])
+            turned = ((d, self.disordered(float(np.radians(d)))) for d in DISORDERS)
+            disorder = match_disorder(captured, ((d, rendered(x, beta)) for d, x in turned))
             off = DISORDER * about.tangents_deg if disorder is None else disorder.degrees
             scene = self.disordered(float(np.radians(off)))
         nearer = np.clip(np.array(NEARER) * about.beta_m, ROUGHNESSES[0], ROUGHNESSES[-1])

@@ -7,7 +7,10 @@ from reconstruction.options import Count, options
 
 @options
 class FitOptions:
-    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
+    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering.
+
+    To the hair's pixels come others that lie beside them, at most as many.
+    """
 
     hair_pixels: Count = 1000
     roughness_cameras: Count = 4

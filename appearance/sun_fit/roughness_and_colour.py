@@ -25,7 +25,7 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import HairScene
-from appearance.sun_fit.light_correlation import SIDE, parts_of
+from appearance.sun_fit.highlights import SIDE, parts_of
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 

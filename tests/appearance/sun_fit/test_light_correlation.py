@@ -7,16 +7,8 @@ import pytest
 
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
-from appearance.sun_fit.light_correlation import (
-    EDGES,
-    SIDE,
-    WINDOW,
-    Highlight,
-    LightPairs,
-    beside,
-    match_disorder,
-    match_roughness,
-)
+from appearance.sun_fit.highlights import EDGES, SIDE, WINDOW, Highlight, LightPairs, beside
+from appearance.sun_fit.light_correlation import match_disorder, match_roughness
 from reconstruction import Camera
 
 BETAS = (0.04, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.95)
@@ -96,7 +88,7 @@ def test_a_profile_alone_would_read_tangents_that_are_off_as_roughness(family):
 @pytest.mark.parametrize("turn_deg", [0, 9, 20])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_pixels_beside_each_other_tell_how_far_strands_turn(turn_deg, noise):
-    """Whatever the roughness that the rendered strands are given."""
+    """By rendered strands that are a quarter rougher, too."""
     rendered = [(d, highlight(0.35, d, seed=7 + k)) for k, d in enumerate((0, 6, 12, 18, 24))]
     found = match_disorder(highlight(0.28, turn_deg, noise, seed=4), rendered)
     assert found is not None
