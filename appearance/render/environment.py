@@ -17,7 +17,14 @@ import numpy as np
 from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import check_environment
 from appearance.render.harmonics import projected
-from appearance.render.paths import Surface, Wave, camera_rays, each_sample, seed_state
+from appearance.render.paths import (
+    Surface,
+    Wave,
+    camera_rays,
+    each_sample,
+    seed_state,
+    stream_of,
+)
 from appearance.render.pixel_field import DeviceField, PixelField, factor_of, field_of
 from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
 from appearance.scene.hair_scene import HairScene
@@ -82,11 +89,10 @@ def direct_environment(
         film, surface = dr.zeros(mi.Float, 3 * len(index)), Surface(scene)
         field = field_of(scene, camera, index)
         gather, origin = _Gather(surface, film, sky, factor_of(field)), seed_state(seed, 1)
-        generator: Any = mi.PCG32  # the stubs call it a plain object
 
         def trace(wave: Wave) -> None:
             si = surface.interact(wave.rays, mi.Bool(True))
-            start = generator(1, origin, mi.UInt64(wave.slot)).next_float32()
+            start = stream_of(origin, mi.UInt64(wave.slot)).next_float32()
             place = start + mi.Float(wave.sample) * _GOLDEN
             hit = Paths(mi.Color3f(1), mi.UInt32(0), wave.slot, wave.rng, si.is_valid())
             gather.add(si, hit, place - dr.floor(place))

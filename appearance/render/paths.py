@@ -179,8 +179,19 @@ def _size(camera: Camera) -> int:
 
 def stream(size: int, *seeds: int) -> Any:
     """Random streams of `size` lanes that depend on all of `seeds`."""
-    generator: Any = mi.PCG32  # the stubs call it a plain object
-    return generator(size, seed_state(*seeds))
+    return stream_of(seed_state(*seeds), dr.arange(mi.UInt64, size))
+
+
+def stream_of(state: Any, lane: Any) -> Any:
+    """The random stream of a `lane`, a `UInt64`; `state` is what `seed_state` returns.
+
+    Each begins at a hash of the two: PCG32 streams whose states differ by a fixed step draw numbers
+    that go together, and the noise of two pixels so many lanes apart correlates by up to 0.4.
+    """
+    low, high = mi.UInt32(lane) ^ mi.UInt32(state), mi.UInt32(lane >> 32) ^ mi.UInt32(state >> 32)
+    hashed: Any = mi.sample_tea_64  # nor do the stubs take Dr.Jit's plain integers
+    generator: Any = mi.PCG32  # which they call a plain object
+    return generator(1, hashed(low, high), lane)
 
 
 def seed_state(*seeds: int) -> Any:
@@ -253,14 +264,13 @@ def each_sample(
     slot = dr.arange(mi.UInt32, slots)
     size, end = opaque_index(slots), opaque_index(spp)
     start = seed_state(seed)
-    generator: Any = mi.PCG32  # the stubs call it a plain object
 
     def more(sample: Any) -> Any:
         return sample < end
 
     def body(sample: Any) -> Any:
         lane = mi.UInt64(sample) * mi.UInt64(size) + mi.UInt64(slot)
-        rng = generator(1, start + lane, lane)
+        rng = stream_of(start, lane)
         pixel = dr.gather(mi.UInt32, pixels, slot)
         trace(Wave(jittered(camera, pixel, sample, spp, rng), rng, slot, sample))
         return (sample + 1,)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from pydantic import Field
 
-from appearance.render.paths import Surface, jittered, seed_state
+from appearance.render.paths import Surface, jittered, seed_state, stream_of
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
@@ -99,11 +99,10 @@ def follow(
     size, end, last = opaque_index(len(pixels)), opaque_index(spp), opaque_index(limits.max_depth)
     (roulette,) = opaque(limits.roulette)
     origin = seed_state(*plan.seeds)
-    generator: Any = mi.PCG32  # the stubs call it a plain object
 
     def begin(sample: Any) -> tuple[Any, Any]:
         lane = mi.UInt64(sample) * mi.UInt64(size) + mi.UInt64(slot)
-        rng = generator(1, origin + lane, lane)
+        rng = stream_of(origin, lane)
         return rng, jittered(camera, pixel, sample, spp, rng)
 
     def more(ray: Any, throughput: Any, depth: Any, sample: Any, rng: Any, active: Any) -> Any:

@@ -199,6 +199,17 @@ def test_same_seed_same_bytes(tufted):
     assert (a != other).any()
 
 
+@pytest.mark.parametrize("spp", [3, 6])
+def test_pixels_of_a_rendering_have_independent_noise(tufted, spp):
+    """Differences of two runs are noise: that of a pixel and of its copy do not go together."""
+    scene, camera, lights = tufted
+    twice = np.tile(covered_pixels(scene, camera), 2)
+    runs = [render_olat(scene, camera, lights, spp=spp, seed=s, pixels=twice) for s in range(64)]
+    noise = np.sqrt(np.stack(runs[::2])) - np.sqrt(np.stack(runs[1::2]))
+    one, other = np.split(noise[..., 0], 2, axis=2)
+    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.03
+
+
 def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
     tufted, monkeypatch, caplog
 ):
