@@ -17,21 +17,25 @@ TURN = np.array([0.15, -0.1])
 
 
 def solve(tufted, truth: HairMaps, **more):
+    """The start, and what is found from five draws of the paths: single ones are 0.06 off."""
     problem = tufted.problem(truth, spp=1024)
     start = replace(truth, rotation=np.zeros_like(truth.rotation))
     raw = problem.encode(start, LightDeviations.calibrated(len(problem.lights)))
-    return raw, solve_correctives(problem, raw, np.ones(len(problem.lights)), EFFORT, **more)
+    gain = np.ones(len(problem.lights))
+    draws = range(0, 5000, 1000)
+    return raw, [solve_correctives(problem, raw, gain, EFFORT, seed=s, **more) for s in draws]
 
 
 def test_a_turn_that_all_fibres_share_is_found(tufted):
     rotation = np.broadcast_to(TURN, (1, 1, 1, 2))
     truth = replace(HairMaps.of(tufted.truth), rotation=rotation)
     raw, found = solve(tufted, truth)
-    assert found.taken
-    np.testing.assert_allclose(decode(found.raw).rotation[0, 0, 0], TURN, atol=0.08)
-    assert found.error < found.start_error
+    turns = [decode(draw.raw).rotation[0, 0, 0] for draw in found if draw.taken]
+    assert len(turns) >= 4
+    np.testing.assert_allclose(np.median(turns, axis=0), TURN, atol=0.08)
+    assert all(draw.error < draw.start_error for draw in found if draw.taken)
     others = [name for name in raw if name != "rotation"]
-    assert all((found.raw[name] == raw[name]).all() for name in others)
+    assert all((draw.raw[name] == raw[name]).all() for name in others for draw in found)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +48,7 @@ def test_neighbours_are_held_together_by_their_weight(tufted, shape, lambda_r, a
     turns = np.array([[0.2, 0.0], [-0.2, 0.0]]).reshape(*shape, 2)
     truth = replace(HairMaps.of(tufted.truth, shape), rotation=turns)
     _, found = solve(tufted, truth, lambda_r=lambda_r)
-    one, other = decode(found.raw).rotation[..., 0].ravel()
+    one, other = np.median([decode(draw.raw).rotation[..., 0].ravel() for draw in found], axis=0)
     assert (one - other > 0.15) == apart
 
 

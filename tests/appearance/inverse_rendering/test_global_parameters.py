@@ -52,7 +52,7 @@ def test_all_are_found_together(plain, tufted, start):
 )
 def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
-    problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
+    problem = tufted.problem(HairMaps.of(truth), views=1, spp=2048)
     quiet = replace(EFFORT, pixels=100, spp=256)
     _, _, maps, _, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3), effort=quiet)
     assert maps.beta_m == pytest.approx(beta_m, rel=0.2)
@@ -78,8 +78,8 @@ def test_white_hair(tufted):
 def test_black_hair(tufted, begins, names, off, left):
     """Its highlight tells roughness and index. Of its absorption it tells that it is black."""
     truth = replace(tufted.truth, sigma_a=(6.0, 9.0, 15.0))
-    problem = tufted.problem(HairMaps.of(truth), views=1, spp=256)
-    quiet = replace(EFFORT, pixels=60)
+    problem = tufted.problem(HairMaps.of(truth), views=1, spp=2048)
+    quiet = replace(EFFORT, pixels=60, spp=256)
     _, _, maps, _, left_open = solve(problem, HairAppearance((begins,) * 3, 0.4, 0.3), names, quiet)
     assert maps.beta_m == pytest.approx(truth.beta_m, rel=0.1)
     assert maps.eta == pytest.approx(truth.eta, abs=max(off, 1e-6))
