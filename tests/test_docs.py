@@ -15,7 +15,7 @@ import pytest
 from benchmarks.__main__ import MODULES
 
 from appearance import HairAppearance
-from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
+from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
 from reconstruction.model import FILES
 from reconstruction.report.report import LeftOut, Series, Stage
 from stage_service.cli import build_parser
@@ -147,7 +147,7 @@ def test_a_model_has_the_files_that_the_page_lists() -> None:
 def test_the_fields_of_a_models_json_files_are_on_the_page() -> None:
     page = (ROOT / "docs" / "files.md").read_text()
     records = {
-        "appearance.json": (FittedAppearance, Uncertainty, HairAppearance),
+        "appearance.json": (FittedAppearance, Fibres, HairAppearance),
         "report.json": (Stage, Series, LeftOut),
     }
     for name, kinds in records.items():

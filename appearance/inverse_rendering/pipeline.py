@@ -54,14 +54,10 @@ def fit_maps(
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
     the fit is done. Where whole training pictures are not clearly better with what was found than
     with Sun's fit, it goes to the model's folder "rejected", with a warning. Returns `{"ended",
-    "steps", "error", "start_error", "sure", "accepted", "doubts", "fibre_beta_m",
-    "fibre_beta_m_range", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
-    "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
-    fit and of what was found; "doubts" are warnings for whoever renders what was found.
-    "fibre_beta_m" is the roughness without the scatter of the strands' directions that Sun's fit
-    measured, its range an interval of about 95 %; None where none was, or it is most of it.
-    What is rendered keeps the scatter: it belongs to these strands. Raises `CaptureError` or
-    `ModelError` naming what is missing.
+    "steps", "error", "start_error", "sure", "accepted", "doubts", "held_out": {"start" |
+    "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the latter where images are held
+    out; see `Outcome` for errors, of Sun's fit and of what was found; "doubts" are warnings for
+    whoever renders what was found. Raises `CaptureError` or `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     training = held_out.training(capture)
@@ -90,7 +86,6 @@ def fit_maps(
             taken = taken or outcome.error < outcome.start_error
         found = outcome if taken or outcome.refused is None else outcome.refused
         found.maps.save(model, mapped.root_uv)
-        fibre = fitted.fibre_beta_m(found.maps.beta_m)
         save_lights(model, found.lights, problem.lights)
         progress("judging held-out images", 0.92)
         result: dict[str, Any] = {
@@ -100,9 +95,7 @@ def fit_maps(
             "error": found.error,
             "sure": outcome.sure,
             "accepted": taken,
-            "fibre_beta_m": fibre,
-            "fibre_beta_m_range": fitted.fibre_beta_m_range(found.maps.beta_m),
-            "doubts": _doubts(start, found.maps, fibre) + _flat(one_colour.left_open),
+            "doubts": _doubts(start, found.maps) + _flat(one_colour.left_open),
             "left_open": one_colour.left_open,
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
@@ -128,8 +121,8 @@ def fit_maps(
     return result
 
 
-def _doubts(start: HairMaps, found: HairMaps, fibre: float | None) -> list[str]:
-    """What a user has to know of fitted roughness to believe it; `fibre` is without scatter."""
+def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
+    """What a user has to know of fitted roughness to believe it."""
     doubts = [
         f"{name} {value:.2f} is beyond {least} to {most}: too far to be sure of"
         for name, (least, most) in FOUND.items()
@@ -142,9 +135,8 @@ def _doubts(start: HairMaps, found: HairMaps, fibre: float | None) -> list[str]:
             f"brighter, sigma_a {before:.2g} against {after:.2g}"
         )
     if not doubts and abs(np.log(found.beta_m / start.beta_m)) > np.log(FROM_SUN):
-        scatter = "" if fibre is None else f" ({fibre:.2f} without the scatter of directions)"
         doubts.append(
-            f"beta_m {found.beta_m:.2f}{scatter} is not what the highlights say, "
+            f"beta_m {found.beta_m:.2f} is not what the highlights say, "
             f"{start.beta_m:.2f} by Sun's fit: strands that lie beside their true places look "
             "rougher in pictures"
         )

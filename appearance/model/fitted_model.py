@@ -120,7 +120,12 @@ class FittedModel:
             red, green, blue = colour_of_absorption(hair.sigma_a, hair.beta_n)
             v = float(variance_of_roughness(hair.beta_m))
             appearance = replace(
-                appearance, hair=hair, colour=(red, green, blue), v=v, uncertainty=None
+                appearance,
+                hair=hair,
+                colour=(red, green, blue),
+                v=v,
+                fibres=None,
+                sigma_a_error=None,
             )
         model.create().write_strands(self.strands)
         if self.head is not None:

@@ -21,7 +21,7 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
+from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
 from appearance.sun_fit.highlights import BESIDE, WINDOW, Highlight, Highlights, beside
 from appearance.sun_fit.light_correlation import (
     Roughness,
@@ -57,10 +57,10 @@ from reconstruction.report.report import Series
 MAX_DEPTH = 16
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
-ROUGHNESSES = (0.04, 0.12, 0.3, 0.6, 0.95)
-"""β_M of the first renderings; nothing outside is found."""
+ROUGHNESSES = (0.04, 0.12, 0.22, 0.35, 0.55, 0.95)
+"""β_M of the renderings of the strands as they are; nothing outside is found."""
 NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
-"""Those that follow, as factors on the answer of the first."""
+"""Those of disordered strands, as factors on the answer of the first."""
 DISORDERS = (0.0, 6.0, 12.0, 18.0, 24.0)
 """Degrees by which rendered strands are turned; by no more than the last."""
 DISORDER = 1.6
@@ -112,9 +112,9 @@ def fit(
         lambda angle: build_scene(disordered(strands, angle, seed), head, hair=start),
     )
     with report.stage("roughness") as stage:
-        plain, printed, found, first = fitting.roughness(stage)
+        plain, printed, as_are, fibres, first = fitting.roughness(stage)
     with report.stage("colour") as stage:
-        colours = fitting.colour(found.beta_m, np.array(first.colour), np.array(first.skin), stage)
+        colours = fitting.colour(as_are.beta_m, np.array(first.colour), np.array(first.skin), stage)
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
@@ -122,11 +122,8 @@ def fit(
         red, green, blue = (
             x if np.isfinite(x) else None for x in colours.absorption_error(first.pairs).tolist()
         )
-        sigma_a = (red, green, blue)
-        tangents = found.tangents_deg, found.tangents_error_deg
-        known = Uncertainty(found.error, found.low, found.high, sigma_a, *tangents)
-        stage.figures["sigma_a_error"] = list(known.sigma_a)
-        for warning in known.warnings(colours.hair.sigma_a):
+        stage.figures["sigma_a_error"] = [red, green, blue]
+        for warning in absorption_warnings(colours.hair.sigma_a, (red, green, blue)):
             stage.warn(warning)
         if capture.plan.get("import", {}).get("relative"):
             stage.warn(
@@ -134,10 +131,12 @@ def fit(
                 "brightness; import them with a grey ball, or with `scale` and the lights' "
                 "intensities, to know it"
             )
-    v = float(variance_of_roughness(found.beta_m))
     made = (colours.hair, colours.colour, colours.skin, exposure)
+    variances = float(variance_of_roughness(as_are.beta_m)), plain.v, printed
+    turns = () if (d := fibres.disorder) is None else (d.degrees, d.error)
+    known = Fibres(fibres.beta_m, fibres.error, fibres.low, fibres.high, *turns)
     model.forget_appearance()
-    FittedAppearance(*made, v, plain.v, printed, held_out, known).save(model)
+    FittedAppearance(*made, *variances, held_out, known, (red, green, blue)).save(model)
     for stale in ("inverse_rendering", "images"):
         report.drop(stale)
     model.write_report(report)
@@ -253,8 +252,12 @@ class SunFit:
     progress: Progress
     disordered: Callable[[float], HairScene] | None = None
 
-    def roughness(self, stage: Stage) -> tuple[Lobe, float, Roughness, Colours]:
-        """The plain lobe, Eq. 10's variance, the roughness by rendering and a first colour."""
+    def roughness(self, stage: Stage) -> tuple[Lobe, float, Roughness, Roughness, Colours]:
+        """The plain lobe, Eq. 10's variance, roughnesses by rendering, and a first colour.
+
+        The first roughness is that of the strands as they are, the second the fibres': of strands
+        that are as disordered as the hair.
+        """
         start = time.perf_counter()
         self.progress("measuring the highlight", 0.3)
         hair = self.pixels.hair
@@ -290,25 +293,27 @@ class SunFit:
             return highlights.of([self._halves(lit, o, number) for o, _ in views])
 
         def matched(scene: HairScene, roughnesses: Iterable[float]) -> Roughness:
-            family[:] = [(beta, rendered(scene, beta)) for beta in roughnesses]
+            family[:] = [(beta, rendered(scene, beta)) for beta in map(float, roughnesses)]
             found = match_roughness(captured, family)
             series.points.append((time.perf_counter() - start, found.error))
             return found
 
         family: list[tuple[float, Highlight]] = []
-        about, scene, disorder = matched(self.scene, ROUGHNESSES), self.scene, None
-        if self.disordered is not None:
+        as_are = matched(self.scene, ROUGHNESSES)
+        nearer = np.clip(np.array(NEARER) * as_are.beta_m, ROUGHNESSES[0], ROUGHNESSES[-1])
+        if self.disordered is None:
+            as_are = fibres = matched(self.scene, np.unique(nearer))
+        else:
             # the turns depend on the roughness a little: without what the tangents' error adds
             smoother = roughness_without_scatter(
-                about.beta_m, float(np.radians(about.tangents_deg))
+                as_are.beta_m, float(np.radians(as_are.tangents_deg))
             )
-            beta = max(smoother or about.beta_m, ROUGHNESSES[0])
+            beta = max(smoother or as_are.beta_m, ROUGHNESSES[0])
             turned = ((d, self.disordered(float(np.radians(d)))) for d in DISORDERS)
             disorder = match_disorder(captured, ((d, rendered(x, beta)) for d, x in turned))
-            off = DISORDER * about.tangents_deg if disorder is None else disorder.degrees
+            off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
             scene = self.disordered(float(np.radians(off)))
-        nearer = np.clip(np.array(NEARER) * about.beta_m, ROUGHNESSES[0], ROUGHNESSES[-1])
-        found = matched(scene, np.unique(nearer).tolist()).after(about, disorder)
+            fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
         stage.figures |= {
             "samples": count,
             "pairs_of_lights": int(captured.pairs.sum()),
@@ -318,18 +323,19 @@ class SunFit:
             "sun_v_as_printed": printed,
             "sun_beta_m_as_printed": float(roughness_of_variance(printed)),
             "lobe_residual": plain.residual,
-            "v": float(variance_of_roughness(found.beta_m)),
-            **asdict(found),
-            "range": list(found.range),
-            "views": list(found.views),
+            "rendered_beta_m": as_are.beta_m,
+            "rendered_misfit": as_are.misfit,
+            **asdict(fibres),
+            "range": list(fibres.range),
+            "views": list(fibres.views),
             "correlation_deg": float(np.degrees(captured.angle())),
             "rendered_correlation_deg": [
                 [beta, float(np.degrees(highlight.angle()))] for beta, highlight in family
             ],
         }
-        for warning in found.warnings():
+        for warning in fibres.warnings():
             stage.warn(warning)
-        return plain, printed, found, first
+        return plain, printed, as_are, fibres, first
 
     def colour(
         self,

@@ -65,10 +65,11 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
 
     Fitted is what is rendered; where inverse rendering was run, both fits also stand by themselves
-    (`sun_fit`, `inverse_rendering`), the latter with the fibres' β_M, without the scatter of the
-    strands' directions (`fibre_beta_m`, `fibre_beta_m_range`), where it is known. Of maps the
-    colour is the mean over the cells. Sun's fit has the standard errors of its logarithms:
-    `beta_m_error`, and `sigma_a_error (3,)`, where None stands for what the colour does not tell.
+    (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells. Sun's fit has
+    what it found of the fibres themselves, whatever strands stand for them (`fibre_beta_m`, its
+    `fibre_beta_m_range`, and `disorder_deg`), and the standard errors of logarithms:
+    `fibre_beta_m_error`, and `sigma_a_error (3,)`, where None stands for what the colour does not
+    tell. `true` has one roughness, as `beta_m` and as `fibre_beta_m`.
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
@@ -90,19 +91,21 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
 
     sun, true = FittedAppearance.load(model), json.loads(truth.read_text())
     out = {"fitted": figures(HairMaps.of(sun.hair), sun.skin)}
-    if (known := sun.uncertainty) is not None:
-        out["fitted"] |= {"beta_m_error": known.beta_m, "sigma_a_error": list(known.sigma_a)}
+    if (known := sun.fibres) is not None:
+        out["fitted"] |= {
+            "fibre_beta_m": known.beta_m,
+            "fibre_beta_m_error": known.error,
+            "fibre_beta_m_range": [known.low, known.high],
+            "disorder_deg": known.disorder_deg,
+        }
+    if sun.sigma_a_error is not None:
+        out["fitted"]["sigma_a_error"] = list(sun.sigma_a_error)
     for folder in (model, model.rejected()):
         if folder.has("hair_maps.npz"):
             out["sun_fit"] = out["fitted"]
             maps = HairMaps.load(folder)[0]
             out["inverse_rendering"] = figures(maps, sun.skin)
-            if (fibre := sun.fibre_beta_m(maps.beta_m)) is not None:
-                out["inverse_rendering"]["fibre_beta_m"] = fibre
-                ends = sun.fibre_beta_m_range(maps.beta_m)
-                out["inverse_rendering"]["fibre_beta_m_range"] = ends and list(ends)
             out["fitted"] = out["inverse_rendering" if folder is model else "sun_fit"]
-    return {
-        **out,
-        "true": figures(HairMaps.of(HairAppearance.from_dict(true["hair"])), true["skin"]),
-    }
+    out["true"] = figures(HairMaps.of(HairAppearance.from_dict(true["hair"])), true["skin"])
+    out["true"]["fibre_beta_m"] = out["true"]["beta_m"]
+    return out

@@ -169,17 +169,21 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
     if not model.has("appearance.json"):
         return
     fit = model.json("appearance.json")
-    hair, known = fit["hair"], fit.get("uncertainty")
+    hair, fibres, errors = fit["hair"], fit.get("fibres"), fit.get("sigma_a_error")
+    known = errors is not None
     said: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}")]
-    if known:
-        low, high = known["beta_m_low"], known["beta_m_high"]
-        said.append(f", {low:.2f} to {high:.2f} at about 95 %")
+    yield "roughness to render these strands with", said
+    if fibres:
+        said = [element("b", f"β_M {fibres['beta_m']:.2f}")]
+        said.append(f", {fibres['low']:.2f} to {fibres['high']:.2f} at about 95 %")
+        if fibres["disorder_deg"] is not None:
+            turns = "single hairs turn by {disorder_deg:.0f}° ± {disorder_error_deg:.0f}° more"
+            said.append(f"; {turns.format(**fibres)} than these strands")
     else:
-        said.append(", no error known")
-    yield "roughness", said
-    errors = known["sigma_a"] if known else [None] * 3
+        said = ["not known"]
+    yield "roughness of the fibres", said
     said = [_swatch(fit["colour"]), "σ_a "]
-    for k, (value, error) in enumerate(zip(hair["sigma_a"], errors, strict=True)):
+    for k, (value, error) in enumerate(zip(hair["sigma_a"], errors or [None] * 3, strict=True)):
         said += [", " if k else "", element("b", f"{value:.2g}")]
         said.append("" if error is None else f" ± {error:.0%}")
     yield "colour", [*said, "" if known else ", no error known"]

@@ -61,8 +61,10 @@ def model(tmp_path):
         stage.warn("look here: " + EVIL)
     model.write_report(report)
     hair = {"sigma_a": [0.1, 0.2, 0.4], "beta_m": 0.33, "beta_n": 0.2}
-    known = {"beta_m_low": 0.28, "beta_m_high": 0.39, "sigma_a": [0.05, 0.06, None]}
-    fit = {"hair": hair, "colour": [1.0, 0.5, 0.0], "skin": [0.2, 0.2, 0.2], "uncertainty": known}
+    fibres = {"beta_m": 0.3, "low": 0.28, "high": 0.39, "disorder_deg": 14.2}
+    fibres["disorder_error_deg"] = 1.6
+    fit = {"hair": hair, "colour": [1.0, 0.5, 0.0], "skin": [0.2, 0.2, 0.2], "fibres": fibres}
+    fit["sigma_a_error"] = [0.05, 0.06, None]
     model.write_json("appearance.json", fit)
     model.write_png("relit.png", np.zeros((2, 2, 3), np.uint8))
     model.write_png("plots/geometry.png", np.zeros((2, 2, 3), np.uint8))
@@ -82,7 +84,8 @@ def test_everything_that_is_known_stands_on_the_page(model):
     text = Page(model_page(model)).text
     for said in (
         *("2 of 4 points", "0 m in all; a strand 100 mm, median", "50 µm"),
-        *("β_M 0.33, 0.28 to 0.39", "σ_a 0.1 ± 5%, 0.2 ± 6%, 0.4"),
+        *("β_M 0.33", "β_M 0.30, 0.28 to 0.39 at about 95 %; single hairs turn by 14° ± 2° more"),
+        *("σ_a 0.1 ± 5%, 0.2 ± 6%, 0.4"),
         *("growth of strands look here", "voxels", "no hair", "3 of 4"),
         *("off mm0.5 (0.25 to 1.5: 10 to 90 %)", "50.0 / 25.0 / 33.3", "hull + vertical"),
         *("17.2 dB / 0.50", "0.280", "1 files"),
@@ -120,10 +123,10 @@ def test_a_plot_is_an_svg_in_which_time_goes_right_and_error_up(model):
 
 def test_an_error_of_a_logarithm_is_a_share(model):
     results = model.json("results.json")
-    fitted = {"beta_m": 0.33, "beta_m_error": 0.068, "sigma_a_error": [0.02, None, 0.1]}
+    fitted = {"fibre_beta_m": 0.33, "fibre_beta_m_error": 0.068, "sigma_a_error": [0.02, None, 0.1]}
     model.write_json("results.json", {**results, "appearance": {"fitted": fitted}})
     text = Page(model_page(model)).text
-    assert "beta m error± 6.8%" in text
+    assert "fibre beta m error± 6.8%" in text
     assert "± 2.0%, not known, ± 10.0%" in text
 
 

@@ -27,12 +27,11 @@ from stage_service.model_page.names import (
 _HEADS = [threshold(t) for t in THRESHOLDS]
 _SCORES = ("psnr", "ssim")
 _APPEARANCE = {
-    "beta_m": "longitudinal roughness β_M",
+    "beta_m": "β_M to render these strands with",
     "v": "longitudinal variance v (Sun's β_l)",
     "colour": "colour of dense hair",
     "skin": "colour of skin",
 }
-_ERRORS = {"beta_m_error": "standard error of β_M", "sigma_a_error": "standard error of σ_a"}
 
 
 def figures_table(results: Mapping[str, Any], out: Path) -> Group:
@@ -49,10 +48,10 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     for key, what in _APPEARANCE.items():
         hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
     if any("fibre_beta_m" in figures for figures in fits.values()):
-        hair.add_row("β_M without strands' scatter", *map(_fibres, fits.values()))
-    for key, what in _ERRORS.items():
-        if any(key in figures for figures in fits.values()):
-            hair.add_row(what, *(_per_cent(figures.get(key)) for figures in fits.values()))
+        hair.add_row("β_M of the fibres", *map(_fibres, fits.values()))
+    if any("sigma_a_error" in figures for figures in fits.values()):
+        errors = (_per_cent(figures.get("sigma_a_error")) for figures in fits.values())
+        hair.add_row("standard error of σ_a", *errors)
     capture = results["capture"]
     return Group(
         geometry,
@@ -141,10 +140,12 @@ def _rows() -> dict[str, list[_Part]]:
             decibels, ssim = (partial(_score, group=group, name=name, score=s) for s in _SCORES)
             where = group.replace("held_out_", "held-out ")
             rows[f"{where}: {title}"] = [(decibels, ".1f", " dB"), (ssim, ".2f", "")]
-    for fit in ("fitted", "sun_fit", "true"):
-        title = {"fitted": "ours", "true": "the truth"}.get(fit, PICTURES.get(fit, fit))
-        rows[f"β_M: {title}"] = [(partial(_beta_m, fit=fit), ".2f", "")]
-    rows["β_M: standard error that Sun's fit gives"] = [(_beta_m_error, ".2f", "")]
+    rows["β_M of the fibres: ours"] = [(partial(_fibre, key="fibre_beta_m"), ".2f", "")]
+    rows["β_M of the fibres: standard error"] = [(_fibre_error, ".2f", "")]
+    rows["β_M of the fibres: the truth"] = [(partial(_beta_m, fit="true"), ".2f", "")]
+    rows["β_M to render these strands with"] = [(partial(_beta_m, fit="fitted"), ".2f", "")]
+    turns = partial(_fibre, key="disorder_deg")
+    rows["turns of single hairs beyond our strands"] = [(turns, ".0f", "°")]
     return rows
 
 
@@ -183,10 +184,16 @@ def _beta_m(results: Mapping[str, Any], fit: str) -> float | None:
     return None if found is None else float(found["beta_m"])
 
 
-def _beta_m_error(results: Mapping[str, Any]) -> float | None:
+def _fibre(results: Mapping[str, Any], key: str) -> float | None:
+    """What Sun's fit found of the fibres; None in results of an earlier version."""
     fits = results["appearance"]
-    found = fits.get("sun_fit", fits["fitted"])
-    return float(found["beta_m"] * found["beta_m_error"]) if "beta_m_error" in found else None
+    found: float | None = fits.get("sun_fit", fits["fitted"]).get(key)
+    return found
+
+
+def _fibre_error(results: Mapping[str, Any]) -> float | None:
+    value, error = (_fibre(results, key) for key in ("fibre_beta_m", "fibre_beta_m_error"))
+    return None if value is None or error is None else value * error
 
 
 def _per_cent(value: Any) -> str:

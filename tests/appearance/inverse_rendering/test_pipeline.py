@@ -23,7 +23,7 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import loop, pipeline
 from appearance.inverse_rendering.loop import Outcome
 from appearance.inverse_rendering.unknowns import LightDeviations
-from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import (
     BadOptions,
     Capture,
@@ -194,31 +194,6 @@ def test_a_roughness_that_is_not_found_again_is_doubted(made, tmp_path, monkeypa
     monkeypatch.setattr(pipeline, "run", found)
     (told,) = fit_maps(capture, other, request=REQUEST)["doubts"]
     assert told.startswith(doubt)
-
-
-@pytest.mark.parametrize(("off", "fibre"), [(None, None), (12.0, 0.4)])
-def test_what_the_scatter_of_directions_adds_is_not_the_fibres(
-    made, tmp_path, monkeypatch, off, fibre
-):
-    """Chiang's formula: 0.4 has the variance 0.177, 0.518 has 0.352; 2 · 12° squared is 0.175."""
-    capture, model = made
-    other = Model(tmp_path / "model")
-    shutil.copytree(model.path, other.path)
-    sun = FittedAppearance.load(model)
-    known = Uncertainty(0.1, 0.3, 0.5, (0.1, 0.1, 0.1), off)
-    replace(sun, uncertainty=known).save(other)
-    wide = HairMaps.of(replace(sun.hair, beta_m=0.518))
-
-    def found(problem, *args, **more):
-        same = LightDeviations.calibrated(len(problem.lights))
-        return Outcome(wide, same, "converged", 1.0, 0.5, 1, [])
-
-    monkeypatch.setattr(pipeline, "run", found)
-    result = fit_maps(capture, other, request=REQUEST)
-    assert result["fibre_beta_m"] == (fibre and pytest.approx(fibre, abs=2e-3))
-    (told,) = result["doubts"]
-    assert told.startswith("beta_m 0.52 is not" if off is None else "beta_m 0.52 (0.40 without")
-    assert HairMaps.load(other)[0].beta_m == pytest.approx(0.518), "these strands look so"
 
 
 def test_a_number_that_pictures_say_nothing_of_is_told(made, tmp_path, monkeypatch):

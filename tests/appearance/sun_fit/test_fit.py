@@ -9,7 +9,7 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
-from appearance.sun_fit.fitted_appearance import FittedAppearance, Uncertainty
+from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
     Camera,
@@ -108,12 +108,12 @@ def test_fit_reports_what_it_did(made, fitted):
 
 def test_fit_says_how_far_off_it_may_be(fitted):
     appearance, report = fitted
-    known = appearance.uncertainty
+    known = appearance.fibres
     assert known is not None
-    assert known.beta_m_low < TRUTH.beta_m < known.beta_m_high
+    assert known.low < TRUTH.beta_m < known.high
     off = np.log(np.array(appearance.hair.sigma_a) / TRUTH.sigma_a)
-    assert (np.abs(off) < 3 * np.array(known.sigma_a, float)).all()
-    assert report["roughness"].figures["error"] == known.beta_m
+    assert (np.abs(off) < 3 * np.array(appearance.sigma_a_error, float)).all()
+    assert report["roughness"].figures["error"] == known.error
 
 
 def fit_of(folder, made, change, lights=None, cameras=("cam_0", "cam_1")):
@@ -155,11 +155,9 @@ def fit_of(folder, made, change, lights=None, cameras=("cam_0", "cam_1")):
 
 def covers(appearance, report, beta):
     """β_M is right within a quarter or its stage warns, and the interval holds it."""
-    known = appearance.uncertainty
-    near = abs(np.log(appearance.hair.beta_m / beta)) < np.log(1.25)
-    return (near or report["roughness"].warnings) and (
-        known.beta_m_low / 1.1 <= beta <= known.beta_m_high * 1.1
-    )
+    known = appearance.fibres
+    near = abs(np.log(known.beta_m / beta)) < np.log(1.25)
+    return (near or report["roughness"].warnings) and known.low / 1.1 <= beta <= known.high * 1.1
 
 
 @pytest.mark.slow
@@ -244,10 +242,8 @@ def test_saturated_samples_are_not_valid(made, tmp_path):
 
 
 def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
-    known = Uncertainty(0.1, 0.2, 0.3, (0.1, 0.2, None))
-    a = FittedAppearance(
-        TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT, known
-    )
+    made = (TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT)
+    a = FittedAppearance(*made, Fibres(0.25, 0.1, 0.2, 0.3), (0.1, 0.2, None))
     model = Model(tmp_path)
     assert not FittedAppearance.is_of(model, LEFT_OUT)
     a.save(model)

@@ -38,7 +38,7 @@ def hair_inverse(
     base = scene.with_hair(HairAppearance((0.1, 0.1, 0.1), GUESS, BETA_N))
     fitting = SunFit(base, FitPixels(few, skin), options, seed, progress)
     try:
-        _, _, found, first = fitting.roughness(stage)
+        _, _, found, _, first = fitting.roughness(stage)
         beta_m = found.beta_m
         start: Array | None = np.array(first.colour)
         albedo = np.array(first.skin)
