@@ -279,7 +279,7 @@ class SunFit:
         channel = int(np.argmin(mean))
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
-        first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"), 2)
+        first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"))
         highlights = Highlights(views, self._tilt, channel)
         captured = highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in views])
         series = Series("roughness", "standard error of log β_M")

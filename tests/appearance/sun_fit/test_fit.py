@@ -83,7 +83,8 @@ def fitted(made):
 
 def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     appearance, _ = fitted
-    assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.18)
+    assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.05)
+    assert appearance.fibres.beta_m == pytest.approx(TRUTH.beta_m, rel=0.05)
     np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.2)
     np.testing.assert_allclose(appearance.skin, SKIN, rtol=0.05)
     assert appearance.held_out == HeldOut(("cam_2",), ("l5",))

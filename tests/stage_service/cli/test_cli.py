@@ -516,7 +516,7 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     again.write_text(json.dumps(results))
     assert main(["evaluate", "table", str(again)]) == 0
     rows = {"| β_M of the fibres: ours | 0.30 |", "| β_M of the fibres: standard error | 0.03 |"}
-    rows |= {"| turns of single hairs beyond our strands | 14 ° |"}
+    rows |= {"| turns of single hairs beyond our strands | 14° |"}
     assert rows <= set(capsys.readouterr().out.splitlines())
     code, data = run(capsys, "evaluate", "table", file, again)
     assert (code, list(data["results"])) == (0, [f"curly, seed 3 ({f})" for f in (file, again)])
