@@ -409,11 +409,11 @@ class SunFit:
 
     def _halves(self, scene: HairScene, o: Observed, number: int) -> Floats:
         """Two renderings `(2, L, P, 3)` of a view, half the samples and own noise each."""
-        spp, views = max(self.options.roughness_spp // 2, 1), []
-        for half in range(2):  # of one rendering, the noise of two pixels may go together
-            spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (2 * number + half << 11)))
-            views.append(render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent))
-        return np.stack(views)
+        spp = max(self.options.roughness_spp // 2, 1)
+        spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 11)))
+        twice = np.tile(o.pixels, 2)
+        images = render_olat(scene, o.camera, o.lights, pixels=twice, **spent)
+        return np.stack(np.split(images, 2, axis=1))
 
     @property
     def _tilt(self) -> float:
