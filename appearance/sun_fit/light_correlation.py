@@ -53,9 +53,10 @@ class Disorder:
     most: float
 
     @property
-    def share(self) -> float:
-        """Error of its square, relative: 1 at most."""
-        return min(2 * self.error / self.degrees, 1.0) if self.degrees > 0 else 1.0
+    def trust(self) -> float:
+        """How much of what it changes is believed, 0 to 1: of d² ± δ, the share d⁴ / (d⁴ + δ²)."""
+        square, error = self.degrees**2, 2 * self.degrees * self.error
+        return square**2 / (square**2 + error**2) if square > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -87,18 +88,22 @@ class Roughness:
     def after(self, other: Roughness, disorder: Disorder | None) -> Roughness:
         """This one, of strands of that `disorder`, with `other`, of the strands as they are.
 
-        What lies between the two answers, which grows with the square of the disorder, joins the
-        error by the disorder's; half of it where that was not measured. The tangents' error is that
-        of `other`.
+        What lies between the two answers grows with the square of the disorder. Of it as much is
+        taken as the disorder is known, three quarters where that was not measured: the mean of what
+        it may be, if none is as likely beforehand as what was measured. Its spread joins the error.
+        The tangents' error is that of `other`.
         """
-        share = 0.5 if disorder is None else disorder.share
-        systematic = share * abs(float(np.log(self.beta_m / other.beta_m)))
+        trust = 0.75 if disorder is None else disorder.trust
+        change = float(np.log(self.beta_m / other.beta_m))
+        systematic = abs(change) * (1 - trust) ** 0.5
+        back = float(np.exp((trust - 1) * change))
         wider = np.exp(np.hypot(self.error, systematic) * 2 - self.error * 2)
         return replace(
             self,
+            beta_m=back * self.beta_m,
             error=float(np.hypot(self.error, systematic)),
-            low=float(max(self.low / wider, self.range[0])),
-            high=float(min(self.high * wider, self.range[1])),
+            low=float(max(back * self.low / wider, self.range[0])),
+            high=float(min(back * self.high * wider, self.range[1])),
             tangents_deg=other.tangents_deg,
             tangents_error_deg=other.tangents_error_deg,
             systematic=systematic,

@@ -8,7 +8,7 @@ import pytest
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.sun_fit.highlights import EDGES, SIDE, WINDOW, Highlight, LightPairs, beside
-from appearance.sun_fit.light_correlation import match_disorder, match_roughness
+from appearance.sun_fit.light_correlation import Disorder, match_disorder, match_roughness
 from reconstruction import Camera
 
 BETAS = (0.04, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.95)
@@ -161,3 +161,14 @@ def test_too_few_pairs_are_an_error_that_says_what_to_do(family):
     few = replace(few, pairs=few.pairs * 0)
     with pytest.raises(ValueError, match="needs more lights"):
         match_roughness(few, family)
+
+
+def test_a_disorder_that_is_hardly_known_changes_the_roughness_half_way(family):
+    """5 ± 2.5°: its square, 25 ± 25, is as uncertain as it is large."""
+    smooth, rough = (match_roughness(highlight(beta), family) for beta in (0.2, 0.3))
+    found = smooth.after(rough, Disorder(5, 2.5, 24))
+    assert found.beta_m == pytest.approx((smooth.beta_m * rough.beta_m) ** 0.5)
+    assert found.low < 0.2 < found.beta_m < 0.3 < found.high
+    sure = smooth.after(rough, Disorder(5, 0.0, 24))
+    assert (sure.beta_m, sure.error) == pytest.approx((smooth.beta_m, smooth.error))
+    assert smooth.after(rough, Disorder(0, 1.0, 24)).beta_m == pytest.approx(rough.beta_m)
