@@ -165,7 +165,7 @@ def fit_colour(
         now = replace(sampling, seed=sampling.seed + step)
         views = [_rendered(lit, o, now) for o in pixels.hair]
         seen = _mean_colour(views)
-        errors.append(float(np.linalg.norm(seen - target) / np.linalg.norm(target)))
+        errors.append(_off(seen, target))
         on_iteration(errors[-1])
         pairs.append((colour, seen))
         if skin_target is not None and step < 3:
@@ -191,9 +191,11 @@ def fit_diffuse(
     target = _mean_colour(hair)
     albedo = np.clip(_as_albedo(hair), 0.02, 0.98)
     pairs: list[tuple[Array, Array]] = []
-    for step in range(3):
+    for step in range(5):
         lit, now = scene.with_hair(DiffuseHair(_rgb(albedo))), replace(SAMPLING, seed=seed + step)
         pairs.append((albedo, _mean_colour([_rendered(lit, o, now) for o in hair])))
+        if _off(pairs[-1][1], target) < TOLERANCE:
+            break
         albedo = next_colour(pairs, target)
     return _rgb(albedo)
 
@@ -221,6 +223,10 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
                 value = middle + (target[k] - level) / gradient
         out[k] = np.clip(value, 0.5 * c[nearest, k], 2.0 * c[nearest, k])
     return np.clip(out, LEAST_ALBEDO, MOST_ALBEDO)
+
+
+def _off(seen: Array, target: Array) -> float:
+    return float(np.linalg.norm(seen - target) / np.linalg.norm(target))
 
 
 def _with_colour(hair: HairAppearance, colour: Array, beta_n: float) -> HairAppearance:

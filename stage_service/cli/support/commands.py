@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import inspect
 import json
+import math
 import os
 import sys
 import time
@@ -101,7 +102,8 @@ def _lines(title: str) -> Progress:
     def show(what: str, share: float) -> None:
         now = time.monotonic()
         if now - last[0] >= LINE_EVERY_S or share >= 1:
-            print(f"{title}: {share:4.0%} {what}", file=sys.stderr, flush=True)
+            per_cent = math.floor(100 * share)  # 100 is the end
+            print(f"{title}: {per_cent:3d}% {what}", file=sys.stderr, flush=True)
             last[0] = now if share < 1 else float("inf")
 
     return show
