@@ -51,8 +51,8 @@ class Observed:
     radiance: Floats
     valid: Bools
 
-    def where(self, pixels: Bools) -> Observed:
-        """The same lights at some of the pixels, marked by `pixels (P,)`."""
+    def where(self, pixels: Bools | Ints) -> Observed:
+        """The same lights at some of the pixels, marked by `pixels (P,)`, or by their places."""
         return replace(
             self,
             pixels=self.pixels[pixels],

@@ -61,7 +61,7 @@ ROUGHNESSES = (0.04, 0.12, 0.22, 0.35, 0.55, 0.95)
 """β_M of the renderings of the strands as they are; nothing outside is found."""
 NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
 """Those of disordered strands, as factors on the answer of the first."""
-DISORDERS = (0.0, 6.0, 12.0, 18.0, 24.0)
+DISORDERS = (0.0, 8.0, 16.0, 24.0)
 """Degrees by which rendered strands are turned; by no more than the last."""
 DISORDER = 1.6
 """Turn of single strands over the error of a pixel's mean inclination, where nothing tells it.
@@ -71,7 +71,7 @@ DISORDER = 1.6
 SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
 ROUGHNESS_PIXELS = 350
-"""Pixels a camera, at most, whose highlights are matched."""
+"""Pixels a camera, at most, whose own highlights are matched."""
 
 
 def fit(
@@ -161,7 +161,8 @@ def _observed(
         mask = model.mask(name, "hair", training)
         bare = model.mask(name, "skin", training) & ~mask
         seen += int(mask.sum())
-        wanted = _with_those_beside(chosen(mask, options.hair_pixels, rng), mask)
+        half = chosen(mask, (options.hair_pixels + 1) // 2, rng)
+        wanted = np.union1d(half, _beside(half, mask))
         uncovered = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
         both = observe(training, name, lights, np.concatenate([wanted, uncovered]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
@@ -189,28 +190,18 @@ def _observed(
     return FitPixels(hair, skin)
 
 
-def _matched(observed: Observed) -> Bools:
-    """Which pixels' highlights are matched `(P,)`: pairs beside each other, then others."""
-    keep = np.zeros(len(observed.pixels), bool)
-    pairs = beside(observed)
-    keep[_some(pairs, ROUGHNESS_PIXELS // 2)] = True
-    keep[_some(np.flatnonzero(~keep), ROUGHNESS_PIXELS - int(keep.sum()))] = True
-    return keep
+def _spread(count: int) -> Ints:
+    """Places of `ROUGHNESS_PIXELS` of so many pixels, evenly."""
+    return np.linspace(0, count - 1, min(count, ROUGHNESS_PIXELS)).astype(int)
 
 
-def _some(rows: Ints, most: int) -> Ints:
-    """`most` of the rows `(N, ...)`, evenly spread."""
-    return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]
-
-
-def _with_those_beside(pixels: Ints, mask: Bools) -> Ints:
-    """`pixels (P,)` and, of as many as are matched or more, the mask's that lie beside them."""
+def _beside(pixels: Ints, mask: Bools) -> Ints:
+    """Those of `mask` that lie `BESIDE` a pixel of `pixels`: right of every second, else below."""
     width = mask.shape[1]
-    few = pixels[:: max(1, len(pixels) // ROUGHNESS_PIXELS)]
-    right = few[::2][few[::2] % width + BESIDE < width] + BESIDE
-    below = few[1::2] + BESIDE * width
-    added = np.concatenate([right, below[below < mask.size]])
-    return np.union1d(pixels, added[mask.ravel()[added]])
+    right = pixels[::2][pixels[::2] % width + BESIDE < width] + BESIDE
+    below = pixels[1::2] + BESIDE * width
+    found = np.concatenate([right, below[below < mask.size]])
+    return found[mask.ravel()[found]]
 
 
 def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
@@ -280,20 +271,21 @@ class SunFit:
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
         first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"))
-        highlights = Highlights(views, self._tilt, channel)
-        captured = highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in views])
+        single = [self._under(o, f, _spread(len(o.pixels))) for o, f in views]
+        captured, of_single = self._highlights(single, channel)
         series = Series("roughness", "standard error of log β_M")
         stage.series.append(series)
         runs = count_from(1)
 
-        def rendered(scene: HairScene, beta: float) -> Highlight:
+        def rendered(highlights: Highlights, scene: HairScene, beta: float) -> Highlight:
             number = next(runs)
             self.progress("matching the highlight", 0.5 + number / 80)
             lit = scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
-            return highlights.of([self._halves(lit, o, number) for o, _ in views])
+            return highlights.of([self._halves(lit, o, number) for o, _ in highlights.views])
 
         def matched(scene: HairScene, roughnesses: Iterable[float]) -> Roughness:
-            family[:] = [(beta, rendered(scene, beta)) for beta in map(float, roughnesses)]
+            each = map(float, roughnesses)
+            family[:] = [(beta, rendered(of_single, scene, beta)) for beta in each]
             found = match_roughness(captured, family)
             series.points.append((time.perf_counter() - start, found.error))
             return found
@@ -309,8 +301,10 @@ class SunFit:
                 as_are.beta_m, float(np.radians(as_are.tangents_deg))
             )
             beta = max(smoother or as_are.beta_m, ROUGHNESSES[0])
+            pairs = [self._under(o, f, np.unique(beside(o))) for o, f in views]
+            seen, of_pairs = self._highlights(pairs, channel)
             turned = ((d, self.disordered(float(np.radians(d)))) for d in DISORDERS)
-            disorder = match_disorder(captured, ((d, rendered(x, beta)) for d, x in turned))
+            disorder = match_disorder(seen, ((d, rendered(of_pairs, x, beta)) for d, x in turned))
             off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
             scene = self.disordered(float(np.radians(off)))
             fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
@@ -388,17 +382,27 @@ class SunFit:
         return result
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:
-        """Some pixels of hair of one direction, their fibres, the lights near a mirror."""
+        """Pixels of hair of one direction, their fibres, the lights near a mirror."""
         out = []
         for o in hair:
             fibres = visible_fibres(self.scene, o.camera, o.pixels, seed=self.seed)
-            fit = usable(fibres)
-            o, fibres = o.where(fit), fibres.where(fit)
-            keep = _matched(o)
-            o, fibres = o.where(keep), fibres.where(keep)
-            near = mirror_lights(o, fibres, tilt_deg=self._tilt, window=WINDOW)
-            out.append((o.under(near), fibres))
+            out.append(self._under(o, fibres, usable(fibres)))
         return out
+
+    def _under(
+        self, o: Observed, fibres: VisibleFibres, pixels: Bools | Ints
+    ) -> tuple[Observed, VisibleFibres]:
+        """Some of the pixels, their fibres, the lights near a mirror direction of them."""
+        o, fibres = o.where(pixels), fibres.where(pixels)
+        near = mirror_lights(o, fibres, tilt_deg=self._tilt, window=WINDOW)
+        return o.under(near), fibres
+
+    def _highlights(
+        self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
+    ) -> tuple[Highlight, Highlights]:
+        """What the capture shows in these views, and how renderings of them are read."""
+        highlights = Highlights(views, self._tilt, channel)
+        return highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in views]), highlights
 
     def _read(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int

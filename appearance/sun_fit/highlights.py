@@ -132,19 +132,14 @@ class LightPairs:
         sample = light * count + pixel
         ends = np.searchsorted(pixel, np.arange(count + 1))
         pairs = [np.stack(np.triu_indices(b - a, 1)) + a for a, b in pairwise(ends)]
-        own = sum(pair.shape[1] for pair in pairs)
-        pairs += [
-            np.stack(np.meshgrid(np.arange(*ends[p : p + 2]), np.arange(*ends[q : q + 2]))).reshape(
-                2, -1
-            )
-            for p, q in beside(observed)
-        ]
         i, j = sample[np.concatenate(pairs, axis=1)]
         angle = np.abs(deviation[i] - deviation[j])
-        # two answers to one light have the noise of that light's frame in common
-        kept = (angle < EDGES[-1]) & (i // count != j // count)
-        own = int(kept[:own].sum())
-        i, j, angle = (x[kept] for x in (i, j, angle))
+        of_two = _pairs_beside(observed, fibres, tilt_deg)
+        own = int((angle < EDGES[-1]).sum())
+        i, j, angle = (
+            np.concatenate([x[angle < EDGES[-1]], y[of_two[2] < EDGES[-1]]])
+            for x, y in zip((i, j, angle), of_two, strict=True)
+        )
         shines = [light.intensity_towards(found.middle)[:, channel] for light in observed.lights]
         return cls(
             sample,
@@ -212,6 +207,31 @@ def beside(observed: Observed) -> Ints:
         there = np.flatnonzero((pixels[order[at]] == pixels + step) & fits)
         found.append(np.stack([there, order[at[there]]], axis=1))
     return np.concatenate(found)
+
+
+def _pairs_beside(
+    observed: Observed, fibres: VisibleFibres, tilt_deg: float
+) -> tuple[Ints, Ints, Array]:
+    """Answers, flat in `(L, P)`, of pixels `beside` each other, and the angle between the lights.
+
+    It is taken about the mean direction of the two: how far the hair turns from one to the other
+    is then told by their answers alone, and not by how well the two directions are known.
+    """
+    places, count = beside(observed), observed.valid.shape[1]
+    both, pairs = places.T.ravel(), len(places)
+    one, other = fibres.mean_tangent()[places.T]
+    sign = np.where((one * other).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+    mean = one + sign * other
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    found = near_mirror(
+        observed.where(both), fibres.where(both), tilt_deg, WINDOW, np.concatenate([mean, mean])
+    )
+    first, second = found.near[:, :pairs], found.near[:, pairs:]
+    pair, i, j = np.nonzero(first.T[:, :, None] & second.T[:, None, :])
+    apart = i != j  # two answers to one light have the noise of that light's frame in common
+    pair, i, j = pair[apart], i[apart], j[apart]
+    angle = np.abs(found.deviation[i, pair] - found.deviation[j, pairs + pair])
+    return i * count + places[pair, 0], j * count + places[pair, 1], angle
 
 
 def parts_of(observed: Observed) -> Ints:

@@ -7,12 +7,13 @@ ask where the highlight is: its width over Δ is the lobe's. For broad lobes, wh
 far enough, the profile decides, with the spread of its shifts as an unknown. Renderings of known
 roughness are measured in the same way; the roughness is where theirs meet the capture's.
 
-Reconstructed strands are smoother than hair: a pixel of theirs mixes fewer directions, which the
-products do see. By how much is told by pixels that lie beside each other: how much less the product
-of their answers falls with the angle than that of one pixel's (`Highlight.likeness`) falls with
-every turn of single strands and depends little on the roughness: turns are read a tenth too large
-by strands a quarter too rough. The renderings are of strands that are `disordered` until their
-likeness is the capture's (`match_disorder`).
+Reconstructed strands may be smoother than hair: a pixel of theirs then mixes fewer directions,
+which the products do see. By how much is told by pixels that lie beside each other: how much less
+the product of their answers falls with the angle than that of one pixel's (`Highlight.likeness`)
+falls with every turn of single strands, whatever the strands' own directions are off, and depends
+little on the roughness: turns are read a tenth too large by strands a quarter too rough. The
+renderings are of strands that are `disordered` until their likeness is the capture's
+(`match_disorder`).
 """
 
 from __future__ import annotations
@@ -158,19 +159,19 @@ def match_disorder(
 ) -> Disorder | None:
     """The disorder, degrees, whose rendered highlights are as alike as the `captured` ones.
 
-    Between the `rendered`, which ascend from 0, a parabola. The error is the jackknife's over parts
-    of the hair, or what the views' answers differ by. None, and nothing is rendered, where too few
-    pixels lie `BESIDE` each other.
+    Between the `rendered`, which ascend from 0, a line over the square: 0 where the capture is more
+    alike than strands as they are. The error is the jackknife's over parts of the hair, or what the
+    views' answers differ by. None, and nothing is rendered, where too few pixels lie `BESIDE` each
+    other.
     """
     if captured.pairs_beside.sum() < FEWEST_PAIRS:
         return None
     chosen, left_out = _chosen(captured.pairs_beside)
     found = [(degrees, highlight.likeness(chosen)) for degrees, highlight in rendered]
     nodes = np.array([degrees for degrees, _ in found])
-    curve = np.polyfit(nodes, np.stack([likeness for _, likeness in found]), 2)
-    x = np.linspace(0, nodes[-1], _STEPS)
-    falling = np.minimum.accumulate(np.vander(x, 3) @ curve)
-    answers = x[np.abs(falling - captured.likeness(chosen)).argmin(axis=0)]
+    slope, start = np.polyfit(nodes**2, np.stack([likeness for _, likeness in found]), 1)
+    square = (captured.likeness(chosen) - start) / np.minimum(slope, -1e-12)
+    answers = np.sqrt(np.clip(square, 0, nodes[-1] ** 2))
     return Disorder(float(answers[0]), max(_errors(answers, left_out)), float(nodes[-1]))
 
 

@@ -155,14 +155,19 @@ def usable(fibres: VisibleFibres) -> Bools:
 
 
 def near_mirror(
-    observed: Observed, fibres: VisibleFibres, tilt_deg: float, window: float = WINDOW
+    observed: Observed,
+    fibres: VisibleFibres,
+    tilt_deg: float,
+    window: float = WINDOW,
+    along: Array | None = None,
 ) -> NearMirror:
     """Samples with |θ_i + θ_o + 2 tilt| below `window` and |φ_i − φ_o| below π/6.
 
-    Pixels that are not `usable` are left out.
+    The fibres run along the mean tangent of each pixel, or `along (P, 3)`. Pixels that are not
+    `usable` are left out.
     """
     middle = _middle(fibres)
-    mean = _unit(fibres.tangent.sum(axis=1, dtype=float))
+    mean = fibres.mean_tangent() if along is None else along
     to_camera = _unit(observed.camera.center - middle)
     positions = np.array([light.position for light in observed.lights])
     towards = positions[:, None] - middle

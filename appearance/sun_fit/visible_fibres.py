@@ -13,7 +13,7 @@ from appearance.render.paths import Surface, jittered, pixel_indices, stream
 from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels, rows_of
-from reconstruction.arrays import Array, Bools, Floats
+from reconstruction.arrays import Array, Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,13 @@ class VisibleFibres:
         """Share of each pixel that shows hair `(P,)`."""
         return np.asarray(self.hair.mean(axis=1))
 
-    def where(self, pixels: Bools) -> VisibleFibres:
-        """Those of some of the pixels, marked by `pixels (P,)`."""
+    def mean_tangent(self) -> Array:
+        """Unit mean of each pixel's tangents `(P, 3)`; 0 where it shows no hair."""
+        mean = self.tangent.sum(axis=1, dtype=float)
+        return np.asarray(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12))
+
+    def where(self, pixels: Bools | Ints) -> VisibleFibres:
+        """Those of some of the pixels, marked by `pixels (P,)`, or by their places."""
         return VisibleFibres(self.point[pixels], self.tangent[pixels], self.hair[pixels])
 
     def spread(self) -> Array:
