@@ -68,6 +68,8 @@ DISORDER = 1.6
 
 √2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
+CHANGED = 0.97
+"""Of the β_M to render with, what that of the fibres must fall below for a warning."""
 SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
 ROUGHNESS_PIXELS = 350
@@ -308,6 +310,12 @@ class SunFit:
             off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
             scene = self.disordered(float(np.radians(off)))
             fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
+            if disorder is not None and fibres.beta_m < CHANGED * as_are.beta_m:
+                stage.warn(
+                    f"single hairs turn by {disorder.degrees:.0f}° more than the strands, by what "
+                    "pixels beside each other tell, and may turn more within a pixel: the fibres' "
+                    f"β_M, {fibres.beta_m:.2f}, may be too large"
+                )
         stage.figures |= {
             "samples": count,
             "pairs_of_lights": int(captured.pairs.sum()),
