@@ -35,8 +35,9 @@ _ALL = 1e-9
 """A light so dim casts its shadow ray: which do must not depend on the hair."""
 _LEAST_SPP = 16
 """Of indirect light, whose noise is no less for small pictures."""
-_WHOLE_PATHS, _PARTS = 1 << 17, 9
-"""Paths of whole pictures of all views together, and parts of a view's hair, about."""
+_WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 20, 4, 9
+"""Paths of whole pictures of all views together, and of a pixel at least: one or two of them, and
+noise decides what is better. And parts of a view's hair, about."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
 
@@ -165,7 +166,10 @@ class FitProblem:
         """
         views = [k for k in range(len(self.views)) if used[k].any()]
         paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))
-        spent = {"spp": int(np.clip(paths, 1, 2 * effort.spp)), "max_depth": effort.max_depth}
+        spent = {
+            "spp": int(np.clip(paths, _LEAST_PATHS, 2 * effort.spp)),
+            "max_depth": effort.max_depth,
+        }
         parts, counted = [], 0
         for k in views:
             o, lights = self.views[k], np.flatnonzero(used[k])
