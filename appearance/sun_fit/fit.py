@@ -192,8 +192,9 @@ def _observed(
     return FitPixels(hair, skin)
 
 
-def _spread(count: int) -> Ints:
-    """Places of `ROUGHNESS_PIXELS` of so many pixels, evenly."""
+def _spread(observed: Observed) -> Ints:
+    """Places of `ROUGHNESS_PIXELS` of the pixels, evenly."""
+    count = len(observed.pixels)
     return np.linspace(0, count - 1, min(count, ROUGHNESS_PIXELS)).astype(int)
 
 
@@ -273,8 +274,7 @@ class SunFit:
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
         first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"))
-        single = [self._under(o, f, _spread(len(o.pixels))) for o, f in views]
-        captured, of_single = self._highlights(single, channel)
+        captured, of_single = self._highlights(views, _spread, channel)
         series = Series("roughness", "standard error of log β_M")
         stage.series.append(series)
         runs = count_from(1)
@@ -303,8 +303,7 @@ class SunFit:
                 as_are.beta_m, float(np.radians(as_are.tangents_deg))
             )
             beta = max(smoother or as_are.beta_m, ROUGHNESSES[0])
-            pairs = [self._under(o, f, np.unique(beside(o))) for o, f in views]
-            seen, of_pairs = self._highlights(pairs, channel)
+            seen, of_pairs = self._highlights(views, lambda o: np.unique(beside(o)), channel)
             turned = ((d, self.disordered(float(np.radians(d)))) for d in DISORDERS)
             disorder = match_disorder(seen, ((d, rendered(of_pairs, x, beta)) for d, x in turned))
             off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
@@ -406,11 +405,16 @@ class SunFit:
         return o.under(near), fibres
 
     def _highlights(
-        self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
+        self,
+        views: Sequence[tuple[Observed, VisibleFibres]],
+        places: Callable[[Observed], Ints],
+        channel: int,
     ) -> tuple[Highlight, Highlights]:
-        """What the capture shows in these views, and how renderings of them are read."""
-        highlights = Highlights(views, self._tilt, channel)
-        return highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in views]), highlights
+        """What the capture shows at `places` of these views, and how renderings there are read."""
+        few = [self._under(o, fibres, places(o)) for o, fibres in views]
+        few = [(o, fibres) for o, fibres in few if len(o.lights)]
+        highlights = Highlights(few, self._tilt, channel)
+        return highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in few]), highlights
 
     def _read(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int

@@ -56,9 +56,14 @@ class Highlight:
 
     @classmethod
     def joined(cls, views: Sequence[Self]) -> Self:
-        """The highlights of several views as one."""
-        names = [f.name for f in fields(cls)]
-        return cls(*(np.concatenate([getattr(v, name) for v in views]) for name in names))
+        """The highlights of several views as one; of none, nothing."""
+        none = (np.zeros((0, len(edges) - 1)) for edges in 2 * [EDGES, EDGES] + 2 * [_DEVIATIONS])
+        return cls(
+            *(
+                np.concatenate([empty, *(getattr(view, f.name) for view in views)])
+                for f, empty in zip(fields(cls), none, strict=True)
+            )
+        )
 
     def correlation(self, parts: Array) -> Array:
         """Mean products over `EDGES`, relative to their mean `(M, 10)`; `parts (M, J)` weigh."""

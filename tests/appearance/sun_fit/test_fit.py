@@ -1,6 +1,7 @@
 """The whole fit on a small capture that was rendered with a known appearance."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -260,3 +261,20 @@ def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
     path.unlink()
     with pytest.raises(ModelError, match="hairstage fit"):
         FittedAppearance.load(model)
+
+
+def test_hair_pixels_that_lie_apart_tell_of_no_disorder(made, tmp_path):
+    """Every second of a row, and rows two apart: none is three beside another."""
+    capture, model = made
+    lone = Model(tmp_path / "model").create()
+    lone.write_strands(model.strands())
+    for name in ("cam_0", "cam_1"):
+        mask = model.mask(name, "hair", capture)
+        apart = np.zeros_like(mask)
+        apart[::2, ::2] = mask[::2, ::2]
+        lone.write_mask(name, "hair", apart)
+    left_out = HeldOut(("cam_2",))
+    fit(capture, lone, held_out=left_out, options=replace(OPTIONS, roughness_spp=12))
+    found = FittedAppearance.load(lone)
+    assert found.fibres.disorder_deg is None
+    assert found.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.15)
