@@ -73,6 +73,8 @@ def run_verify(args: argparse.Namespace, output: Output) -> int:
     """
     from reconstruction import verify
 
+    if not args.capture.is_dir():
+        raise BadArgument(f"{args.capture}: no such folder: give a capture's")
     with progress_bar("verify") as progress:
         problems = verify(args.capture, progress)
     text = "\n".join(problems) or f"{args.capture} is sound"

@@ -273,6 +273,7 @@ def test_verify_tells_sound_from_damaged(capsys, tmp_path):
     frame.write_bytes(frame.read_bytes()[:-1] + b"x")
     code, data = run(capsys, "verify", tmp_path / "capture")
     assert code == 1
+    assert run(capsys, "verify", tmp_path / "captur")[0] == 3, "nothing was read"
     assert len(data["problems"]) == 1
     assert "00001/cam.exr" in data["problems"][0]
 
