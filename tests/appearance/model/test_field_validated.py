@@ -41,7 +41,7 @@ from reconstruction.geometry.lights import dome_positions
 HAIR = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
 REQUEST = FieldRequest(
     lights=12,
-    spp=128,
+    spp=1024,
     max_depth=2,
     fit=FieldOptions(degree=1, levels=((2, 3, 3),), ridges=(1e-3, 1e-2, 0.1)),
 )
@@ -72,7 +72,7 @@ def made(small, tmp_path_factory):
     for camera in cameras:
         mask = coverage(scene, camera)["hair"] > 0.6
         model.write_mask(camera.name, "hair", mask)
-        frames = render_olat(scene, camera, lights, spp=256, max_depth=2, seed=9)
+        frames = render_olat(scene, camera, lights, spp=1024, max_depth=2, seed=9)
         for step, image in zip(steps, frames, strict=True):
             shown = (image * (2.0, 1.0, 1.0)).astype(np.float32)
             writer.write_frame(step, camera.name, shown)
@@ -103,7 +103,7 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
     sky = Environment(np.ones((2, 4, 3), np.float32))
     for lights, maps in (([light], []), ([], [sky])):
         with_it, without = (
-            m.render(camera, lights, maps, Sampling(64, 2))[5:10, 5:10].sum((0, 1))
+            m.render(camera, lights, maps, Sampling(1024, 2))[5:10, 5:10].sum((0, 1))
             for m in (fitted, bare)
         )
         assert with_it[0] / without[0] == pytest.approx(2, rel=0.08)
@@ -144,7 +144,7 @@ def test_edited_hair_keeps_its_field(own, tmp_path):
     shuffled = restyled(fitted, Strands.from_list(strands, radius=4e-4))
     camera, light = capture.rig.camera("c0"), [capture.rig.light("l3")]
     pictures = [
-        m.render(camera, light, [], Sampling(64, 2)).sum((0, 1)) for m in (fitted, shuffled)
+        m.render(camera, light, [], Sampling(1024, 2)).sum((0, 1)) for m in (fitted, shuffled)
     ]
     np.testing.assert_allclose(pictures[1], pictures[0], rtol=0.02)
     short = cut(fitted, 0.03)
@@ -152,7 +152,7 @@ def test_edited_hair_keeps_its_field(own, tmp_path):
     again = FittedModel.load(Model(tmp_path / "short"))
     np.testing.assert_allclose(again.field.places.kept, short.field.places.kept, rtol=1e-6)
     bare = again.without_field()
-    one, other = (m.render(camera, light, [], Sampling(64, 2)).sum((0, 1)) for m in (again, bare))
+    one, other = (m.render(camera, light, [], Sampling(1024, 2)).sum((0, 1)) for m in (again, bare))
     # what lay hidden below is less well known
     assert (one[0] / one[1]) / (other[0] / other[1]) == pytest.approx(2, rel=0.15)
     model.write_strands(Strands.from_list(strands[:10], radius=4e-4))

@@ -29,7 +29,7 @@ def measure_scanlines(
     index: Ints,
     *,
     lines: int = 6,
-    spp: int = 32,
+    spp: int = 256,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Time and noise of a whole sweep, beside `lines` lines one by one, scaled to all.
