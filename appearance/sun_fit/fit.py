@@ -68,7 +68,7 @@ DISORDER = 1.6
 
 √2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
-CHANGED = 0.97
+CHANGED = 0.99
 """Of the β_M to render with, what that of the fibres must fall below for a warning."""
 SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
