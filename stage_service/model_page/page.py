@@ -171,8 +171,8 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
     fit = model.json("appearance.json")
     hair, fibres, errors = fit["hair"], fit.get("fibres"), fit.get("sigma_a_error")
     known = errors is not None
-    said: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}")]
-    yield "roughness to render these strands with", said
+    said: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}"), ", to render these strands with"]
+    yield "roughness", said
     if fibres:
         said = [element("b", f"β_M {fibres['beta_m']:.2f}")]
         said.append(f", {fibres['low']:.2f} to {fibres['high']:.2f} at about 95 %")
@@ -181,7 +181,7 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
             said.append(f"; {turns.format(**fibres)} than these strands")
     else:
         said = ["not known"]
-    yield "roughness of the fibres", said
+    yield "of the fibres", said
     said = [_swatch(fit["colour"]), "σ_a "]
     for k, (value, error) in enumerate(zip(hair["sigma_a"], errors or [None] * 3, strict=True)):
         said += [", " if k else "", element("b", f"{value:.2g}")]
