@@ -57,7 +57,7 @@ class Highlight:
     @classmethod
     def joined(cls, views: Sequence[Self]) -> Self:
         """The highlights of several views as one; of none, nothing."""
-        none = (np.zeros((0, len(edges) - 1)) for edges in 2 * [EDGES, EDGES] + 2 * [_DEVIATIONS])
+        none = (np.zeros((0, len(edges) - 1)) for edges in 4 * [EDGES] + 2 * [_DEVIATIONS])
         return cls(
             *(
                 np.concatenate([empty, *(getattr(view, f.name) for view in views)])

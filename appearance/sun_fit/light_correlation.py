@@ -161,8 +161,8 @@ def match_disorder(
 
     Between the `rendered`, which ascend from 0, a line over the square: 0 where the capture is more
     alike than strands as they are. The error is the jackknife's over parts of the hair, or what the
-    views' answers differ by. None, and nothing is rendered, where too few pixels lie `BESIDE` each
-    other.
+    views' answers differ by. None where too few pixels lie `BESIDE` each other, and nothing is
+    rendered then, or where turns make the rendered ones no less alike.
     """
     if captured.pairs_beside.sum() < FEWEST_PAIRS:
         return None
@@ -170,7 +170,9 @@ def match_disorder(
     found = [(degrees, highlight.likeness(chosen)) for degrees, highlight in rendered]
     nodes = np.array([degrees for degrees, _ in found])
     slope, start = np.polyfit(nodes**2, np.stack([likeness for _, likeness in found]), 1)
-    square = (captured.likeness(chosen) - start) / np.minimum(slope, -1e-12)
+    if slope[0] >= 0:
+        return None
+    square = (captured.likeness(chosen) - start) / np.where(slope < 0, slope, slope[0])
     answers = np.sqrt(np.clip(square, 0, nodes[-1] ** 2))
     return Disorder(float(answers[0]), max(_errors(answers, left_out)), float(nodes[-1]))
 

@@ -9,7 +9,7 @@ from reconstruction.options import Count, options
 class FitOptions:
     """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering.
 
-    To the hair's pixels come others that lie beside them, at most as many.
+    Half of the hair's pixels are drawn; the others lie beside them, where those are hair.
     """
 
     hair_pixels: Count = 1000

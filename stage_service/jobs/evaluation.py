@@ -96,8 +96,9 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
             "fibre_beta_m": known.beta_m,
             "fibre_beta_m_error": known.error,
             "fibre_beta_m_range": [known.low, known.high],
-            "disorder_deg": known.disorder_deg,
         }
+        if known.disorder_deg is not None:
+            out["fitted"]["disorder_deg"] = known.disorder_deg
     if sun.sigma_a_error is not None:
         out["fitted"]["sigma_a_error"] = list(sun.sigma_a_error)
     for folder in (model, model.rejected()):

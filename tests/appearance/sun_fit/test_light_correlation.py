@@ -9,7 +9,10 @@ from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.sun_fit.highlights import EDGES, SIDE, WINDOW, Highlight, LightPairs, beside
 from appearance.sun_fit.light_correlation import Disorder, match_disorder, match_roughness
-from reconstruction import Camera
+from appearance.sun_fit.mirror_samples import near_mirror
+from appearance.sun_fit.visible_fibres import VisibleFibres
+from reconstruction import Camera, Light
+from reconstruction.geometry.lights import dome_positions
 
 BETAS = (0.04, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.95)
 PIXELS, LIGHTS, VIEWS = 450, 24, 2
@@ -172,3 +175,36 @@ def test_a_disorder_that_is_hardly_known_changes_the_roughness_half_way(family):
     sure = smooth.after(rough, Disorder(5, 0.0, 24))
     assert (sure.beta_m, sure.error) == pytest.approx((smooth.beta_m, smooth.error))
     assert smooth.after(rough, Disorder(0, 1.0, 24)).beta_m == pytest.approx(rough.beta_m)
+
+
+def test_renderings_that_turns_do_not_change_tell_of_no_disorder():
+    rendered = [(d, highlight(0.3, d, seed=7)) for d in (24, 16, 8, 0)]
+    wrong = [(d, h) for (_, h), d in zip(rendered, (0, 8, 16, 24), strict=True)]
+    assert match_disorder(highlight(0.3, 10, seed=4), wrong) is None
+
+
+@pytest.mark.parametrize(("hair_deg", "alike"), [(0, True), (25, False)])
+def test_what_strands_are_off_from_pixel_to_pixel_is_not_the_hairs(hair_deg, alike):
+    """Pixels whose hair runs one way answer alike, though strands there are 12° off at random."""
+    rng = np.random.default_rng(0)
+    camera = Camera.look_at("cam", 24, 24, (0, -1, 0), (0, 0, 0), 4)
+    pixels = np.arange(24 * 24)
+    lights = [
+        Light(f"l{k}", p, np.full(3, 1.0)) for k, p in enumerate(dome_positions(60, 1.0, -80.0))
+    ]
+
+    def fibres(degrees):
+        lean = np.radians(degrees) * rng.normal(size=len(pixels))
+        tangent = np.stack([0 * lean, np.sin(lean), np.cos(lean)], axis=1)
+        hair = np.ones((len(pixels), 1), bool)
+        return VisibleFibres(0 * tangent[:, None], tangent[:, None], hair)
+
+    true, strands = fibres(hair_deg), fibres(12)
+    valid = np.ones((len(lights), len(pixels)), bool)
+    seen = Observed(camera, tuple(lights), pixels, np.zeros((*valid.shape, 3)), valid)
+    shift = near_mirror(seen, true, 0.0).deviation
+    v = float(variance_of_roughness(0.25))
+    answer = longitudinal(0.5 * shift, 0.5 * shift, v)
+    found = LightPairs.of(seen, strands, tilt_deg=0.0, channel=0).highlight(answer, answer)
+    likeness = found.likeness(np.ones((1, SIDE**2)))[0]
+    assert (likeness > 0.9) == alike
