@@ -17,6 +17,7 @@ from stage_service.devices.errors import (
     DeviceUnreachable,
     SafetyRefusal,
 )
+from stage_service.devices.serial_ports import ExclusivePort
 
 LONGEST_LINE = 4096
 MOST_LINES = 1000
@@ -37,7 +38,7 @@ class SerialLines:
         self.name = f"{name} ({config.port})"
         self.config = config
         self._identity = identity
-        self._port: serial.Serial | None = None
+        self._port: ExclusivePort | None = None
         self._lock = threading.RLock()
 
     def connect(self) -> re.Match[str]:
@@ -46,9 +47,7 @@ class SerialLines:
         with self._lock:
             self.close()
             try:
-                port = serial.Serial(
-                    config.port, config.baud, write_timeout=config.timeout_s, exclusive=True
-                )
+                port = ExclusivePort(config.port, config.baud, timeout_s=config.timeout_s)
             except (OSError, serial.SerialException) as error:
                 doing, expected = "opening the serial port", "a free serial port"
                 todo = "Check the cable, the path in the rig file and who else has it open."

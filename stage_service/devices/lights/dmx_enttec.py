@@ -17,13 +17,12 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 
-import serial
-
 from reconstruction.geometry.rig import RigError
 from stage_service.config import DmxConfig
 from stage_service.devices.errors import DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
+from stage_service.devices.serial_ports import ExclusivePort
 
 CHANNELS, FEWEST_CHANNELS = 512, 24
 GET_PARAMETERS, SEND_DMX = 3, 6
@@ -61,7 +60,7 @@ class DmxLightBank:
         self._asked = 0  # bytes of user configuration, by the newest request
         self._bare = False  # whether the widget answers without any
         self._late = False  # whether an answer is missing
-        self._port: serial.Serial | None = None
+        self._port: ExclusivePort | None = None
         self._lock = threading.RLock()
 
     def connect(self) -> None:
@@ -137,8 +136,7 @@ class DmxLightBank:
         try:
             if self._port is None:
                 # The widget's USB driver ignores the baud rate.
-                timeout = self.config.timeout_s
-                self._port = serial.Serial(self.config.port, write_timeout=timeout, exclusive=True)
+                self._port = ExclusivePort(self.config.port, timeout_s=self.config.timeout_s)
             self._port.reset_input_buffer()
         except (OSError, termios.error) as error:
             raise self._lost("opening the port", error) from error

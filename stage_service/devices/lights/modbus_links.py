@@ -9,10 +9,10 @@ import termios
 import time
 from typing import Any
 
-import serial
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
 from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
+from stage_service.devices.serial_ports import ExclusivePort
 
 _FASTEST_FIXED = 19200
 _SILENCE_S = 1.75e-3
@@ -91,13 +91,12 @@ class _RtuLink(_Deadline, ModbusSerialClient):
     def connect(self) -> bool:
         if self.socket is None:
             try:
-                self.socket = serial.Serial(
+                self.socket = ExclusivePort(
                     self._config.port,
                     self._config.baud,
+                    timeout_s=self._config.timeout_s,
                     parity=self._config.parity,
-                    stopbits=self._config.stop_bits,
-                    write_timeout=self._config.timeout_s,
-                    exclusive=True,
+                    stop_bits=self._config.stop_bits,
                 )
             except termios.error as error:
                 raise OSError(*error.args) from error
