@@ -336,7 +336,7 @@ class _Probe:
         lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # fewer agree where pixels are wide
         if method == "lmvs":
             lines *= 0.03
-        add("segments", 0.0, 6.5e-7 * hair * cameras, 5e-7 * hair)
+        add("segments", 0.0, (4e-7 + 5e-8 / (os.cpu_count() or 2) * cameras) * hair, 5e-7 * hair)
         add("connection", 0.0, 8e-5 * lines, 5e-7 * hair)
         return lines
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
+import drjit as dr
 import numpy as np
 
+from reconstruction.array_backend import array_types, for_kernels
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.light_codes.code_views import View
 from reconstruction.light_codes.search import DepthMap
+
+_NONE = 2**32 - 1  # the number of no segment
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,27 +68,43 @@ def count_supports(
     Another view agrees where it found, within a pixel of where it would see the segment, one of
     its own within `distance` metres and `angle_deg` of it.
     """
-    supports = np.ones(len(segments), np.int64)
-    least = np.cos(np.radians(angle_deg))
+    t = array_types()
+    points, directions = (
+        t.Float(for_kernels(v.ravel())) for v in (segments.points, segments.directions)
+    )
+    lane = dr.arange(t.UInt32, len(segments))
+    p, d = dr.gather(t.Array3f, points, lane), dr.gather(t.Array3f, directions, lane)
+    owner = t.UInt32(for_kernels(segments.view, np.uint32))
+    supports = dr.full(t.UInt32, 1, len(segments))
+    near, like = (dr.opaque(t.Float, v) for v in (distance**2, np.cos(np.radians(angle_deg))))
     start = 0
     for k, (view, found) in enumerate(zip(views, maps, strict=True)):
-        index = np.full((view.camera.height + 2, view.camera.width + 2), -1, np.int64)
-        index[found.y + 1, found.x + 1] = start + np.arange(len(found.x))
+        camera = view.camera
+        index = np.full((camera.height + 2, camera.width + 2), _NONE, np.uint32)
+        index[found.y + 1, found.x + 1] = start + np.arange(len(found.x), dtype=np.uint32)
         start += len(found.x)
-        other = np.flatnonzero(segments.view != k)
-        pixels, depth = view.camera.project(segments.points[other])
-        on = (depth > 0) & view.camera.inside(pixels)
-        other, at = other[on], np.rint(pixels[on]).astype(np.int64)
-        agrees = np.zeros(len(other), bool)
+        of_pixel = t.UInt32(for_kernels(index.ravel(), np.uint32))
+        row = dr.opaque(t.UInt32, camera.width + 2)
+        projection = camera.K @ np.column_stack([camera.R, camera.t])
+        m = [dr.opaque(t.Float, float(v)) for v in projection.ravel()]
+        x, y, z = (m[i] * p.x + m[i + 1] * p.y + m[i + 2] * p.z + m[i + 3] for i in (0, 4, 8))
+        sees = (owner != dr.opaque(t.UInt32, k)) & (z > 0)
+        inverse = dr.rcp(dr.select(sees, z, 1))
+        x, y = x * inverse + 0.5, y * inverse + 0.5
+        sees &= (x >= 0) & (x < t.Float(dr.opaque(t.UInt32, camera.width)))
+        sees &= (y >= 0) & (y < t.Float(dr.opaque(t.UInt32, camera.height)))
+        corner = t.UInt32(y) * row + t.UInt32(x)
+        agrees = t.Bool(False)
         for dy, dx in np.ndindex(3, 3):
-            j = index[at[:, 1] + dy, at[:, 0] + dx]
-            some = np.flatnonzero((j >= 0) & ~agrees)
-            i, j = other[some], j[some]
-            near = np.linalg.norm(segments.points[i] - segments.points[j], axis=1) <= distance
-            cosine = np.einsum("nk,nk->n", segments.directions[i], segments.directions[j])
-            agrees[some] = near & (np.abs(cosine) >= least)
-        supports[other[agrees]] += 1
-    return replace(segments, supports=supports)
+            asked = sees & ~agrees
+            j = dr.gather(t.UInt32, of_pixel, corner + dy * row + dx, asked)
+            asked &= j != _NONE
+            away = dr.squared_norm(dr.gather(t.Array3f, points, j, asked) - p)
+            cosine = dr.abs(dr.dot(dr.gather(t.Array3f, directions, j, asked), d))
+            agrees |= asked & (away <= near) & (cosine >= like)
+        supports += dr.select(agrees, t.UInt32(1), t.UInt32(0))
+        dr.eval(supports)
+    return replace(segments, supports=np.array(supports).astype(np.int64))
 
 
 def thinned_lines(

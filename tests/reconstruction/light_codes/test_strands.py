@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from reconstruction import Report, Strands
+from reconstruction import Camera, Report, Strands
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.strands import smoothed
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.line_strands import connect_segments
-from reconstruction.light_codes.search import DepthSearch
+from reconstruction.light_codes.search import DepthMap, DepthSearch
 from reconstruction.light_codes.segments import count_supports, thinned_lines, to_segments
 
 
@@ -73,6 +74,60 @@ def test_tips_grow_along_the_fibre_while_views_agree(make_fibres: Any, fibre_cam
     off = np.linalg.norm(grown[:, None] - fibre[None], axis=2).min(axis=1)
     assert np.quantile(off, 0.9) < 1e-3
     assert extend(stage.views, []) == []
+
+
+SIDE, PIXEL = 9, 2e-4  # pixels, and metres that one spans at the origin
+BESIDE = np.array([1.0, 0.0, 0.0])
+
+
+def looking(position: Any, target: Any = (0, 0, 0), middle: int = SIDE // 2) -> Any:
+    """A view of SIDE² pixels from 1 m off; the target falls on the pixel (middle, middle)."""
+    fov = 2 * np.degrees(np.arctan(SIDE * PIXEL / 2))
+    camera = Camera.look_at("c", SIDE, SIDE, position, target, fov)
+    camera.K[:2, 2] = middle
+    return SimpleNamespace(camera=camera)
+
+
+def single(x: int, depth: float, direction: Any, y: int = SIDE // 2) -> DepthMap:
+    """The map of a view that found one segment."""
+    one = np.ones(1, np.float32)
+    at, along = (np.full(1, v) for v in (x, y)), np.asarray(direction, np.float32)[None]
+    return DepthMap(*at, one * np.float32(depth), along, one, one, one, np.ones(1, np.int64))
+
+
+def nothing() -> DepthMap:
+    no, none = np.zeros(0, np.float32), np.zeros(0, np.int64)
+    return DepthMap(none, none, no, np.zeros((0, 3), np.float32), no, no, no, none)
+
+
+@pytest.mark.parametrize(
+    ("deeper", "turned", "x", "agrees"),
+    [
+        (0.9e-3, 9.0, 4, True),
+        (-0.9e-3, 171.0, 4, True),  # the sign of a direction means nothing
+        (1.1e-3, 0.0, 4, False),
+        (0.0, 11.0, 4, False),
+        (0.0, 0.0, 5, True),
+        (0.0, 0.0, 6, False),  # within the distance, but two pixels off
+    ],
+)
+def test_a_view_agrees_that_found_the_segment_near_and_alike(
+    deeper: float, turned: float, x: int, agrees: bool
+) -> None:
+    a = np.radians(turned)
+    views = [looking((0, -1, 0)), looking(BESIDE)]
+    maps = [single(4, 1.0, (0, 0, 1)), single(x, 1.0 + deeper, (np.sin(a), 0, np.cos(a)))]
+    found = count_supports(views, maps, to_segments(views, maps), distance=1e-3, angle_deg=10.0)
+    assert found.supports[0] == 1 + agrees
+
+
+def test_views_that_see_a_segment_at_their_corner_behind_them_or_not_at_all() -> None:
+    corner = looking(BESIDE, middle=0)
+    away = looking(BESIDE, target=2 * BESIDE)
+    views = [looking((0, -1, 0)), corner, looking((0, 1, 0)), away, looking(-BESIDE, middle=-50)]
+    up = (0, 0, 1)
+    maps = [single(4, 1.0, up), single(0, 1.0, up, y=0), nothing(), single(4, 1.0, up), nothing()]
+    assert count_supports(views, maps, to_segments(views, maps)).supports.tolist() == [2, 2, 1]
 
 
 @pytest.fixture(scope="module")
