@@ -19,6 +19,7 @@ from benchmarks.importing.painted import PaintedCapture
 from benchmarks.results import save
 from reconstruction import Camera, Model, Progress, Rig, reconstruct
 from reconstruction.estimate import estimate
+from reconstruction.methods import METHODS, Method
 from stage_service.cli.support.commands import rig_path
 from stage_service.config import load_rig_file
 
@@ -59,16 +60,22 @@ SIZES = {
 }
 
 
-def measure(size: Size, folder: Path, seed: int, progress: Progress) -> dict[str, Any]:
-    """The estimate and the run of one capture."""
+def measure(
+    size: Size, method: Method, folder: Path, seed: int, progress: Progress
+) -> dict[str, Any]:
+    """The estimate and the run of one capture; stages are told beside what they took."""
     painted = PaintedCapture.write(
         folder / "capture", size.rig(), sweep=size.sweep, all_on=size.sweep, seed=seed
     )
     capture = painted.view(reduced=size.reduced)
-    told = estimate(capture, progress=within(progress, "estimate", 0.0, 0.05))
+    told = estimate(capture, method=method, progress=within(progress, "estimate", 0.0, 0.05))
     tell = within(progress, "reconstruct", 0.05, 0.9)  # where it ends, bars say no more
-    report = reconstruct(capture, Model(folder / "model"), method="auto", progress=tell)
+    report = reconstruct(capture, Model(folder / "model"), method=method, progress=tell)
     taken = {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb or 0.0} for s in report.stages}
+    for stage in told.stages:
+        if mine := taken.get(stage.name):
+            mine["seconds_over_estimate"] = mine["seconds"] / max(stage.seconds, 1.0)
+            mine["peak_over_estimate"] = mine["peak_gb"] / stage.peak_gb
     seconds = sum(s["seconds"] for s in taken.values())
     peak = max(s["peak_gb"] for s in taken.values())
     return {
@@ -87,12 +94,15 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for name in ["small"] if args.quick else args.sizes:
         size = replace(SIZES[name], lights=12, cameras=4) if args.quick else SIZES[name]
 
-        def tell(what: str, share: float, name: str = name) -> None:
-            progress(f"{name}: {what}", share)
+        for method in args.methods:
+            row = f"{name}, {method}"
 
-        with TemporaryDirectory(dir=args.out) as folder:
-            results[name] = measure(size, Path(folder), args.seed, tell)
-        save(args.out / "large.json", results)
+            def tell(what: str, share: float, row: str = row) -> None:
+                progress(f"{row}: {what}", share)
+
+            with TemporaryDirectory(dir=args.out) as folder:
+                results[row] = measure(size, method, Path(folder), args.seed, tell)
+            save(args.out / "large.json", results)
     return results
 
 
@@ -112,4 +122,5 @@ def _scaled(camera: Camera, by: float) -> Camera:
 SIZE = option(
     "--sizes", "which captures", nargs="+", choices=SIZES, default=["small", "photographs"]
 )
-BENCHMARK = Benchmark(run, (SIZE,))
+HOW = option("--methods", "of reconstruction", nargs="+", choices=METHODS, default=["auto"])
+BENCHMARK = Benchmark(run, (SIZE, HOW))
