@@ -24,6 +24,7 @@ from reconstruction.geometry.mesh_queries import depth_map, mesh_depth
 from reconstruction.images.hair_features import (
     FAINTEST_LINES,
     TwoClasses,
+    clear_classes,
     line_strength,
     looks,
     split,
@@ -265,7 +266,7 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
     hair = np.concatenate([(v.outside | v.standing)[v.subject] for v in views])
     if hair.any():
         classes: TwoClasses | None = two_classes(pixels, hair)
-    else:
+    elif (classes := clear_classes(pixels)) is None:
         subjects = {v.camera.name: v.subject for v in views}
         glossy = {
             v.camera.name: np.stack(

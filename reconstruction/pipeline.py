@@ -15,11 +15,12 @@ from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.kept_frames import frames_kept
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field, with_descent
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
-from reconstruction.growth.hair_envelope import build_envelope, build_hull, pixel_size
+from reconstruction.growth.hair_envelope import SHELL, build_envelope, build_hull, pixel_size
 from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
@@ -53,7 +54,6 @@ HEAD_OF_HAIR = 100_000 * 40e-6
 
 LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
 FINE_PIXEL = 1e-3  # metres: line stereo finds next to nothing on pixels twice as wide
-UNROOTED_DEPTH = 12e-3  # metres under a hull's surface that are filled where no head is known
 SPACING = 2e-3  # metres between a strand's points as it is written
 
 
@@ -280,7 +280,12 @@ class _Stages:
         """
         o, olat = self.options, masked.capture.olat_lights()
         mesh = None if head is None else head.mesh
-        envelope, depths = self.envelope(masked, cloud, mesh)
+        if mesh is None:
+            with self.report.stage("envelope") as stage:
+                envelope, bare, depths = build_hull(masked, grid=o.grid, stage=stage)
+        else:
+            envelope, depths = self.envelope(masked, cloud, mesh)
+            bare = inside_mesh(envelope, mesh)
         pixel = pixel_size(masked.cameras, envelope.centers().mean(axis=0))
         measured, seen = Measured.none(), list[AnyFloats]()
         if olat:
@@ -300,7 +305,7 @@ class _Stages:
                 except CaptureError as error:
                     stage.warn(f"line stereo finds nothing: {error}")
         scalp = None if mesh is None else find_scalp(mesh, envelope)
-        field = self.field(envelope, with_descent(envelope, measured, mesh), scalp)
+        field = self.field(envelope, with_descent(envelope, measured, bare), scalp)
         if head is not None and scalp is not None:
             grown = self.refined(self.grown(field, scalp, seen), measured, cloud)
             self.rooted(grown, written, scalp, head.scalp_map)
@@ -309,7 +314,7 @@ class _Stages:
             coverage, tracing = Coverage(field), Tracing(max_length=o.max_length)
             for path in seen:
                 coverage.add(path)
-            within = UNROOTED_DEPTH if o.within is None else o.within
+            within = SHELL if o.within is None else o.within
             gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
             short = Strands.from_list([*seen, *gaps]).cut(o.max_length)
             self._unrooted(
@@ -319,13 +324,11 @@ class _Stages:
             )
 
     def envelope(
-        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh | None
+        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh
     ) -> tuple[VoxelGrid, dict[str, Array]]:
         """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels."""
         o = self.options
         with self.report.stage("envelope") as stage:
-            if head is None:
-                return build_hull(masked, grid=o.grid, stage=stage)
             return build_envelope(
                 masked,
                 cloud,

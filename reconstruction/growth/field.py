@@ -11,8 +11,6 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
-from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.laplace import conjugate_gradients, grid_laplacian
 from reconstruction.report.report import Series
@@ -161,12 +159,12 @@ DESCENT_WEIGHT = 0.3
 """Of the way down, beside the confidences (0 to 1) of measured lines in the same voxel."""
 
 
-def with_descent(grid: VoxelGrid, measured: Measured, head: Mesh | None = None) -> Measured:
+def with_descent(grid: VoxelGrid, measured: Measured, head: Bools) -> Measured:
     """The measured lines and, all over the outer surface, the way down (`descent`).
 
     Where nothing was measured that is all there is; elsewhere the lines pull the surface's field.
     """
-    points, directions = descent(grid, None if head is None else inside_mesh(grid, head))
+    points, directions = descent(grid, head)
     return Measured(
         np.concatenate([measured.points, points]),
         np.concatenate([measured.directions, directions]),

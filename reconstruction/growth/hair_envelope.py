@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import CaptureError
@@ -20,9 +21,10 @@ from reconstruction.geometry.mesh_queries import (
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
-from reconstruction.masks import MaskedCapture
+from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.report.report import Stage
 
+SHELL = 12e-3  # metres under a hull's surface that what is seen there may be deep
 _BARE = 2e-3  # metres behind the head's surface up to which a pixel of skin rules hair out
 _ACROSS = 128  # voxels along the edge of the box in which hair is looked for
 
@@ -93,28 +95,62 @@ def build_envelope(
 
 def build_hull(
     masked: MaskedCapture, *, grid: float, stage: Stage
-) -> tuple[VoxelGrid, dict[str, Array]]:
-    """As `build_envelope` without sweep and head: the hull of the masks, depths `(H, W)` by camera.
+) -> tuple[VoxelGrid, Bools, dict[str, Array]]:
+    """As `build_envelope` without sweep and head: what of the subject's hull can be hair.
+
+    Where skin is seen that is what is at most `SHELL` metres from where more cameras show hair than
+    skin, under the hull's surface: a head has an inside, and a face hides hair but does not carve
+    it. Also the rest of the hull's voxels `(X, Y, Z)`, and the depths `(H, W)` by camera.
 
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
-    masks = {k: m.hair for k, m in masked.masks.items() if m.hair.any()}
+    masks = {k: m for k, m in masked.masks.items() if m.hair.any()}
+    cameras = [c for c in masked.cameras if c.name in masks]
+    subjects = {k: trim_edges(m.subject, m.hair) for k, m in masks.items()}
     try:
-        envelope = visual_hull(masked.cameras, masks, spacing=grid)
+        hull = visual_hull(cameras, subjects, spacing=grid)
     except ValueError as error:
         raise CaptureError(f"{masked.capture.path}: no volume for hair: {error}") from error
-    litres = float(envelope.inside.sum() * 1e3 * grid**3)
-    if not litres:
+    hair, skin = _shown(hull, cameras, masks)
+    envelope = hull
+    if skin.any():
+        near = ndimage.distance_transform_edt(~hair, sampling=grid) <= SHELL
+        envelope = replace(hull, inside=hull.inside & near & ~skin)
+    litres = 1e3 * grid**3
+    if not envelope.inside.any():
         raise CaptureError(
             f"{masked.capture.path}: no volume is left for hair: check masks and poses"
         )
-    stage.figures.update(envelope_litres=litres, voxels=int(envelope.inside.sum()))
-    stage.warn("no head: what the hull holds of it counts as hair, and no strand has a root")
-    return envelope, {
-        c.name: np.where(masks[c.name], depth_map_first(c, envelope), 0.0)
-        for c in masked.cameras
-        if c.name in masks
+    stage.figures.update(
+        hull_litres=float(hull.inside.sum() * litres),
+        envelope_litres=float(envelope.inside.sum() * litres),
+        voxels=int(envelope.inside.sum()),
+    )
+    stage.warn("no head: what lies under the hair counts as hair, and no strand has a root")
+    depths = {
+        c.name: np.where(masks[c.name].hair, depth_map_first(c, envelope), 0.0) for c in cameras
     }
+    return envelope, hull.inside & ~envelope.inside, depths
+
+
+def _shown(
+    hull: VoxelGrid, cameras: Sequence[Camera], masks: Mapping[str, HairMask]
+) -> tuple[Bools, Bools]:
+    """Voxels `hull.inside.shape` that more cameras show as hair than as skin, and the reverse."""
+    centers, votes = hull.centers(), np.zeros(int(hull.inside.sum()), np.int64)
+    for camera in cameras:
+        mask = masks[camera.name]
+        seen, x, y, depth = camera.pixels_of(centers)
+        # in squares that no voxel is smaller than: finer pixels miss the voxels' centres
+        square = int(np.ceil(2 * hull.spacing / pixel_size([camera], centers.mean(axis=0))))
+        first = np.full((camera.height // square + 1, camera.width // square + 1), np.inf)
+        np.minimum.at(first, (y[seen] // square, x[seen] // square), depth[seen])
+        near = seen & (depth <= first[y // square, x // square] + SHELL)
+        votes[near] += mask.hair[y, x][near]
+        votes[near] -= mask.skin[y, x][near]
+    hair, skin = np.zeros((2, *hull.inside.shape), bool)
+    hair[hull.inside], skin[hull.inside] = votes > 0, votes < 0
+    return hair, skin
 
 
 def pixel_size(cameras: Sequence[Camera], middle: Array) -> float:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from reconstruction.arrays import AnyFloats, Array, Bools
+from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, texture
@@ -37,6 +37,9 @@ FAINTEST_GLOSS = float(np.log(0.12 + 0.03))
 _BANK = LogGaborBank(wavelength=3.0, count=16, spread=1.0)
 _ONE_CLASS = 3.0
 """Deviations between classes' means under which they are one: 2.65 for a Gaussian cut in two."""
+_CLEAR = 4.0
+"""Deviations between classes' means from which they are two without an example of either: rendered
+hair and skin have 4.7 to 6.5, a tenth of the skin as well, hair alone has up to 3.6."""
 _RIGHT = 0.8
 """Of known hair, and of known skin, on its own side: half of each where the classes are one."""
 _ITERATIONS = 25
@@ -116,24 +119,46 @@ def matte_fit(
 
 @dataclass(frozen=True, eq=False)
 class TwoClasses:
-    """Hair and skin by `looks`: the log of the odds that a pixel is hair is linear in them."""
+    """Hair and skin by `looks`: the log of the odds that a pixel is hair is linear in them.
+
+    `apart` is how many of their common deviations the classes' means are from each other.
+    """
 
     weights: Array
     offset: float
+    apart: float = 0.0
 
     def scores(self, looks: Array) -> Array:
         """Log odds `(...)` for hair of `looks (4, ...)`, at most 5 either way."""
         return np.asarray(np.clip(np.tensordot(self.weights, looks, 1) + self.offset, -5, 5))
 
 
+def clear_classes(looks: Array) -> TwoClasses | None:
+    """Hair and skin among pixels with `looks (N, 4)` that are two classes without any example.
+
+    Two Gaussians of one covariance that start from what is matte and what is not. None where they
+    are less than `_CLEAR` apart, or what started as hair has become the less glossy.
+    """
+    x = looks[_few(looks)]
+    found = _mixture(x, [0, 1, 2, 3], np.zeros(len(x), bool), x[:, 0] < FAINTEST_GLOSS)
+    if found is None or found.apart < _CLEAR:
+        return None
+    hair = found.scores(x.T) > 0
+    glossier = hair.any() and not hair.all() and np.median(x[hair, 0]) > np.median(x[~hair, 0])
+    return found if glossier else None
+
+
 def two_classes(looks: Array, hair: Bools) -> TwoClasses:
     """Hair and skin among pixels with `looks (N, 4)`, where some, `hair (N,)`, are sure to be hair.
 
-    Skin is looked for among the others with less gloss than nine in ten of the sure ones; where
-    these are no more than in hair itself, all of it is hair. Where the classes that start from
-    them overlap, the rest is as a whole what most of it is. Where sure hair is matte, as what
-    stands off a head that was misplaced, light cannot tell, and all of the rest is skin.
+    Where these are no `clear_classes`, skin is looked for among the others with less gloss than
+    nine in ten of the sure ones; where these are no more than in hair itself, all of it is hair.
+    Where the classes that start from them overlap, the rest is as a whole what most of it is.
+    Where sure hair is matte, as what stands off a head that was misplaced, light cannot tell, and
+    all of the rest is skin.
     """
+    if clear := clear_classes(looks):
+        return clear
     if np.median(looks[hair, 0]) < FAINTEST_GLOSS:
         return TwoClasses(np.zeros(4), -5.0)
     matte = ~hair & (looks[:, 0] < np.quantile(looks[hair, 0], _LIKE_HAIR))
@@ -154,26 +179,29 @@ def split(looks: Array, hair: Bools, skin: Bools, pure: float = 1.0) -> TwoClass
     in hair's shadow. None where they still do not: on its own side must be `_RIGHT` of the hair,
     and as much of the pure share of the skin.
     """
-    few = np.random.default_rng(0).permutation(len(looks))[:_MOST_PIXELS]
+    few = _few(looks)
     x, hair, skin = looks[few], hair[few], skin[few]
     examples = hair if hair.any() else ~skin
     for columns in ([1, 2, 3], [0, 1, 2, 3]):
-        found = _mixture(x[:, columns], hair, skin)
-        if found is not None:
-            weights = np.zeros(4)
-            weights[columns] = found[0]
-            classes = TwoClasses(weights, found[1])
+        classes = _mixture(x, columns, hair, skin)
+        if classes is not None:
             odds = classes.scores(x.T)
             if (odds[examples] > 0).mean() > _RIGHT and (odds[skin] < 0).mean() > _RIGHT * pure:
                 return classes
     return None
 
 
-def _mixture(x: Array, hair: Bools, start: Bools) -> tuple[Array, float] | None:
-    """Weights and offset of the log odds for hair at even priors; None for a class that vanishes.
+def _few(looks: Array) -> Ints:
+    """Numbers of the pixels that classes are learned from."""
+    return np.random.default_rng(0).permutation(len(looks))[:_MOST_PIXELS]
+
+
+def _mixture(looks: Array, columns: list[int], hair: Bools, start: Bools) -> TwoClasses | None:
+    """The classes by these `columns` of `looks (N, 4)`, at even priors; None where one vanishes.
 
     Even, since a prior would move the line between the classes where pixels show both.
     """
+    x = looks[:, columns]
     skin = np.where(hair, 0.0, np.where(start, 0.95, 0.05))
     for _ in range(_ITERATIONS):
         classes = (1 - skin, skin)
@@ -187,7 +215,9 @@ def _mixture(x: Array, hair: Bools, start: Bools) -> tuple[Array, float] | None:
         prior = np.clip(skin[~hair].mean(), 0.02, 0.98)
         odds = np.clip(x @ weights + offset + np.log(1 / prior - 1), -30, 30)
         skin = np.where(hair, 0.0, 1 / (1 + np.exp(odds)))
-    return weights, offset
+    every = np.zeros(looks.shape[1])
+    every[columns] = weights
+    return TwoClasses(every, offset, float(np.sqrt((means[0] - means[1]) @ weights)))
 
 
 def line_strength(lit: AnyFloats, subject: Bools) -> Array:

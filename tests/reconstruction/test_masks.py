@@ -15,6 +15,7 @@ from reconstruction import Camera, Capture, CaptureWriter, Light, Mesh, Rig, Ste
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.hair_features import (
+    clear_classes,
     line_strength,
     matte_fit,
     otsu,
@@ -395,6 +396,41 @@ def test_where_one_class_is_seen_it_is_not_split() -> None:
     assert (two_classes(covered, known).scores(covered.T) > 0).all()
     matte = looks_of(0.04, 0.0, 1000, 0)  # what stands off is no hair: a misplaced head
     assert (two_classes(matte, known).scores(matte.T) < 0).all()
+
+
+@pytest.mark.parametrize("share", [0.4, 0.05])
+def test_hair_and_skin_of_two_colours_need_no_example(share: float) -> None:
+    count = round(2000 * share)
+    hair, skin = looks_of(0.25, 0.5, 2000 - count, 0), looks_of(0.1, 0.0, count, 1)
+    classes = clear_classes(np.concatenate([hair, skin]))
+    assert classes is not None
+    assert (classes.scores(hair.T) > 0).mean() > 0.98
+    assert (classes.scores(skin.T) < 0).mean() > 0.98
+
+
+def test_hair_alone_of_which_some_shines_more_is_one_class() -> None:
+    assert clear_classes(looks_of(0.25, 0.0, 2000, 0)) is None
+    rim, inner = looks_of(0.37, 0.45, 700, 0), looks_of(0.24, 0.6, 1300, 1)
+    assert clear_classes(np.concatenate([rim, inner])) is None
+    alike = np.concatenate([looks_of(0.12, 0.0, 1000, 0), looks_of(0.05, 0.0, 1000, 1)])
+    assert clear_classes(alike) is None
+    assert clear_classes(looks_of(0.25, 0.0, 5, 0)) is None
+
+
+def test_hair_at_the_outline_that_shines_more_does_not_make_the_rest_skin() -> None:
+    """Looks of the demo's hair: its rim is brighter and less red than what lies on the head."""
+    rng = np.random.default_rng(3)
+
+    def some(count: int, middle: list[float], spread: list[float]) -> np.ndarray:
+        middle[0] = np.log(middle[0] + 0.03)
+        return np.asarray(middle + rng.normal(size=(count, 4)) * spread)
+
+    rim = some(2400, [0.35, 0.45, 0.63, -2.3], [0.32, 0.12, 0.12, 0.5])
+    inner = some(5200, [0.28, 0.63, 0.75, -3.5], [0.32, 0.08, 0.08, 0.4])
+    skin = some(1280, [0.14, 0.4, 0.24, -2.6], [0.4, 0.05, 0.07, 0.2])
+    scores = two_classes(np.concatenate([rim, inner, skin]), np.arange(8880) < 2400).scores
+    assert (scores(inner.T) > 0).mean() > 0.97
+    assert (scores(skin.T) < 0).mean() > 0.97
 
 
 def fur(shape: tuple[int, int], hair: np.ndarray, seed: int, noise: float = 0.01) -> np.ndarray:

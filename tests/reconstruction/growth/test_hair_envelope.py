@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from reconstruction import Camera, Capture, Mesh, Rig
-from reconstruction.growth.hair_envelope import build_envelope
+from reconstruction.growth.hair_envelope import build_envelope, build_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.report.report import Stage
@@ -44,6 +45,51 @@ def test_hair_that_hangs_far_below_the_head_is_in_the_envelope() -> None:
             longest=longest,
         )
         assert envelope.centers()[:, 2].min() == pytest.approx(reaches, abs=0.05)
+
+
+RADIUS = 0.1
+
+
+def ball_capture(face: float) -> MaskedCapture:
+    """A ball seen from eight sides, all hair but for what is further than `face` to the front."""
+    cameras, masks = [], {}
+    for k, a in enumerate(np.radians(np.arange(8) * 45.0)):
+        place = (1.2 * np.sin(a), -1.2 * np.cos(a), (0.3, -0.3)[k % 2])
+        camera = Camera.look_at(f"c{k}", 120, 120, place, (0, 0, 0), 12.0)
+        rays = camera.rays(np.stack(np.meshgrid(np.arange(120), np.arange(120)), axis=-1))
+        b = rays @ camera.center
+        square = b**2 - camera.center @ camera.center + RADIUS**2
+        point = camera.center + (-b - np.sqrt(np.maximum(square, 0)))[..., None] * rays
+        subject, skin = square > 0, point[..., 1] < -face
+        masks[camera.name] = HairMask(subject, subject & ~skin, subject & skin, "user", 1.0)
+        cameras.append(camera)
+    capture = Capture.__new__(Capture)
+    capture.path, capture.rig = Path("ball"), Rig("ball", tuple(cameras), (), ())
+    return MaskedCapture(capture, masks)
+
+
+def test_a_face_without_a_head_is_bare_and_hides_no_hair() -> None:
+    """Cameras in front see skin alone where hair lies behind the head."""
+    masked = ball_capture(face=0.05)
+    hull, bare, depths = build_hull(masked, grid=3e-3, stage=Stage("envelope"))
+    behind, before, middle = np.array([[0, 0.095, 0], [0, -0.095, 0], [0, 0, 0.0]])
+    assert hull.contains(behind[None])[0]
+    assert not hull.contains(np.stack([before, middle])).any()
+    rest = replace(hull, inside=bare)
+    assert rest.contains(np.stack([before, middle])).all()
+    assert not (hull.inside & bare).any()
+    off = np.linalg.norm(hull.centers(), axis=1)
+    assert off.min() > RADIUS - 0.035  # rays through a ball's rim are longer in the shell than deep
+    from_behind = depths["c4"][60, 60]
+    assert from_behind == pytest.approx(np.hypot(1.2, 0.3) - RADIUS, abs=6e-3)
+    assert depths["c0"][60, 60] == 0  # a pixel of skin
+
+
+def test_without_any_skin_all_of_the_hull_can_be_hair() -> None:
+    hull, bare, _ = build_hull(ball_capture(face=1.0), grid=3e-3, stage=Stage("envelope"))
+    assert hull.contains(np.zeros((1, 3)))[0]
+    assert not bare.any()
+    assert hull.inside.sum() * 3e-3**3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.15)
 
 
 OCTAHEDRON = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
