@@ -1,6 +1,8 @@
 """Automatic hair masks beside the true ones, at several path counts: noise must not decide them.
 
-Captures of the demo's rig go through the wires once and are kept. Leaves `masks.json`.
+And strands of the same captures without their sweep and head, as of photographs under single
+lights, by masks that light alone has told. Captures of the demo's rig go through the wires once and
+are kept. Leaves `masks.json`.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from benchmarks.captures import SimulatedCapture
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, option, within
 from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
 from benchmarks.results import save
-from reconstruction import Capture, Progress, Stage, read_strands
+from benchmarks.strand_truth import StrandTruth
+from reconstruction import Capture, Model, Progress, Stage, read_strands, reconstruct
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.light_planes import triangulate
 from reconstruction.masks import HairMask, MaskedCapture, disagreements, hair_masks
@@ -53,8 +56,23 @@ def overlaps(masks: Mapping[str, HairMask], true: Mapping[str, HairMask]) -> dic
     return out
 
 
-def judge(folder: Path, truth_folder: Path) -> dict[str, Any]:
-    """Overlaps, disagreements and the envelope, with masks of the light, without head and true."""
+class SingleLights(Capture):
+    """A capture as if neither a sweep was shot nor the head digitised."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.steps = tuple(s for s in self.steps if s.kind != "scanline")
+
+    @property
+    def head(self) -> None:
+        """None."""
+
+
+def judge(folder: Path, truth_folder: Path, model: Model) -> dict[str, Any]:
+    """Overlaps, disagreements and the envelope, with masks of the light, without head and true.
+
+    `model` is where strands of single lights alone are left; their baselines have the head.
+    """
     capture = Capture(folder)
     cloud, head = triangulate(capture), capture.head
     assert head is not None
@@ -74,6 +92,13 @@ def judge(folder: Path, truth_folder: Path) -> dict[str, Any]:
             "disagreement": disagreements(masks, capture.rig.cameras, cloud, head),
             "envelope_litres": stage.figures["envelope_litres"],
         }
+    alone = SingleLights(folder)
+    reconstruct(alone, model)
+    truth = StrandTruth(capture, truth_folder)
+    out["single lights alone"] = {
+        "overlap": overlaps(hair_masks(alone), true),
+        "strands": {"ours": truth.score(model.strands()), **truth.baselines(model)},
+    }
     return out
 
 
@@ -105,7 +130,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     captures = _captures(args)
     for k, ((name, paths), capture) in enumerate(captures.items()):
         tell = within(progress, f"{name}, {paths} paths", k / len(captures), 1 / len(captures))
-        results.setdefault(name, {})[str(paths)] = judge(*capture.make(args.cache, tell))
+        model = Model(args.out / f"masks-{name}-{paths}")
+        results.setdefault(name, {})[str(paths)] = judge(*capture.make(args.cache, tell), model)
         save(args.out / "masks.json", results)
     return results
 
