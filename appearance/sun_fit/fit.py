@@ -114,9 +114,10 @@ def fit(
         lambda angle: build_scene(disordered(strands, angle, seed), head, hair=start),
     )
     with report.stage("roughness") as stage:
-        plain, printed, as_are, fibres, first = fitting.roughness(stage)
+        found = fitting.roughness(stage)
+        beta_m, first = found.as_are.beta_m, found.first
     with report.stage("colour") as stage:
-        colours = fitting.colour(as_are.beta_m, np.array(first.colour), np.array(first.skin), stage)
+        colours = fitting.colour(beta_m, np.array(first.colour), np.array(first.skin), stage)
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
@@ -134,7 +135,8 @@ def fit(
                 "intensities, to know it"
             )
     made = (colours.hair, colours.colour, colours.skin, exposure)
-    variances = float(variance_of_roughness(as_are.beta_m)), plain.v, printed
+    variances = float(variance_of_roughness(beta_m)), found.plain.v, found.printed
+    fibres = found.fibres
     turns = () if (d := fibres.disorder) is None else (d.degrees, d.error)
     known = Fibres(fibres.beta_m, fibres.error, fibres.low, fibres.high, *turns)
     model.forget_appearance()
@@ -232,6 +234,22 @@ def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: St
 
 
 @dataclass(frozen=True)
+class Roughnesses:
+    """What the highlights tell.
+
+    `as_are` is the roughness to render the strands with, `fibres` that of strands as disordered as
+    the hair is, `plain` the lobe of the capture's own samples, `printed` the variance by Eq. 10 as
+    it is printed, `first` the colour that went into the renderings.
+    """
+
+    as_are: Roughness
+    fibres: Roughness
+    plain: Lobe
+    printed: float
+    first: Colours
+
+
+@dataclass(frozen=True)
 class SunFit:
     """The observations and the geometry that the two fits share.
 
@@ -246,12 +264,8 @@ class SunFit:
     progress: Progress
     disordered: Callable[[float], HairScene] | None = None
 
-    def roughness(self, stage: Stage) -> tuple[Lobe, float, Roughness, Roughness, Colours]:
-        """The plain lobe, Eq. 10's variance, roughnesses by rendering, and a first colour.
-
-        The first roughness is that of the strands as they are, the second the fibres': of strands
-        that are as disordered as the hair.
-        """
+    def roughness(self, stage: Stage) -> Roughnesses:
+        """The roughnesses by matched renderings; raises `ValueError` where no light tells one."""
         start = time.perf_counter()
         self.progress("measuring the highlight", 0.3)
         hair = self.pixels.hair
@@ -336,7 +350,7 @@ class SunFit:
         }
         for warning in fibres.warnings():
             stage.warn(warning)
-        return plain, printed, as_are, fibres, first
+        return Roughnesses(as_are, fibres, plain, printed, first)
 
     def colour(
         self,

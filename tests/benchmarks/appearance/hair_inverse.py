@@ -38,10 +38,10 @@ def hair_inverse(
     base = scene.with_hair(HairAppearance((0.1, 0.1, 0.1), GUESS, BETA_N))
     fitting = SunFit(base, FitPixels(few, skin), options, seed, progress)
     try:
-        _, _, found, _, first = fitting.roughness(stage)
-        beta_m = found.beta_m
-        start: Array | None = np.array(first.colour)
-        albedo = np.array(first.skin)
+        found = fitting.roughness(stage)
+        beta_m = found.as_are.beta_m
+        start: Array | None = np.array(found.first.colour)
+        albedo = np.array(found.first.skin)
     except ValueError as error:
         stage.warn(f"the roughness is a guess, {GUESS}: {error}")
         beta_m, start, albedo = GUESS, None, np.array(scene.skin)
