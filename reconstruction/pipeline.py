@@ -20,7 +20,13 @@ from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field, with_descent
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
-from reconstruction.growth.hair_envelope import SHELL, build_envelope, build_hull, pixel_size
+from reconstruction.growth.hair_envelope import (
+    SHELL,
+    build_envelope,
+    build_hull,
+    pixel_size,
+    subject_hull,
+)
 from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
@@ -29,8 +35,10 @@ from reconstruction.head.capture_head import (
     HeadPoints,
     digitised_points,
     fit_capture_head,
+    lit_skin_points,
     skin_points,
 )
+from reconstruction.head.lit_skin import FEWEST_LIGHTS
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.images.segmentation import Network
@@ -52,6 +60,7 @@ from reconstruction.tangents.estimate import Measured, measure_tangents
 HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
+UNLIKE_MM = 3.0  # RMS from a face's points to the posed template's: of another head it has 5
 LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
 FINE_PIXEL = 1e-3  # metres: line stereo finds next to nothing on pixels twice as wide
 SPACING = 2e-3  # metres between a strand's points as it is written
@@ -101,7 +110,7 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
     if method == "photometric" or method == "lmvs":
         stages.seen_strands(masked, head, method)
     elif method == "hull":
-        stages.hull(masked, cloud, head)
+        stages.hull(masked, cloud, head or stages.head_by_light(masked))
     else:
         head = head or stages.head_under_skin(masked, cloud)
         envelope, depths = stages.envelope(masked, cloud, head.mesh)
@@ -178,6 +187,32 @@ class _Stages:
     def head_under_skin(self, masked: MaskedCapture, cloud: PointCloud) -> FittedHead:
         """The head under the triangulated points on bare skin."""
         return self._fitted(skin_points(masked, cloud), cloud)
+
+    def head_by_light(self, masked: MaskedCapture) -> FittedHead | None:
+        """The head under skin whose shape single lights show, None where they show none."""
+        lights = masked.capture.olat_lights()
+        if len(lights) < FEWEST_LIGHTS or not any(m.skin.any() for m in masked.masks.values()):
+            return None
+        with self.report.stage("head") as stage:
+            self.progress("looking for a face", 0.0)
+            try:
+                points = lit_skin_points(masked, subject_hull(masked, self.options.grid))
+                seed = self.options.seed
+                head = fit_capture_head(points, self.options.head_mesh, stage, seed=seed)
+            except CaptureError as error:
+                stage.warn(f"no head is found under single lights: {error}")
+                self.model.remove("head.obj")
+                return None
+            off = stage.figures["posed_rms_mm"]
+            if off > UNLIKE_MM:
+                stage.warn(
+                    f"the face under single lights is {off:.1f} mm off the template's, more than "
+                    f"{UNLIKE_MM:g}: no head is taken from it; give head.obj or scalp points"
+                )
+                self.model.remove("head.obj")
+                return None
+            self.model.write_head(head.mesh)
+        return head
 
     def _fitted(self, points: HeadPoints, cloud: PointCloud | None = None) -> FittedHead:
         with self.report.stage("head") as stage:

@@ -19,6 +19,7 @@ from reconstruction.geometry.mesh_queries import (
     mesh_silhouette,
 )
 from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.head.lit_skin import first_depth
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask, MaskedCapture
@@ -104,13 +105,8 @@ def build_hull(
 
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
-    masks = {k: m for k, m in masked.masks.items() if m.hair.any()}
-    cameras = [c for c in masked.cameras if c.name in masks]
-    subjects = {k: trim_edges(m.subject, m.hair) for k, m in masks.items()}
-    try:
-        hull = visual_hull(cameras, subjects, spacing=grid)
-    except ValueError as error:
-        raise CaptureError(f"{masked.capture.path}: no volume for hair: {error}") from error
+    hull, cameras = subject_hull(masked, grid), _showing_hair(masked)
+    masks = masked.masks
     hair, skin = _shown(hull, cameras, masks)
     envelope = hull
     if skin.any():
@@ -133,6 +129,23 @@ def build_hull(
     return envelope, hull.inside & ~envelope.inside, depths
 
 
+def subject_hull(masked: MaskedCapture, spacing: float) -> VoxelGrid:
+    """The visual hull of hair and skin; ends where only skin runs out of the picture.
+
+    Raises `CaptureError` where there is none.
+    """
+    masks = {c.name: masked.masks[c.name] for c in _showing_hair(masked)}
+    subjects = {k: trim_edges(m.subject, m.hair) for k, m in masks.items()}
+    try:
+        return visual_hull(masked.cameras, subjects, spacing=spacing)
+    except ValueError as error:
+        raise CaptureError(f"{masked.capture.path}: no volume for hair: {error}") from error
+
+
+def _showing_hair(masked: MaskedCapture) -> list[Camera]:
+    return [c for c in masked.cameras if masked.masks[c.name].hair.any()]
+
+
 def _shown(
     hull: VoxelGrid, cameras: Sequence[Camera], masks: Mapping[str, HairMask]
 ) -> tuple[Bools, Bools]:
@@ -141,11 +154,7 @@ def _shown(
     for camera in cameras:
         mask = masks[camera.name]
         seen, x, y, depth = camera.pixels_of(centers)
-        # in squares that no voxel is smaller than: finer pixels miss the voxels' centres
-        square = int(np.ceil(2 * hull.spacing / pixel_size([camera], centers.mean(axis=0))))
-        first = np.full((camera.height // square + 1, camera.width // square + 1), np.inf)
-        np.minimum.at(first, (y[seen] // square, x[seen] // square), depth[seen])
-        near = seen & (depth <= first[y // square, x // square] + SHELL)
+        near = seen & (depth <= first_depth(camera, hull)[y, x] + SHELL)
         votes[near] += mask.hair[y, x][near]
         votes[near] -= mask.skin[y, x][near]
     hair, skin = np.zeros((2, *hull.inside.shape), bool)

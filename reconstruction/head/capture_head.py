@@ -13,8 +13,15 @@ from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.containment import inside
 from reconstruction.files.points import read_points
 from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head
 from reconstruction.head.generic import generic_head
+from reconstruction.head.lit_skin import (
+    FEWEST_LIGHTS,
+    FEWEST_PIXELS,
+    first_depth,
+    lit_skin,
+)
 from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
 from reconstruction.light_planes.point_cloud import PointCloud
@@ -101,9 +108,46 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
         )
     x, y = points[:, :2].mean(axis=0) - middle
     turn = float(np.arctan2(x, -y))
-    guides = _under_the_hair(cloud.subset(hair & face), len(points))
+    under = hair & face
+    guides = _under_the_hair(cloud.points[under], cloud.view[under], len(points))
     hints = HeadHints(part="above chin", turn=turn, guides=guides)
     return HeadPoints(points, normals, hints, "reconstructed skin")
+
+
+def lit_skin_points(masked: MaskedCapture, hull: VoxelGrid) -> HeadPoints:
+    """Points on the bare skin of a face, whose shape single lights tell: see `lit_skin`.
+
+    Of the camera that shows most of it. `hull` is the subject's; the head lies some way under the
+    crown's hair, as in `skin_points`. Raises `CaptureError` where no camera shows enough.
+    """
+    capture, cameras = masked.capture, masked.cameras
+    lowest = float(np.percentile(hull.centers()[:, 2], 99.5)) - _HEIGHT
+    largest = sorted(cameras, key=lambda c: int(masked.masks[c.name].skin.sum()), reverse=True)
+    found = [lit_skin(capture, c, masked.masks[c.name].skin, hull, lowest) for c in largest[:3]]
+    faces = [f for f in found if f is not None]
+    if not faces:
+        raise CaptureError(
+            f"{capture.path}: no camera shows {FEWEST_PIXELS} pixels of skin in one piece under "
+            f"{FEWEST_LIGHTS} single lights"
+        )
+    face = max(faces, key=lambda f: len(f.points))
+    crown, view = [], []
+    for camera in cameras:
+        depth = first_depth(camera, hull)
+        y, x = np.nonzero(masked.masks[camera.name].hair & np.isfinite(depth))
+        rays = camera.rays(np.stack([x, y], axis=1))
+        crown.append(camera.center + rays * (depth[y, x] / (rays @ camera.R[2]))[:, None])
+        view.append(-rays)
+    hair, towards = np.concatenate(crown), np.concatenate(view)
+    near, middle = _head_region(np.concatenate([hair, face.points]))
+    skin = near[len(hair) :]
+    points, normals = _thinned(face.points[skin], face.normals[skin])
+    if len(points) < FEWEST_SKIN:
+        raise CaptureError(f"{capture.path}: {face.camera} shows too little skin of the head")
+    x, y = points[:, :2].mean(axis=0) - middle
+    guides = _under_the_hair(hair[near[: len(hair)]], towards[near[: len(hair)]], len(points))
+    hints = HeadHints(part="above chin", turn=float(np.arctan2(x, -y)), guides=guides)
+    return HeadPoints(points, normals, hints, f"skin under single lights, {face.camera}")
 
 
 def fit_capture_head(
@@ -180,18 +224,19 @@ def _head_region(points: Array) -> tuple[Bools, Array]:
     return (points[:, 2] > top - _HEIGHT) & (beside < _RADIUS), middle
 
 
-def _under_the_hair(hair: PointCloud, most: int) -> tuple[Array, Array] | None:
-    """About where the scalp is `(G, 3)` under points on the crown's hair, with its normals.
+def _under_the_hair(points: Array, view: Array, most: int) -> tuple[Array, Array] | None:
+    """About where the scalp is `(G, 3)` under the crown's hair, with its normals.
 
-    No more than `most`: they weigh no more than the skin.
+    Of `points (N, 3)` on hair that were seen from the directions `view (N, 3)`. No more than
+    `most`: they weigh no more than the skin.
     """
-    if not len(hair):
+    if not len(points):
         return None
-    top = np.percentile(hair.points[:, 2], 99.5)
-    crown = hair.subset(hair.points[:, 2] > top - _CROWN)
-    crown = crown.subset(_one_a_cell(crown.points))
-    normals = surface_normals(crown.points, crown.view)
-    guides = crown.points - _HAIR * normals
+    crown = points[:, 2] > np.percentile(points[:, 2], 99.5) - _CROWN
+    points, view = points[crown], view[crown]
+    first = _one_a_cell(points)
+    normals = surface_normals(points[first], view[first])
+    guides = points[first] - _HAIR * normals
     few = np.random.default_rng(0).permutation(len(guides))[:most]
     return guides[few], normals[few]
 
