@@ -19,6 +19,8 @@ from reconstruction.capture.folder import Capture, CaptureError, MissingFrame, S
 from reconstruction.capture.kept_frames import kept_bytes
 from reconstruction.geometry.cameras import Camera
 from reconstruction.head.capture_head import HeadPoints, digitised_points
+from reconstruction.head.lit_skin import FEWEST_LIGHTS as FEWEST_LIGHTS_OF_SKIN
+from reconstruction.head.lit_skin import MOST_LIGHTS
 from reconstruction.images.orientation import responses
 from reconstruction.light_codes.codes import WORD
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
@@ -269,6 +271,8 @@ class _Probe:
             return out
         if method != "hull" and not known:
             add("head", table=HEAD_FIT)
+        elif not known and lights >= FEWEST_LIGHTS_OF_SKIN:
+            add("head", 3 * min(lights, MOST_LIGHTS) * self.again, HEAD_FIT)
         volume = self.volume
         bare = not known and method == "hull"  # nothing but a hull, filled 12 mm deep
         each = 0.1 if bare else 0.5
