@@ -1,7 +1,7 @@
 """Automatic hair masks beside the true ones, at several path counts: noise must not decide them.
 
-And strands of the same captures without their sweep and head, as of photographs under single
-lights, by masks that light alone has told. Captures of the demo's rig go through the wires once and
+And strands, and a head, of the same captures without their sweep and head, as of photographs under
+single lights, by masks that light alone has told. Captures of the demo's rig go through the wires once and
 are kept. Leaves `masks.json`.
 """
 
@@ -14,6 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from appearance import HairAppearance, build_scene
 from appearance.render.coverage import coverage
 from benchmarks.captures import SimulatedCapture
@@ -21,10 +23,17 @@ from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, opt
 from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
 from benchmarks.results import save
 from benchmarks.strand_truth import StrandTruth
-from reconstruction import Capture, Model, Progress, Stage, read_strands, reconstruct
+from reconstruction import Capture, Mesh, Model, Progress, Stage, read_strands, reconstruct
+from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.light_planes import triangulate
-from reconstruction.masks import HairMask, MaskedCapture, disagreements, hair_masks
+from reconstruction.masks import (
+    HairMask,
+    MaskedCapture,
+    disagreements,
+    distance_to,
+    hair_masks,
+)
 from stage_service.cli.support.commands import rig_path
 
 SUBJECTS = ("wavy", "curly", "sintel")
@@ -97,9 +106,20 @@ def judge(folder: Path, truth_folder: Path, model: Model) -> dict[str, Any]:
     truth = StrandTruth(capture, truth_folder)
     out["single lights alone"] = {
         "overlap": overlaps(hair_masks(alone), true),
+        "head_mm": _apart(model.head(alone), head),
         "strands": {"ours": truth.score(model.strands()), **truth.baselines(model)},
     }
     return out
+
+
+def _apart(found: Mesh | None, true: Mesh) -> dict[str, float] | None:
+    """Millimetres from the upper 22 cm of the head that was found to the true one."""
+    if found is None:
+        return None
+    points = surface_samples(found, 4e-3)[0]
+    upper = points[points[:, 2] > true.vertices[:, 2].max() - 0.22]
+    apart = 1e3 * np.abs(distance_to(true, upper))
+    return {f"p{q}": float(np.percentile(apart, q)) for q in (50, 95)}
 
 
 def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCapture]:
