@@ -1,8 +1,8 @@
 """Automatic hair masks beside the true ones, at several path counts: noise must not decide them.
 
 And strands, and a head, of the same captures without their sweep and head, as of photographs under
-single lights, by masks that light alone has told. Captures of the demo's rig go through the wires once and
-are kept. Leaves `masks.json`.
+single lights, by masks that light alone has told. Captures of the demo's rig go through the wires
+once and are kept. Leaves `masks.json`.
 """
 
 from __future__ import annotations
