@@ -23,6 +23,7 @@ from reconstruction.head.lit_skin import FEWEST_LIGHTS as FEWEST_LIGHTS_OF_SKIN
 from reconstruction.head.lit_skin import MOST_LIGHTS
 from reconstruction.images.orientation import responses
 from reconstruction.light_codes.codes import WORD
+from reconstruction.light_codes.line_strands import MOST_LINES
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
 from reconstruction.methods import Method
 from reconstruction.pipeline import FINE_PIXEL, method_for
@@ -340,8 +341,9 @@ class _Probe:
         lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # fewer agree where pixels are wide
         if method == "lmvs":
             lines *= 0.03
+        found, lines = lines, min(lines, MOST_LINES)
         add("segments", 0.0, (4e-7 + 5e-8 / (os.cpu_count() or 2) * cameras) * hair, 5e-7 * hair)
-        add("connection", 0.0, 8e-5 * lines, 5e-7 * hair)
+        add("connection", 0.0, 5e-6 * found + 8e-5 * lines, 5e-7 * hair)
         return lines
 
     def row(self) -> float:

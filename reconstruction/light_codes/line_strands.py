@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +33,10 @@ SUPPORT_DISTANCE, SUPPORT_ANGLE_DEG = 1.5e-3, 15.0
 
 CROWD = 3e-4
 """Metres: lines are averaged in cells of this size before strands are traced through them."""
+
+MOST_LINES = 1_000_000
+"""More are averaged in larger cells, and strands are traced as much further apart: those of large
+pictures would take hours."""
 
 SEGMENT_WEIGHT = 4.0
 """Of a segment's confidence, in an orientation field that it shares with measured tangents."""
@@ -131,12 +136,20 @@ def connect_segments(views: list[View], segments: Segments, report: Report) -> l
         points, directions, weights = thinned_lines(
             segments.points, segments.directions, weights, CROWD
         )
+        coarser = 1
+        while len(points) > MOST_LINES:
+            coarser *= 2
+            points, directions, weights = thinned_lines(
+                points, directions, weights, coarser * CROWD
+            )
+        tracing = replace(TRACING, apart=coarser * TRACING.apart)
         usual = np.median(weights[weights > 0]) if (weights > 0).any() else 1.0
         lines = Measured(points, directions, np.minimum(weights / usual, 1.0))
-        found = [p.astype(float) for p in surface_strands(lines, TRACING)]
+        found = [p.astype(float) for p in surface_strands(lines, tracing)]
         grown = extend(views, found)
         stage.figures.update(
             lines=len(points),
+            cells_mm=1e3 * coarser * CROWD,
             strands=len(found),
             metres=_metres(found),
             metres_extended=_metres(grown),

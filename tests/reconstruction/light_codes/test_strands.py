@@ -11,6 +11,7 @@ import pytest
 from reconstruction import Camera, Report, Strands
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.geometry.strands import smoothed
+from reconstruction.light_codes import line_strands
 from reconstruction.light_codes.extension import extend, fewest_views
 from reconstruction.light_codes.line_strands import connect_segments
 from reconstruction.light_codes.search import DepthMap, DepthSearch
@@ -146,6 +147,23 @@ def test_segments_that_three_views_find_alike_lie_on_fibres(fibres: Any, segment
     assert np.quantile(off[agreed], 0.9) < 0.8 * pixel
     assert off[agreed].mean() < 0.5 * off[~agreed].mean()
     assert segments.supports.max() <= len(fibres.views)
+
+
+def test_more_lines_than_can_be_traced_are_averaged_in_larger_cells(
+    fibres: Any, segments: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = segments.subset(segments.supports >= 3)
+    report = Report()
+    whole = connect_segments(fibres.views, good, report)
+    every = report.stages[-1].figures
+    monkeypatch.setattr(line_strands, "MOST_LINES", every["lines"] // 2)
+    fewer = connect_segments(fibres.views, good, report)
+    figures = report.stages[-1].figures
+    assert figures["lines"] <= every["lines"] // 2
+    assert figures["cells_mm"] > every["cells_mm"] == pytest.approx(0.3)
+    assert 0 < len(fewer) < len(whole)
+    found = compare_strands(Strands.from_list(fewer, 2e-4), fibres.strands, samples=None)["all"]
+    assert found["2mm_20deg"]["precision"] > 0.85
 
 
 def test_fibres_come_back_as_strands(fibres: Any, segments: Any) -> None:
