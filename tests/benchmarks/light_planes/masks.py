@@ -102,7 +102,7 @@ def judge(folder: Path, truth_folder: Path, model: Model) -> dict[str, Any]:
             "envelope_litres": stage.figures["envelope_litres"],
         }
     alone = SingleLights(folder)
-    reconstruct(alone, model)
+    reconstruct(alone, model, method="auto")
     truth = StrandTruth(capture, truth_folder)
     out["single lights alone"] = {
         "overlap": overlaps(hair_masks(alone), true),
