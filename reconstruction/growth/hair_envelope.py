@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.lit_skin import first_depth
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
-from reconstruction.masks import HairMask, MaskedCapture
+from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 
 SHELL = 12e-3  # metres under a hull's surface that what is seen there may be deep
@@ -105,12 +105,11 @@ def build_hull(
 
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
-    hull, cameras = subject_hull(masked, grid), _showing_hair(masked)
-    masks = masked.masks
-    hair, skin = _shown(hull, cameras, masks)
-    envelope = hull
+    hull = envelope = subject_hull(masked, grid)
+    hair, skin = _shown(hull, masked)
     if skin.any():
-        near = ndimage.distance_transform_edt(~hair, sampling=grid) <= SHELL
+        # of a volume without any hair there is no distance to it
+        near = hair.any() and ndimage.distance_transform_edt(~hair, sampling=grid) <= SHELL
         envelope = replace(hull, inside=hull.inside & near & ~skin)
     litres = 1e3 * grid**3
     if not envelope.inside.any():
@@ -124,7 +123,8 @@ def build_hull(
     )
     stage.warn("no head: what lies under the hair counts as hair, and no strand has a root")
     depths = {
-        c.name: np.where(masks[c.name].hair, depth_map_first(c, envelope), 0.0) for c in cameras
+        c.name: np.where(masked.masks[c.name].hair, depth_map_first(c, envelope), 0.0)
+        for c in masked.cameras
     }
     return envelope, hull.inside & ~envelope.inside, depths
 
@@ -134,25 +134,19 @@ def subject_hull(masked: MaskedCapture, spacing: float) -> VoxelGrid:
 
     Raises `CaptureError` where there is none.
     """
-    masks = {c.name: masked.masks[c.name] for c in _showing_hair(masked)}
-    subjects = {k: trim_edges(m.subject, m.hair) for k, m in masks.items()}
+    subjects = {k: trim_edges(m.subject, m.hair) for k, m in masked.masks.items()}
     try:
-        return visual_hull(masked.cameras, subjects, spacing=spacing)
+        some = {k: subject for k, subject in subjects.items() if subject.any()}
+        return visual_hull(masked.cameras, some, spacing=spacing)
     except ValueError as error:
         raise CaptureError(f"{masked.capture.path}: no volume for hair: {error}") from error
 
 
-def _showing_hair(masked: MaskedCapture) -> list[Camera]:
-    return [c for c in masked.cameras if masked.masks[c.name].hair.any()]
-
-
-def _shown(
-    hull: VoxelGrid, cameras: Sequence[Camera], masks: Mapping[str, HairMask]
-) -> tuple[Bools, Bools]:
+def _shown(hull: VoxelGrid, masked: MaskedCapture) -> tuple[Bools, Bools]:
     """Voxels `hull.inside.shape` that more cameras show as hair than as skin, and the reverse."""
     centers, votes = hull.centers(), np.zeros(int(hull.inside.sum()), np.int64)
-    for camera in cameras:
-        mask = masks[camera.name]
+    for camera in masked.cameras:
+        mask = masked.masks[camera.name]
         seen, x, y, depth = camera.pixels_of(centers)
         near = seen & (depth <= first_depth(camera, hull)[y, x] + SHELL)
         votes[near] += mask.hair[y, x][near]

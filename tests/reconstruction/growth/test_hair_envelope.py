@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction import Camera, Capture, Mesh, Rig
+from reconstruction import Camera, Capture, CaptureError, Mesh, Rig
 from reconstruction.growth.hair_envelope import build_envelope, build_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask, MaskedCapture
@@ -83,6 +83,23 @@ def test_a_face_without_a_head_is_bare_and_hides_no_hair() -> None:
     from_behind = depths["c4"][60, 60]
     assert from_behind == pytest.approx(np.hypot(1.2, 0.3) - RADIUS, abs=6e-3)
     assert depths["c0"][60, 60] == 0  # a pixel of skin
+
+
+def test_a_camera_that_shows_skin_alone_has_its_say_and_skin_alone_is_no_hair() -> None:
+    masked = ball_capture(face=0.0)
+    front = masked.masks["c0"]
+    assert not front.hair[45:75, 45:75].any()
+    bald = replace(front, hair=front.hair & False, skin=front.subject)
+    masks = {**masked.masks, "c0": bald}
+    hull, bare, depths = build_hull(
+        MaskedCapture(masked.capture, masks), grid=3e-3, stage=Stage("envelope")
+    )
+    assert hull.contains(np.array([[0, 0.095, 0]]))[0]
+    assert replace(hull, inside=bare).contains(np.array([[0, -0.095, 0]]))[0]
+    assert not depths["c0"].any()
+    every = {k: replace(m, hair=m.hair & False, skin=m.subject) for k, m in masks.items()}
+    with pytest.raises(CaptureError, match="no volume"):
+        build_hull(MaskedCapture(masked.capture, every), grid=3e-3, stage=Stage("envelope"))
 
 
 def test_without_any_skin_all_of_the_hull_can_be_hair() -> None:
