@@ -122,7 +122,7 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
             lines, measured = merge(measured, segments), merge(measured, segments, SEGMENT_WEIGHT)
         scalp = find_scalp(head.mesh, envelope)
         field = stages.field(envelope, measured, scalp)
-        grown = stages.grown(field, scalp, seen)
+        grown = stages.grown(field, scalp, seen, stages.options.within)
         grown = stages.refined(grown, measured, cloud)
         stages.rooted(grown, lines, scalp, head.scalp_map)
 
@@ -341,15 +341,15 @@ class _Stages:
                     stage.warn(f"line stereo finds nothing: {error}")
         scalp = None if mesh is None else find_scalp(mesh, envelope)
         field = self.field(envelope, with_descent(envelope, measured, bare), scalp)
+        within = SHELL if o.within is None else o.within  # lines lie on the hull, millimetres off
         if head is not None and scalp is not None:
-            grown = self.refined(self.grown(field, scalp, seen), measured, cloud)
+            grown = self.refined(self.grown(field, scalp, seen, within), measured, cloud)
             self.rooted(grown, written, scalp, head.scalp_map)
             return
         with self.report.stage("strands") as stage:
             coverage, tracing = Coverage(field), Tracing(max_length=o.max_length)
             for path in seen:
                 coverage.add(path)
-            within = SHELL if o.within is None else o.within
             gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
             short = Strands.from_list([*seen, *gaps]).cut(o.max_length)
             self._unrooted(
@@ -428,10 +428,17 @@ class _Stages:
                 )
         return field
 
-    def grown(self, field: OrientationField, scalp: Scalp, seen: list[AnyFloats]) -> Strands:
+    def grown(
+        self,
+        field: OrientationField,
+        scalp: Scalp,
+        seen: list[AnyFloats],
+        within: float | None = None,
+    ) -> Strands:
         """Strands from the scalp, then through the gaps that those leave, all of them rooted.
 
-        `seen` polylines `(N, 3)` were measured as they are; they get roots like those through gaps.
+        Gaps are filled `within` so many metres of a measured voxel, see `fill_gaps`. `seen`
+        polylines `(N, 3)` were measured as they are; they get roots like those through gaps.
         """
         o = self.options
         with self.report.stage("strands") as stage:
@@ -444,7 +451,7 @@ class _Stages:
                 coverage.add(path)
             share = coverage.share()
             self.progress("filling gaps", 0.4)
-            gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=o.within)
+            gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
             filled = coverage.share()
             self.progress("rooting strands", 0.7)
             loose = [polyline.astype(np.float32) for polyline in seen] + gaps

@@ -68,6 +68,8 @@ def count_supports(
     Another view agrees where it found, within a pixel of where it would see the segment, one of
     its own within `distance` metres and `angle_deg` of it.
     """
+    if not len(segments):
+        return segments
     t = array_types()
     points, directions = (
         t.Float(for_kernels(v.ravel())) for v in (segments.points, segments.directions)

@@ -129,6 +129,8 @@ def test_views_that_see_a_segment_at_their_corner_behind_them_or_not_at_all() ->
     up = (0, 0, 1)
     maps = [single(4, 1.0, up), single(0, 1.0, up, y=0), nothing(), single(4, 1.0, up), nothing()]
     assert count_supports(views, maps, to_segments(views, maps)).supports.tolist() == [2, 2, 1]
+    empty = [nothing()] * 5
+    assert not len(count_supports(views, empty, to_segments(views, empty)))
 
 
 @pytest.fixture(scope="module")
