@@ -127,8 +127,8 @@ class ReconstructOptions:
     where the user's masks do not. `scalp_points` is a file of digitised points of the scalp to fit
     a head to, where the capture has no `head.obj` or a better one is wanted, and `head_mesh` (OBJ)
     the head to fit instead of the generic one. Gaps are filled `within` metres of what was measured
-    (None: 3 mm, or two voxels): give more where pixels are wider. `radius` of the strands; None
-    takes the one that keeps a head of hair's coverage.
+    (None: 3 mm, or two voxels, of a hull 12 mm): give more where pixels are wider. `radius` of the
+    strands; None takes the one that keeps a head of hair's coverage.
     """
 
     held_out: tuple[str, ...] = ()
