@@ -10,7 +10,19 @@ import pytest
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from reconstruction import Camera, Capture, CaptureError, Light, Mesh, Rig, Stage
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureError,
+    Light,
+    Mesh,
+    Model,
+    Report,
+    Rig,
+    Stage,
+    read_obj,
+    silent,
+)
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh_queries import mesh_depth, surface_samples
@@ -19,6 +31,8 @@ from reconstruction.head.capture_head import fit_capture_head, lit_skin_points
 from reconstruction.head.generic import generic_head
 from reconstruction.head.lit_skin import integrated, lit_skin, matte_normals
 from reconstruction.masks import HairMask, MaskedCapture
+from reconstruction.pipeline import _Stages
+from reconstruction.reconstruct_options import ReconstructOptions
 
 LIGHTS = tuple(
     Light(f"l{i:02d}", p, np.full(3, 2.0)) for i, p in enumerate(dome_positions(60, 1.2, -40.0))
@@ -140,6 +154,25 @@ def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -
     fitted = fit_capture_head(found, None, Stage("head")).mesh
     scalp = head.vertices[np.unique(head.faces[head.scalp])]
     assert np.median(ClosestPoint(fitted, 8e-3)(scalp)[2]) < 3e-3
+
+
+def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
+    head: Mesh, tmp_path: Path
+) -> None:
+    def found(mesh: Mesh) -> tuple[Any, Stage]:
+        capture, report = Shaded(mesh, around(160), LIGHTS), Report()
+        stages = _Stages(Model(tmp_path), ReconstructOptions(grid=3e-3), silent, report)
+        return stages.head_by_light(MaskedCapture(capture, capture.masks)), report.stages[-1]
+
+    mine, stage = found(head)
+    assert mine is not None
+    assert not stage.warnings
+    assert read_obj(tmp_path / "head.obj").vertices.shape == mine.mesh.vertices.shape
+    flat = Mesh(head.vertices * [1.0, 0.6, 1.0], head.faces, head.scalp)
+    none, stage = found(flat)
+    assert none is None
+    assert "no head is taken from it; give head.obj" in stage.warnings[-1]
+    assert not (tmp_path / "head.obj").exists()
 
 
 def test_few_lights_or_little_skin_tell_nothing(head: Mesh) -> None:
