@@ -1,9 +1,10 @@
-"""Which pixels are hair and which are skin: the user's word, else geometry, else the light.
+"""Which pixels are hair and which are skin: the user's word, else the light, else geometry.
 
 Hair is wherever the user's mask says so, or else the user's network, of what is lit. Without one,
-a pixel whose triangulated point stands off the head, or that shows the subject where the head is
-not, is hair. What these look like, and what is matte, tells the pixels on the head, in all cameras
-together: `hair_features`. Without a head mesh, gloss and the fineness of lines do.
+what pixels look like tells them, in all cameras together, where they are two clear classes:
+`hair_features`. Where they are not, a pixel whose triangulated point stands off the head, or that
+shows the subject where the head is not, is an example of hair. Without a head mesh, gloss and the
+fineness of lines are split by themselves.
 """
 
 from __future__ import annotations
