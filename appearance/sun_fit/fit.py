@@ -24,6 +24,7 @@ from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
 from appearance.sun_fit.highlights import BESIDE, WINDOW, Highlight, Highlights, beside
 from appearance.sun_fit.light_correlation import (
+    Disorder,
     Roughness,
     disordered,
     match_disorder,
@@ -70,6 +71,9 @@ DISORDER = 1.6
 """
 CHANGED = 0.99
 """Of the β_M to render with, what that of the fibres must fall below for a warning."""
+UNTOLD_DEG = 10.0
+"""Degrees that a disorder and its error must exceed together for the same warning: orderly hair on
+strands as orderly had 6, hair whose fibres came out a quarter too rough 12 to 36."""
 SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
 ROUGHNESS_PIXELS = 350
@@ -209,6 +213,14 @@ def _beside(pixels: Ints, mask: Bools) -> Ints:
     return found[mask.ravel()[found]]
 
 
+def doubtful(as_are: float, fibres: float, disorder: Disorder) -> bool:
+    """Whether hair may be so much more disordered than strands that the `fibres`' β_M is in doubt.
+
+    `as_are` is the β_M to render the strands with.
+    """
+    return fibres < CHANGED * as_are or disorder.degrees + disorder.error > UNTOLD_DEG
+
+
 def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
     """Leave out the lights that reach no hair pixel of any camera."""
     hair, noise = pixels.hair, 0.0
@@ -323,11 +335,11 @@ class SunFit:
             off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
             scene = self.disordered(float(np.radians(off)))
             fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
-            if disorder is not None and fibres.beta_m < CHANGED * as_are.beta_m:
+            if disorder is not None and doubtful(as_are.beta_m, fibres.beta_m, disorder):
                 stage.warn(
-                    f"single hairs turn by {disorder.degrees:.0f}° more than the strands, by what "
-                    "pixels beside each other tell, and may turn more within a pixel: the fibres' "
-                    f"β_M, {fibres.beta_m:.2f}, may be too large"
+                    f"single hairs turn by {disorder.degrees:.0f} ± {disorder.error:.0f}° more "
+                    "than the strands, by what pixels beside each other tell, and may turn more "
+                    f"within a pixel: the fibres' β_M, {fibres.beta_m:.2f}, may be too large"
                 )
         stage.figures |= {
             "samples": count,

@@ -10,7 +10,9 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
+from appearance.sun_fit.fit import doubtful
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
+from appearance.sun_fit.light_correlation import Disorder
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
     Camera,
@@ -261,6 +263,21 @@ def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
     path.unlink()
     with pytest.raises(ModelError, match="hairstage fit"):
         FittedAppearance.load(model)
+
+
+@pytest.mark.parametrize(
+    ("as_are", "fibres", "degrees", "error", "told"),
+    [
+        (0.303, 0.297, 4.5, 1.4, True),  # changed by 2 %
+        (0.300, 0.299, 4.5, 1.4, False),
+        (0.349, 0.349, 2.9, 16.3, True),  # of true 0.28: nothing was found, and nothing is known
+        (0.350, 0.349, 0.0, 9.0, False),
+    ],
+)
+def test_a_disorder_that_may_be_large_puts_the_roughness_in_doubt(
+    as_are, fibres, degrees, error, told
+):
+    assert doubtful(as_are, fibres, Disorder(degrees, error, 24.0)) is told
 
 
 def test_hair_pixels_that_lie_apart_tell_of_no_disorder(made, tmp_path):
