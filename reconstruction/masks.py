@@ -54,7 +54,8 @@ MOST_DISAGREEMENT = 0.15
 class HairMask:
     """One camera's pixels `(H, W) bool`: `subject` is the union of `hair` and `skin`, no overlap.
 
-    `source` says who told hair from skin: "geometry" has learned from it what hair looks like, with
+    `source` says who told hair from skin: "light and lines" by looks alone, "geometry" by looks
+    with a head, which has given examples of hair where looks were no two clear classes; with
     "geometry alone" all of the head looks like one thing. `decided` is the share of the subject
     that it decided, the rest follows its neighbours.
     """

@@ -199,18 +199,19 @@ class _Stages:
                 points = lit_skin_points(masked, subject_hull(masked, self.options.grid))
                 seed = self.options.seed
                 head = fit_capture_head(points, self.options.head_mesh, stage, seed=seed)
+                off = stage.figures["posed_rms_mm"]
+                if off > UNLIKE_MM:
+                    raise CaptureError(
+                        f"the face is {off:.1f} mm off the template's, more than {UNLIKE_MM:g}"
+                    )
             except CaptureError as error:
-                stage.warn(f"no head is found under single lights: {error}")
-                self.model.remove("head.obj")
-                return None
-            off = stage.figures["posed_rms_mm"]
-            if off > UNLIKE_MM:
                 stage.warn(
-                    f"the face under single lights is {off:.1f} mm off the template's, more than "
-                    f"{UNLIKE_MM:g}: no head is taken from it; give head.obj or scalp points"
+                    f"no head is taken from single lights, no strand has a root: {error}: give "
+                    "head.obj, or scalp points as scalp.obj"
                 )
                 self.model.remove("head.obj")
                 return None
+            self.progress(f"head: a template under {points.source}", 0.0)
             self.model.write_head(head.mesh)
         return head
 

@@ -84,6 +84,11 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
     `CaptureError` where too few are left to fit a head to.
     """
     capture, masks = masked.capture, masked.masks
+    if not len(cloud):
+        raise CaptureError(
+            f"{capture.path}: no head.obj, and no sweep to find a head by: give head.obj or "
+            "scalp.obj, or take the method auto, which looks for a face under single lights"
+        )
     skin, hair = np.zeros((2, len(cloud)), bool)
     for index, name in enumerate(cloud.cameras):
         if name not in masks:

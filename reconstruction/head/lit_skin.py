@@ -118,7 +118,7 @@ def integrated(camera: Camera, region: Bools, normals: Array) -> tuple[Array, Ar
     rays = camera.rays(np.stack([x, y], axis=1)) @ camera.R.T
     rays /= rays[:, 2:]
     facing = -(n * rays).sum(axis=1)
-    slope = n[:, :2] / (np.diag(camera.K)[:2] * np.maximum(facing, 0.1)[:, None])
+    slope = n[:, :2] @ np.linalg.inv(camera.K[:2, :2]) / np.maximum(facing, 0.1)[:, None]
     follows = facing > _GRAZING
     rows, columns, entries, wanted = [], [], [], []
     count = 0

@@ -79,9 +79,9 @@ def test_a_face_without_a_head_is_bare_and_hides_no_hair() -> None:
     assert rest.contains(np.stack([before, middle])).all()
     assert not (hull.inside & bare).any()
     off = np.linalg.norm(hull.centers(), axis=1)
-    assert off.min() > RADIUS - 0.035  # rays through a ball's rim are longer in the shell than deep
+    assert off.min() > RADIUS - 0.03  # rays through a ball's rim are longer in the shell than deep
     from_behind = depths["c4"][60, 60]
-    assert from_behind == pytest.approx(np.hypot(1.2, 0.3) - RADIUS, abs=6e-3)
+    assert from_behind == pytest.approx(np.hypot(1.2, 0.3) - RADIUS, abs=3.4e-3)
     assert depths["c0"][60, 60] == 0  # a pixel of skin
 
 
@@ -106,7 +106,7 @@ def test_without_any_skin_all_of_the_hull_can_be_hair() -> None:
     hull, bare, _ = build_hull(ball_capture(face=1.0), grid=3e-3, stage=Stage("envelope"))
     assert hull.contains(np.zeros((1, 3)))[0]
     assert not bare.any()
-    assert hull.inside.sum() * 3e-3**3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.15)
+    assert hull.inside.sum() * 3e-3**3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.04)
 
 
 OCTAHEDRON = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])

@@ -55,11 +55,11 @@ def test_normals_stand_against_shadows_and_highlights_and_near_lights() -> None:
     values += matte.max() * (rng.random(matte.shape) < 0.03)
     found = matte_normals(values, to_light)
     angles = np.degrees(np.arccos(np.clip((found * normals).sum(axis=1), -1, 1)))
-    assert np.quantile(angles, 0.95) < 1.0
+    assert np.quantile(angles, 0.95) < 0.1
     cut = np.minimum(matte, 0.2)  # where the sensor is full
     known = matte_normals(cut, to_light, matte < 0.2)
     angles = np.degrees(np.arccos(np.clip((known * normals).sum(axis=1), -1, 1)))
-    assert np.quantile(angles, 0.95) < 1.0
+    assert np.quantile(angles, 0.95) < 0.1
     assert not matte_normals(np.zeros((2, 60)), to_light[:2]).any()
 
 
@@ -77,7 +77,7 @@ def test_the_integral_of_a_ball_is_the_ball_and_two_balls_are_two_pieces() -> No
     one, depth, normals = ball(np.zeros(3), 0.09)
     facing = one & ((normals * -rays).sum(axis=-1) > 0.4)
     log_depth, piece = integrated(camera, facing, normals[facing])
-    assert np.ptp(log_depth - np.log(depth[facing])) < 2e-3  # of 1 m: the ball is 55 mm deep
+    assert np.ptp(log_depth - np.log(depth[facing])) < 1.7e-4  # of 1 m: the ball is 55 mm deep
     assert len(np.unique(piece)) == 1
     behind, _, far = ball(np.array([0.04, 0.3, 0.05]), 0.12)
     both = one | behind
@@ -153,7 +153,7 @@ def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -
     assert np.median(apart) < 2e-3
     fitted = fit_capture_head(found, None, Stage("head")).mesh
     scalp = head.vertices[np.unique(head.faces[head.scalp])]
-    assert np.median(ClosestPoint(fitted, 8e-3)(scalp)[2]) < 3e-3
+    assert np.median(ClosestPoint(fitted, 8e-3)(scalp)[2]) < 2e-3
 
 
 def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
@@ -171,7 +171,7 @@ def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
     flat = Mesh(head.vertices * [1.0, 0.6, 1.0], head.faces, head.scalp)
     none, stage = found(flat)
     assert none is None
-    assert "no head is taken from it; give head.obj" in stage.warnings[-1]
+    assert "off the template's, more than 3: give head.obj" in stage.warnings[-1]
     assert not (tmp_path / "head.obj").exists()
 
 
