@@ -267,7 +267,7 @@ class _Probe:
             (8 * min(lights, 1.5 * LOOKS) / len(self.cameras) + 40) * hair / GB,
         )
         if method in ("photometric", "lmvs"):
-            lines = self._line_stereo(add, method)
+            _, lines = self._line_stereo(add, method)
             add("strands", table=3e-5 * lines, gb=7e-6 * lines)
             return out
         if method != "hull" and not known:
@@ -280,22 +280,23 @@ class _Probe:
         add("envelope", table=2 + each * len(self.cameras) * volume, gb=0.3 * volume)
         if lights:
             self._orientation(add)
-        lines = 0.0
+        found, lines = 0.0, 0.0
         if method == "hull":
             sees = lights > 0 and self.pixel <= FINE_PIXEL
             place = len(out)
-            lines = self._line_stereo(add, method) if sees else 0.0
+            if sees:
+                found, lines = self._line_stereo(add, method)
             add("line stereo", table=2e-5 * lines, gb=5e-7 * hair if sees else 0.0)
             out.insert(place, out.pop())
         else:
             add("surface", table=8e-9 * n * n if sweep else 0.0, gb=8e-6 * n if sweep else 0.0)
             if method == "fused":
-                lines = self._line_stereo(add, method)
+                found, lines = self._line_stereo(add, method)
         grown = (3.0 if bare else 1.2) * volume + 7e-6 * n + 5e-6 * lines
         if sweep:
             grown = 0.6 + 2e-5 * n
         traced = (30 if bare else 16) * volume + 1.2e-4 * n + 1e-4 * lines
-        add("field", table=7.5 * volume, gb=1.2 * volume)
+        add("field", table=7.5 * volume + 2e-6 * (n + found), gb=1.2 * volume)
         add("strands", table=traced, gb=grown)
         if bare:
             return out
@@ -322,8 +323,8 @@ class _Probe:
 
     def _line_stereo(
         self, add: Callable[[str, float, float, float], None], method: Method
-    ) -> float:
-        """Add its stages; returns how many lines views are expected to agree on."""
+    ) -> tuple[float, float]:
+        """Add its stages; returns how many lines views will agree on, and those traced through."""
         cameras, lights, hair = len(self.cameras), self.lights, self.hair
         frames, bank = self.frames("olat"), self.options.light_codes.bank
         measured = frames * (self.again + self.filtering(bank))
@@ -344,7 +345,7 @@ class _Probe:
         found, lines = lines, min(lines, MOST_LINES)
         add("segments", 0.0, (4e-7 + 5e-8 / (os.cpu_count() or 2) * cameras) * hair, 5e-7 * hair)
         add("connection", 0.0, 5e-6 * found + 8e-5 * lines, 5e-7 * hair)
-        return lines
+        return found, lines
 
     def row(self) -> float:
         """Seconds that one row of a sweep takes in one camera: of some in three places."""

@@ -184,14 +184,19 @@ def gather(
     number[grid.inside] = np.arange(int(grid.inside.sum()))
     index = grid.index(points)
     q = (np.asarray(points, float) - grid.origin) / grid.spacing
-    best, distance = np.full(len(index), -1, np.int64), np.full(len(index), np.inf)
+
+    def numbered(ijk: Ints) -> Ints:
+        on = ((ijk >= 0) & (ijk < np.array(number.shape))).all(axis=1)
+        return np.where(on, number[tuple(np.where(on[:, None], ijk, 0).T)], -1)
+
+    best = numbered(index)
+    off = np.flatnonzero(best < 0)
+    distance = np.full(len(off), np.inf)
     for shift in np.ndindex(3, 3, 3):
-        moved = index + np.array(shift) - 1
-        on = ((moved >= 0) & (moved < np.array(number.shape))).all(axis=1)
-        n = np.where(on, number[tuple(np.where(on[:, None], moved, 0).T)], -1)
-        far = np.linalg.norm(q - moved, axis=1)
+        moved = index[off] + np.array(shift) - 1
+        n, far = numbered(moved), np.linalg.norm(q[off] - moved, axis=1)
         nearer = (n >= 0) & (far < distance)
-        best[nearer], distance[nearer] = n[nearer], far[nearer]
+        best[off[nearer]], distance[nearer] = n[nearer], far[nearer]
     ok = (best >= 0) & (np.asarray(weights) > 0)
     voxels, member = np.unique(best[ok], return_inverse=True)
     w = np.asarray(weights, float)[ok]
