@@ -12,7 +12,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +30,7 @@ from reconstruction.reading import read_json
 from stage_service.config import RigFile
 from stage_service.records.events import EventLog
 from stage_service.service_models import BoardSize, CalibrationRequest
+from stage_service.signals import tied
 
 LEAST = 6
 """Corners that tell a board's pose."""
@@ -104,22 +107,13 @@ class Calibrating:
         words += ["--keep-lens"] if request.keep_lens else []
         command = [sys.executable, "-m", "stage_service.cli", "calibrate", "rig", "--json"]
         self._folder.mkdir(parents=True, exist_ok=True)
+        started: Future[subprocess.Popen[str]] = Future()
+        work = partial(self._run, [*command, *map(str, words)], made, started)
         with self._lock:
             self._end()
-            with (self._folder / "log").open("w") as log:
-                self._process = subprocess.Popen(
-                    [*command, *map(str, words)],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=log,
-                    text=True,
-                    start_new_session=True,
-                )
-            with suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, self._process.pid, LOWER)
+            threading.Thread(target=work, name="calibration", daemon=True).start()
+            self._process = started.result()
             self._view = CalibrationView(state="running", started=utc_now(), request=request)
-            follow = threading.Thread(target=self._follow, args=(self._process, made), daemon=True)
-            follow.start()
         self._events.publish("calibration.state", {"state": "running"})
         return self.view()
 
@@ -134,7 +128,26 @@ class Calibrating:
             process.kill()
             process.wait()
 
-    def _follow(self, process: subprocess.Popen[str], made: Path) -> None:
+    def _run(
+        self, command: list[str], made: Path, started: Future[subprocess.Popen[str]]
+    ) -> None:
+        """Start the process, on the thread that it is tied to, and learn what comes of it."""
+        try:
+            with (self._folder / "log").open("w") as log:
+                process = subprocess.Popen(
+                    tied(command, "KILL"),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    text=True,
+                    start_new_session=True,
+                )
+        except Exception as error:  # whoever asked has to know
+            started.set_exception(error)
+            return
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, process.pid, LOWER)
+        started.set_result(process)
         answer, _ = process.communicate()
         with self._lock:
             if self._process is not process:  # it was ended, by the next one or by the service

@@ -45,3 +45,11 @@ def until(what: Callable[[], T], seconds: float | None = None, *, pause: float =
         assert time.monotonic() < deadline, f"it did not happen within {seconds:g} s"
         time.sleep(pause)
     return found
+
+
+def gone(pid: int) -> bool:
+    """Whether that process has ended, whoever has still to take note of it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -13,7 +16,7 @@ import numpy as np
 import pytest
 from serving import Client, serving, slug
 from shooting import shoot
-from waiting import until
+from waiting import gone, until
 
 from reconstruction import Camera, Light, Rig, Step
 from reconstruction.calibration.boards import Board
@@ -100,3 +103,33 @@ def test_the_rig_that_comes_of_it_and_why_none_does(truth, http, tmp_path):
     view = until(lambda: v if (v := ask.get("/calibration").json())["state"] == "failed" else None)
     assert "cam_0: sees 8 or more corners of the board in 1" in view["error"]
     assert view["rig"], "that of before is still there"
+
+
+def test_one_that_runs_ends_with_a_service_that_is_killed(nominal, tmp_path):
+    if shutil.which("setpriv") is None:
+        pytest.skip("there is no setpriv here: children outlive a service that is killed")
+    code = """
+import os, signal, sys, time
+from pathlib import Path
+from stage_service.calibrating import Calibrating
+from stage_service.config import load_rig_file
+from stage_service.records.events import EventLog
+from stage_service.service_models import CalibrationRequest
+
+root = Path(sys.argv[1])
+one = Calibrating(root / "calibration", load_rig_file(root / "nominal.json"), EventLog())
+one.begin(CalibrationRequest(boards=["pose"]), lambda _: root / "pose")
+child = one._process.pid
+while b"setpriv" in Path(f"/proc/{child}/cmdline").read_bytes():
+    time.sleep(0.01)
+os.kill(child, signal.SIGSTOP)  # it would end by itself otherwise
+print(child, flush=True)
+time.sleep(600)
+"""
+    (tmp_path / "nominal.json").write_text(json.dumps(nominal.to_dict()))
+    words = [sys.executable, "-c", code, tmp_path]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
+        assert service.stdout is not None
+        child = int(service.stdout.readline())
+        service.kill()
+    until(lambda: gone(child))

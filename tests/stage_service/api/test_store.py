@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import pytest
 from serving import Client, serving, slug
-from waiting import until
+from waiting import gone, until
 
 from reconstruction import Capture, Model, verify
 from stage_service.acquisition.states import CaptureStatus
@@ -262,9 +262,9 @@ time.sleep(600)
     words = [sys.executable, "-c", code, tmp_path]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
         assert service.stdout is not None
-        stat = Path(f"/proc/{int(service.stdout.readline())}/stat")
+        child = int(service.stdout.readline())
         service.kill()
-    until(lambda: not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX")
+    until(lambda: gone(child))
 
 
 def test_what_was_not_read_for_long_is_read_again_by_itself(rig_file, tmp_path):
