@@ -128,9 +128,7 @@ class Calibrating:
             process.kill()
             process.wait()
 
-    def _run(
-        self, command: list[str], made: Path, started: Future[subprocess.Popen[str]]
-    ) -> None:
+    def _run(self, command: list[str], made: Path, started: Future[subprocess.Popen[str]]) -> None:
         """Start the process, on the thread that it is tied to, and learn what comes of it."""
         try:
             with (self._folder / "log").open("w") as log:

@@ -23,6 +23,7 @@ from stage_service.acquisition.states import (
     State,
     WrongState,
     possible,
+    read_status,
 )
 from stage_service.captures.capture_run import CaptureRun, Tally, plan_of
 from stage_service.captures.catalogue import Catalogue
@@ -64,10 +65,10 @@ class CaptureManager:
 
     `on_complete(status)` is called on that thread when a capture is done with outcome "completed".
     What lies there already is in its `catalogue`, without a manifest as interrupted, unreadable as
-    damaged. Constructing connects to nothing and reads no capture; `start`, `devices`,
-    `blackout` and `darken` talk to the stage, all through one `DeviceSet`. Raises `RootInUse` while
-    another manager has this root, `StageInUse` while one on this machine has the stage; `take_over`
-    says that one on another machine has it no more.
+    damaged. Constructing connects to nothing and reads no capture but the snapshot; `start`,
+    `devices`, `blackout` and `darken` talk to the stage, all through one `DeviceSet`. Raises
+    `RootInUse` while another manager has this root, `StageInUse` while one on this machine has the
+    stage; `take_over` says that one on another machine has it no more.
 
     A blackout that could not be verified is latched (`latch`): nothing is lit until that is over.
     `audit` is where the captures' ends and the latch are recorded.
@@ -110,6 +111,8 @@ class CaptureManager:
         self._shooting = root / "shooting"  # names the capture under way
         self.died_in = _text(self._shooting)  # in which a service ended, until the next
         self.catalogue = Catalogue(self.folder, root / "captures.index")
+        if (root / SNAPSHOT).is_dir():
+            self.catalogue.put(read_status(root / SNAPSHOT))
         self._tally = Tally()
         self._looked = -APART_S
         self._stay_on_exit = off_on_exit(self.close)

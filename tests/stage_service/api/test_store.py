@@ -238,6 +238,17 @@ def test_a_snapshot_is_nothing_to_keep(http):
     assert http.get("/trash").json() == []
 
 
+def test_a_snapshot_is_there_until_the_next_one_whatever_becomes_of_the_service(rig_file, tmp_path):
+    root = tmp_path / "root"
+    with serving(rig_file, root) as http:
+        http.post("/snapshot", json={"light": "light_003"})
+        until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
+    with serving(rig_file, root) as http:
+        assert http.get("/captures/snapshot").json()["outcome"] == "completed"
+        assert http.get("/captures/snapshot/steps").json()[0]["light"] == "light_003"
+        assert http.get("/captures").json() == []
+
+
 def test_what_reads_a_capture_again_ends_with_a_service_that_is_killed(tmp_path):
     if shutil.which("setpriv") is None:
         pytest.skip("there is no setpriv here: children outlive a service that is killed")
