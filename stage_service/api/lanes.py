@@ -45,7 +45,8 @@ class Lanes:
                 )
         except TimeoutError:
             raise JobsUnavailable(
-                f"the job database has not answered within {DATABASE_S:g} s"
+                f"job database or disk has not answered within {DATABASE_S:g} s: what was asked "
+                "may still be done, look before you ask again"
             ) from None
 
 
