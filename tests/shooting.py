@@ -1,13 +1,16 @@
-"""Captures of a prop without the wires: for calibrations, whose devices are tested elsewhere."""
+"""Captures of a prop without the wires, and what one believes of the stage: for calibrations."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from reconstruction import Capture, CaptureWriter, Rig, Step
+from reconstruction import Camera, Capture, CaptureWriter, Rig, Step
 from reconstruction.capture.folder import FrameRecord
 from simulators.frames.frames import FrameMaker, Sensor, Snapshot
 from simulators.frames.responses import Responder
@@ -60,3 +63,25 @@ def shoot(
     writer.commit(records)
     writer.finish("completed")
     return Capture(path)
+
+
+def believed(rig: Rig, seed: int = 1) -> Rig:
+    """What one believes of a stage: 1 cm, 1.5°, 4 % of focal lengths and 3 cm of lamps off."""
+    rng = np.random.default_rng(seed)
+
+    def off(device: Any) -> Any:
+        turn = Rotation.from_rotvec(rng.normal(0, np.radians(1.5), 3)).as_matrix()
+        center = device.center + rng.normal(0, 0.01, 3)
+        K = device.K.copy()
+        K[0, 0], K[1, 1] = 1.04 * K[0, 0], 1.03 * K[1, 1]
+        K[:2, 2] += rng.normal(0, 3, 2)
+        R = turn @ device.R
+        lens = {"distortion": np.zeros(5)} if isinstance(device, Camera) else {}
+        return replace(device, K=K, R=R, t=-R @ center, **lens)
+
+    lights = tuple(
+        replace(x, position=x.position + rng.normal(0, 0.03, 3), intensity=np.ones(3))
+        for x in rig.lights
+    )
+    cameras, beams = (tuple(map(off, d)) for d in (rig.cameras, rig.projectors))
+    return Rig("nominal", cameras, lights, beams)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,24 +25,20 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     By light: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
     Devices are matched by name; raises `KeyError` for one that `truth` lacks.
     """
-    ball = _ball()
-    frame = _align(found, truth, ball)
+    ball, found = _ball(), aligned(found, truth)
     cameras = {}
-    for c in found.cameras:
-        ours, true = frame.inverse().seen_by(c), truth.camera(c.name)
+    for ours in found.cameras:
+        true = truth.camera(ours.name)
         off = np.linalg.norm(ours.project(ball)[0] - true.project(ball)[0], axis=1)
-        cameras[c.name] = {
+        cameras[ours.name] = {
             "reprojection_px": [float(off.mean()), float(off.max())],
             "centre_mm": 1e3 * float(np.linalg.norm(ours.center - true.center)),
             "turn_deg": _turn_deg(ours, true),
         }
-    projectors = {
-        p.name: _rows(frame.inverse().seen_by(p), truth.projector(p.name), ball)
-        for p in found.projectors
-    }
+    projectors = {p.name: _rows(p, truth.projector(p.name), ball) for p in found.projectors}
     lights = {}
     for light in found.lights:
-        place, real = frame(light.position), truth.light(light.name)
+        place, real = light.position, truth.light(light.name)
         distance = float(np.linalg.norm(real.position))
         cosine = place @ real.position / (np.linalg.norm(place) * distance)
         strength = light.intensity.mean() / max(float(real.intensity.mean()), 1e-300)
@@ -53,8 +50,12 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     return {"cameras": cameras, "projectors": projectors, "lights": lights}
 
 
-def _align(found: Rig, truth: Rig, ball: Array) -> Rigid:
-    """The motion after which `ball` is seen alike: poses alone trade turns for principal points."""
+def aligned(found: Rig, truth: Rig) -> Rig:
+    """`found`, moved to where its cameras see a head-sized ball of points most as `truth`'s do.
+
+    Poses alone trade turns for principal points. Raises `KeyError` as `compare_rigs`.
+    """
+    ball = _ball()
     same = [truth.camera(c.name) for c in found.cameras]
     start = align_devices(found.cameras, same)
     true = [c.project(ball)[0] for c in same]
@@ -64,7 +65,13 @@ def _align(found: Rig, truth: Rig, ball: Array) -> Rigid:
         off = [c.project(back(ball))[0] - p for c, p in zip(found.cameras, true, strict=True)]
         return np.concatenate(off).ravel()
 
-    return Rigid.from_vector(minimise(numeric(residual), np.zeros(6)).x) @ start
+    back = (Rigid.from_vector(minimise(numeric(residual), np.zeros(6)).x) @ start).inverse()
+    return replace(
+        found,
+        cameras=tuple(map(back.seen_by, found.cameras)),
+        lights=tuple(x.moved(back.rotation, back.translation) for x in found.lights),
+        projectors=tuple(map(back.seen_by, found.projectors)),
+    )
 
 
 def _ball() -> Array:

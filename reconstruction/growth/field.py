@@ -186,7 +186,7 @@ def gather(
     q = (np.asarray(points, float) - grid.origin) / grid.spacing
 
     def numbered(ijk: Ints) -> Ints:
-        on = ((ijk >= 0) & (ijk < np.array(number.shape))).all(axis=1)
+        on: Bools = np.asarray(((ijk >= 0) & (ijk < np.array(number.shape))).all(axis=1))
         return np.where(on, number[tuple(np.where(on[:, None], ijk, 0).T)], -1)
 
     best = numbered(index)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from benchmarks.light_planes.growth_study import compare_growth
 from benchmarks.light_planes.motion_errors import motion_errors, true_motion
 from benchmarks.light_planes.solver_study import compare_solvers
 from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangulation
+from benchmarks.light_planes.without_help import calibrated, copied, rig_errors
 from benchmarks.pictures import picture_model, picture_motion
 from benchmarks.results import save
-from benchmarks.strand_truth import StrandTruth
+from benchmarks.strand_truth import StrandTruth, write_hair_masks
 from reconstruction import (
     Capture,
     Model,
@@ -63,11 +65,13 @@ def study(
     case: SubjectCaptures,
     options: ReconstructOptions,
     *,
+    without_help: bool = False,
     studies: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """One subject, still and drifting, and baselines; leaves models and `OUT/result.json`.
 
+    `without_help` adds what head and rig are worth that come from elsewhere, and true masks.
     `studies` adds what one subject is enough for: the motion's worth in strands, error against run
     time of motion, field and growth, and how stages grow.
     """
@@ -84,6 +88,10 @@ def study(
         "stages": {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb} for s in report.stages},
     }
     save(out / "result.json", result)
+    if without_help:
+        with TemporaryDirectory(dir=case.still[0].parent) as folder:  # links stay on one disk
+            result["calibration"] = _without_help(runs, case, Path(folder))
+        save(out / "result.json", result)
     if case.drifting is not None:
         moving = Capture(case.drifting[0])
         known = true_motion(moving, case.drifting[1])
@@ -126,6 +134,20 @@ class _Runs:
         seconds = time.perf_counter() - begin
         self.scores[name] = {**self.truth.score(model.strands()), "seconds": seconds}
         return report
+
+
+def _without_help(runs: _Runs, case: SubjectCaptures, folder: Path) -> dict[str, float]:
+    """Adds the rows; returns how far off the calibrated rig is."""
+    capture, to = Capture(case.still[0]), folder / "capture"
+    runs.progress("calibrating", 0.0)
+    rig = calibrated(capture.rig)
+    given = copied(capture, to)
+    write_hair_masks(given, case.still[1])
+    runs.add("true masks", Capture(to))
+    runs.add("laid head", copied(capture, to, head=False))
+    runs.add("calibrated rig", copied(capture, to, rig=rig))
+    runs.add("without help", copied(capture, to, rig=rig, head=False))
+    return rig_errors(rig, capture.rig)
 
 
 def motion_study(

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from shooting import shoot
+from shooting import believed, shoot
 
 from reconstruction import Camera, Capture, Light, Projector, Rig, Step
 from reconstruction.calibration.boards import Board, Sighting
@@ -54,25 +53,8 @@ def true_rig() -> Rig:
 
 @pytest.fixture(scope="session")
 def nominal_rig(true_rig: Rig) -> Rig:
-    """What one believed: 1 cm, 1.5°, 4 % of the focal length and 3 cm of the lamps off."""
-    rng = np.random.default_rng(1)
-
-    def off(device: Any) -> Any:
-        turn = Rotation.from_rotvec(rng.normal(0, np.radians(1.5), 3)).as_matrix()
-        center = device.center + rng.normal(0, 0.01, 3)
-        K = device.K.copy()
-        K[0, 0], K[1, 1] = 1.04 * K[0, 0], 1.03 * K[1, 1]
-        K[:2, 2] += rng.normal(0, 3, 2)
-        R = turn @ device.R
-        lens = {"distortion": np.zeros(5)} if isinstance(device, Camera) else {}
-        return replace(device, K=K, R=R, t=-R @ center, **lens)
-
-    lights = tuple(
-        replace(x, position=x.position + rng.normal(0, 0.03, 3), intensity=np.ones(3))
-        for x in true_rig.lights
-    )
-    cameras, beams = (tuple(map(off, d)) for d in (true_rig.cameras, true_rig.projectors))
-    return Rig("nominal", cameras, lights, beams)
+    """What one believed."""
+    return believed(true_rig)
 
 
 @pytest.fixture(scope="session")
