@@ -117,7 +117,7 @@ def _result(model: Model) -> Html:
         )
         radius = 1e6 * _middle(strands.radius)
         facts.append(("radius", [element("b", f"{radius:.0f} µm"), _coverage_note(radius)]))
-    facts += _material(model)
+    facts += [*_laid_head(model), *_material(model)]
     rows = [joined([element("dt", what), element("dd", *said)]) for what, said in facts]
     text = joined(
         [
@@ -162,6 +162,14 @@ def _by_inverse_rendering(model: Model) -> bool:
     """Whether its maps are a fit's; those of an edited model, which has no report, are not."""
     names = (stage.name for stage in model.report().stages)
     return model.has("hair_maps.npz") and "inverse_rendering" in names
+
+
+def _laid_head(model: Model) -> Iterator[tuple[str, list[str]]]:
+    """Under what a head was laid that nobody measured, and how near it came."""
+    laid = next((s.figures for s in model.report().stages if s.name == "head"), {})
+    if model.has("head.obj") and {"template", "source", "rms_mm"} <= set(laid):
+        said = f": the {laid['template']} laid under {laid['source']}, {laid['rms_mm']:.1f} mm off"
+        yield "head", [link("head.obj"), said]
 
 
 def _material(model: Model) -> Iterator[tuple[str, list[str]]]:

@@ -9,7 +9,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from reconstruction import Model, Report, Strands
+from reconstruction import Mesh, Model, Report, Strands
 from reconstruction.report.report import Series
 from stage_service.cli import main
 from stage_service.model_page import model_page, write_page
@@ -92,6 +92,19 @@ def test_everything_that_is_known_stands_on_the_page(model):
     ):
         assert said.replace("0.280", "0.28") in text, said
     assert text.count("<img src=x onerror=alert(1)>") >= 5  # as text
+
+
+def test_a_head_that_nobody_measured_is_called_what_it_is(model):
+    report = model.report()
+    with report.stage("head") as stage:
+        stage.figures = {"template": "generic head", "source": "skin " + EVIL, "rms_mm": 1.24}
+    model.write_report(report)
+    said = "head.obj: the generic head laid under skin <img"
+    assert said not in Page(model_page(model)).text, "refused: there is no head"
+    model.write_head(Mesh(np.eye(3), np.array([[0, 1, 2]])))
+    text = Page(model_page(model)).text
+    assert said in text
+    assert "1.2 mm off" in text
 
 
 def test_names_and_messages_are_text_and_nothing_runs_or_is_fetched(model):
