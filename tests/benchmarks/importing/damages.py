@@ -2,8 +2,8 @@
 
 One capture of the demo's rig goes through the wires once and is kept. It is written out as pictures
 with COLMAP's text and lights in millimetres, read by `hairstage import`, reconstructed by
-`hairstage reconstruct`, and scored beside the capture itself. Leaves `importing.json` and
-`importing.md`.
+`hairstage reconstruct`, fitted without some lights, and scored beside the capture itself. Leaves
+`importing.json` and `importing.md`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from appearance import HeldOut, assess, fit
+from appearance.model.options import AssessOptions
 from benchmarks.captures import SimulatedCapture
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, within
 from benchmarks.importing.folders import Written, write_folder
@@ -40,6 +42,9 @@ DAMAGES = {
 """All have COLMAP's text and millimetres."""
 
 LEVELS = ("1mm_10deg", "2mm_20deg")
+HELD_OUT = slice(7, None, 16)
+"""Lights that the fit does not see and that its pictures are compared under."""
+COMPARED = AssessOptions(spp=16, relit_size=64, relit_spp=1)
 
 
 def _command(*words: object) -> None:
@@ -50,23 +55,30 @@ def _command(*words: object) -> None:
         raise CommandError(f"{' '.join(map(str, words))}: {done.stderr[-600:]}", done.returncode)
 
 
-def _scored(model: Model, truth: StrandTruth) -> dict[str, Any]:
-    """F in percent over visible and all points, and what the report warns of."""
-    scores, report = truth.score(model.strands()), model.report()
+def _scored(capture: Capture, model: Model, truth: StrandTruth, seed: int) -> dict[str, Any]:
+    """F in percent over visible and all points, pictures of lights left out, and the warnings."""
+    scores = truth.score(model.strands())
+    held_out = HeldOut(lights=tuple(capture.olat_lights()[HELD_OUT]))
+    fit(capture, model, held_out=held_out, seed=seed)
+    pictures = assess(capture, model, held_out=held_out, options=COMPARED, seed=seed)
+    report = model.report()
     return {
         **{part: {k: 100 * scores[part][k]["f"] for k in LEVELS} for part in ("visible", "all")},
+        "pictures": pictures["held_out_lights"],
         "seconds": sum(stage.seconds for stage in report.stages),
         "warnings": [w for stage in report.stages for w in stage.warnings],
     }
 
 
-def _imported(work: Path, seen: Capture, written: Written, args: argparse.Namespace) -> Model:
+def _imported(
+    work: Path, seen: Capture, written: Written, args: argparse.Namespace
+) -> tuple[Capture, Model]:
     """The capture written out, imported and reconstructed by the commands."""
     folder = write_folder(seen, work / "folder", written, args.seed)
     _command("import", folder, "--out", work / "capture", "--json")
     model, options = work / "model", json.dumps(_options(args))
     _command("reconstruct", work / "capture", "--out", model, "--options", options, "--json")
-    return Model(model)
+    return Capture(work / "capture"), Model(model)
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:
@@ -109,21 +121,25 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                 model = Model(Path(work) / "model")
                 options = parse_options(ReconstructOptions, _options(args))
                 reconstruct(seen, model, method="auto", options=options)
+                capture = seen
             else:
-                model = _imported(Path(work), seen, written, args)
-            results["rows"][name] = _scored(model, truth)
+                capture, model = _imported(Path(work), seen, written, args)
+            results["rows"][name] = _scored(capture, model, truth, args.seed)
         save(args.out / "importing.json", results)
         (args.out / "importing.md").write_text(table(results))
     return results
 
 
 def table(results: dict[str, Any]) -> str:
-    """F at both levels over visible points, and what is lost at the finer one, in Markdown."""
+    """F at both levels over visible points, what is lost at the finer one, pictures; Markdown."""
     rows, first = [], results["rows"]["direct"]["visible"][LEVELS[0]]
     for name, row in results["rows"].items():
         fine, coarse = (row["visible"][k] for k in LEVELS)
+        ours, nearest = (row["pictures"][k]["psnr"] for k in ("ours", "three_nearest"))
         rows.append((name, f"{fine:.1f}", f"{coarse:.1f}", f"{fine - first:+.1f}"))
-    return markdown(("written as", "F at 1 mm/10°, %", "F at 2 mm/20°, %", "points at 1 mm"), rows)
+        rows[-1] += (f"{ours:.1f}", f"{nearest:.1f}")
+    head = ("written as", "F at 1 mm/10°, %", "F at 2 mm/20°, %", "points at 1 mm")
+    return markdown((*head, "lights left out, dB", "three nearest lights, dB"), rows)
 
 
 BENCHMARK = Benchmark(run, (CACHE, ONLY))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,8 +49,9 @@ def test_frames_and_rig_survive_the_way_out_and_in(
 
 
 def test_what_is_lost_stands_beside_the_direct_capture() -> None:
-    def row(fine: float) -> dict[str, dict[str, float]]:
-        return {"visible": {"1mm_10deg": fine, "2mm_20deg": 60.0}}
+    def row(fine: float) -> dict[str, Any]:
+        pictures = {"ours": {"psnr": 19.0}, "three_nearest": {"psnr": 17.0}}
+        return {"visible": {"1mm_10deg": fine, "2mm_20deg": 60.0}, "pictures": pictures}
 
     text = table({"rows": {"direct": row(20.0), "16-bit PNG": row(17.5)}})
-    assert "| 16-bit PNG | 17.5 | 60.0 | -2.5 |" in text
+    assert "| 16-bit PNG | 17.5 | 60.0 | -2.5 | 19.0 | 17.0 |" in text
