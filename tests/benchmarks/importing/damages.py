@@ -136,8 +136,8 @@ def table(results: dict[str, Any]) -> str:
     for name, row in results["rows"].items():
         fine, coarse = (row["visible"][k] for k in LEVELS)
         ours, nearest = (row["pictures"][k]["psnr"] for k in ("ours", "three_nearest"))
-        rows.append((name, f"{fine:.1f}", f"{coarse:.1f}", f"{fine - first:+.1f}"))
-        rows[-1] += (f"{ours:.1f}", f"{nearest:.1f}")
+        scores = (f"{fine:.1f}", f"{coarse:.1f}", f"{fine - first:+.1f}")
+        rows.append((name, *scores, f"{ours:.1f}", f"{nearest:.1f}"))
     head = ("written as", "F at 1 mm/10°, %", "F at 2 mm/20°, %", "points at 1 mm")
     return markdown((*head, "lights left out, dB", "three nearest lights, dB"), rows)
 
