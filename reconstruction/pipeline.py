@@ -25,20 +25,12 @@ from reconstruction.growth.hair_envelope import (
     build_envelope,
     build_hull,
     pixel_size,
-    subject_hull,
 )
 from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
-from reconstruction.head.capture_head import (
-    FittedHead,
-    HeadPoints,
-    digitised_points,
-    fit_capture_head,
-    lit_skin_points,
-    skin_points,
-)
-from reconstruction.head.lit_skin import FEWEST_LIGHTS
+from reconstruction.head.capture_head import FittedHead
+from reconstruction.head.heads import Heads
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.images.segmentation import Network
@@ -60,7 +52,6 @@ from reconstruction.tangents.estimate import Measured, measure_tangents
 HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
-UNLIKE_MM = 3.0  # RMS from a face's points to the posed template's: of another head it has 5
 LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
 FINE_PIXEL = 1e-3  # metres: line stereo finds next to nothing on pixels twice as wide
 SPACING = 2e-3  # metres between a strand's points as it is written
@@ -102,7 +93,8 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
     stages.imported(capture)
     whole = stages.undistorted(capture)
     capture = _without(whole, stages.options.held_out)
-    head = stages.known_head(capture)
+    heads = Heads(stages.model, stages.options, stages.progress, stages.report)
+    head = heads.known(capture)
     if method == "auto":
         method = stages.chosen(capture, head)
     cloud = stages.points(capture, motion)
@@ -110,9 +102,9 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
     if method == "photometric" or method == "lmvs":
         stages.seen_strands(masked, head, method)
     elif method == "hull":
-        stages.hull(masked, cloud, head or stages.head_by_light(masked))
+        stages.hull(masked, cloud, head or heads.by_light(masked))
     else:
-        head = head or stages.head_under_skin(masked, cloud)
+        head = head or heads.under_skin(masked, cloud)
         envelope, depths = stages.envelope(masked, cloud, head.mesh)
         measured = stages.tangents(masked, cloud, depths)
         seen, lines = stages.surface(measured, cloud), measured
@@ -174,53 +166,6 @@ class _Stages:
                         f"{name}: {1 - share:.0%} of the picture lie outside the undistorted one"
                     )
         return out
-
-    def known_head(self, capture: Capture) -> FittedHead | None:
-        """The head under the user's scalp points, which win where asked for, or the capture's."""
-        self.report.drop("head")
-        asked = self.options.scalp_points
-        if capture.head is not None and asked is None:
-            return FittedHead(capture.head, None)
-        points = digitised_points(capture, asked)
-        return None if points is None else self._fitted(points)
-
-    def head_under_skin(self, masked: MaskedCapture, cloud: PointCloud) -> FittedHead:
-        """The head under the triangulated points on bare skin."""
-        return self._fitted(skin_points(masked, cloud), cloud)
-
-    def head_by_light(self, masked: MaskedCapture) -> FittedHead | None:
-        """The head under skin whose shape single lights show, None where they show none."""
-        lights = masked.capture.olat_lights()
-        if len(lights) < FEWEST_LIGHTS or not any(m.skin.any() for m in masked.masks.values()):
-            return None
-        with self.report.stage("head") as stage:
-            self.progress("looking for a face", 0.0)
-            try:
-                points = lit_skin_points(masked, subject_hull(masked, self.options.grid))
-                seed = self.options.seed
-                head = fit_capture_head(points, self.options.head_mesh, stage, seed=seed)
-                off = stage.figures["posed_rms_mm"]
-                if off > UNLIKE_MM:
-                    raise CaptureError(
-                        f"the face is {off:.1f} mm off the template's, more than {UNLIKE_MM:g}"
-                    )
-            except CaptureError as error:
-                stage.warn(
-                    f"no head is taken from single lights, no strand has a root: {error}: give "
-                    "head.obj, or scalp points as scalp.obj"
-                )
-                self.model.remove("head.obj")
-                return None
-            self.progress(f"head: a template under {points.source}", 0.0)
-            self.model.write_head(head.mesh)
-        return head
-
-    def _fitted(self, points: HeadPoints, cloud: PointCloud | None = None) -> FittedHead:
-        with self.report.stage("head") as stage:
-            seed = self.options.seed
-            head = fit_capture_head(points, self.options.head_mesh, stage, cloud=cloud, seed=seed)
-            self.model.write_head(head.mesh)
-        return head
 
     def chosen(self, capture: Capture, head: FittedHead | None) -> Method:
         """The method for what the capture holds; the stage `method` says what and which."""

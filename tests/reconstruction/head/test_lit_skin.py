@@ -29,9 +29,9 @@ from reconstruction.geometry.mesh_queries import mesh_depth, surface_samples
 from reconstruction.growth.hair_envelope import subject_hull
 from reconstruction.head.capture_head import fit_capture_head, lit_skin_points
 from reconstruction.head.generic import generic_head
+from reconstruction.head.heads import Heads
 from reconstruction.head.lit_skin import integrated, lit_skin, matte_normals
 from reconstruction.masks import HairMask, MaskedCapture
-from reconstruction.pipeline import _Stages
 from reconstruction.reconstruct_options import ReconstructOptions
 
 LIGHTS = tuple(
@@ -161,8 +161,8 @@ def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
 ) -> None:
     def found(mesh: Mesh) -> tuple[Any, Stage]:
         capture, report = Shaded(mesh, around(160), LIGHTS), Report()
-        stages = _Stages(Model(tmp_path), ReconstructOptions(grid=3e-3), silent, report)
-        return stages.head_by_light(MaskedCapture(capture, capture.masks)), report.stages[-1]
+        heads = Heads(Model(tmp_path), ReconstructOptions(grid=3e-3), silent, report)
+        return heads.by_light(MaskedCapture(capture, capture.masks)), report.stages[-1]
 
     mine, stage = found(head)
     assert mine is not None
