@@ -67,6 +67,15 @@ def test_containers_start_commands_that_there_are_on_files_that_there_are():
         assert f'SYMLINK+="{Path(device).name}"' in rules
 
 
+def test_serial_ports_belong_to_a_group_that_a_container_has_too():
+    """One that only the host has is a number inside, which no user of the image is in."""
+    rules = (DEPLOY / "udev" / "70-hairstage.rules").read_text()
+    service = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["service"]
+    assert set(re.findall(r'GROUP="(\w+)"', rules)) == set(service["group_add"]) == {"dialout"}
+    assert "--groups dialout" in (DEPLOY / "Containerfile").read_text()
+    assert "adduser hairstage dialout" in (DEPLOY.parent / "docs" / "deployment.md").read_text()
+
+
 def test_rig_files_use_the_ports_that_the_udev_rules_name():
     rules = (DEPLOY / "udev" / "70-hairstage.rules").read_text()
     devices = load_rig_file(rig_path("stage331")).devices
