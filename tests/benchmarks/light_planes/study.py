@@ -133,6 +133,7 @@ class _Runs:
         )
         seconds = time.perf_counter() - begin
         self.scores[name] = {**self.truth.score(model.strands()), "seconds": seconds}
+        save(self.out / "result.json", {"scores": self.scores})
         return report
 
 
