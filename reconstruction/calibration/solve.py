@@ -199,7 +199,7 @@ def _lights(
     if captures.diffuse:
         progress("diffuse sphere", 0.7)
         sphere = targets.diffuse_radius, targets.diffuse_albedo
-        shadings = gather_shading(captures.diffuse, cameras, *sphere, names)
+        shadings = gather_shading(captures.diffuse, cameras, *sphere, names, stage.warn)
         shadings = refine_centres(by_name, shadings)
         stage.figures["diffuse_centres"] = next(iter(shadings.values())).centres.tolist()
     found: dict[str, CalibratedLight] = {}
