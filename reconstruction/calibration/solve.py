@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.calibration.boards import Board, CalibrationError, Sighting
+from reconstruction.calibration.rig_comparison import unlike_nominal
 from reconstruction.calibration.shading import refine_centres, shaded_light, with_intensity
 from reconstruction.calibration.solve_cameras import CameraSolution, calibrate_cameras
 from reconstruction.calibration.solve_lights import CalibratedLight, mirrored_lights
@@ -132,6 +133,8 @@ def _cameras(
     for name, rms in found.rms.items():
         if rms > 0.3:
             stage.warn(f"{name}: corners are off by {rms:.2g} px (rms): is the board flat?")
+    for text in unlike_nominal(found.cameras, nominal.cameras, board.square):
+        stage.warn(text)
     return found
 
 
