@@ -81,8 +81,10 @@ def calibrate(
     in the report's stages under `undetermined`.
 
     The world is `nominal`'s: the rigid motion that fits its cameras best. Raises
-    `CalibrationError` where cameras stay open.
+    `CalibrationError` where cameras stay open, or took pictures of another size than `nominal` has.
     """
+    for capture in (*captures.boards, *captures.mirrors, *captures.diffuse):
+        _require_size(nominal, capture)
     report = Report()
     poses = {f"{k:02d} {c.path.name}": c for k, c in enumerate(captures.boards)}
     with report.stage("cameras") as stage:
@@ -96,6 +98,18 @@ def calibrate(
         with report.stage("lights") as stage:
             lights = _lights(nominal, found.cameras, targets, captures, stage, progress)
     return Rig(nominal.name, found.cameras, lights, projectors), report
+
+
+def _require_size(nominal: Rig, capture: Capture) -> None:
+    sizes = {c.name: (c.width, c.height) for c in capture.rig.cameras}
+    for c in nominal.cameras:
+        width, height = sizes.get(c.name, (c.width, c.height))
+        if (width, height) != (c.width, c.height):
+            raise CalibrationError(
+                f"{capture.path}: pictures of {c.name} have {width} × {height} pixels, in the "
+                f"nominal rig they have {c.width} × {c.height}: give the rig file of the stage as "
+                "it was shot, binning and all (--rig)"
+            )
 
 
 def sightings(captures: Mapping[str, Capture], camera: str, board: Board) -> dict[str, Sighting]:

@@ -78,6 +78,15 @@ def test_cameras_with_each_others_names_are_warned_of(
     assert "have two of them each other's name?" in said
 
 
+def test_a_nominal_rig_of_other_pictures_is_refused(
+    nominal_rig: Rig, board_captures: list[Capture]
+) -> None:
+    """The pictures have 288 × 240 pixels; a lens of theirs is none of a picture half as wide."""
+    halved = replace(nominal_rig, cameras=tuple(c.reduced(2) for c in nominal_rig.cameras))
+    with pytest.raises(CalibrationError, match=r"cam_0 have 288 × 240 pixels, .* have 144 × 120"):
+        calibrate(halved, TargetCaptures(board_captures))
+
+
 def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None:
     part = Rig("part", true_rig.cameras[:0:-1], true_rig.lights[2:], ())
     errors = compare_rigs(part, true_rig)
