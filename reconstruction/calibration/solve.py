@@ -28,6 +28,8 @@ from reconstruction.geometry.rig import Rig
 from reconstruction.images.silhouettes import NoSilhouette, lit_image
 from reconstruction.report.report import Progress, Report, Stage, silent
 
+OFF = 1.0  # pixels: highlights of a mirror sphere alone are met better, root mean square
+
 
 @dataclass(frozen=True)
 class TargetCaptures:
@@ -234,6 +236,12 @@ def _lights(
                 "frames, and is the sphere in view?"
             )
         by_mirror, centres, rms = mirrored_lights(by_name, glints, targets.mirror_radius, found)
+        if rms > OFF:
+            stage.warn(
+                f"mirror sphere: highlights are off by {rms:.2g} px (rms): is its radius "
+                f"{1e3 * targets.mirror_radius:g} mm, and does nothing else shine, as a light that "
+                "a camera sees?"
+            )
         for name, one in by_mirror.items():
             found[name] = with_intensity(one, shadings[name]) if name in found else one
         stage.figures.update(

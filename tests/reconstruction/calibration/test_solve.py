@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from reconstruction import Capture, Rig
+from reconstruction.arrays import Bools, Floats
 from reconstruction.calibration.boards import Board, CalibrationError
 from reconstruction.calibration.rig_comparison import compare_rigs
 from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
@@ -85,6 +86,32 @@ def test_a_nominal_rig_of_other_pictures_is_refused(
     halved = replace(nominal_rig, cameras=tuple(c.reduced(2) for c in nominal_rig.cameras))
     with pytest.raises(CalibrationError, match=r"cam_0 have 288 × 240 pixels, .* have 144 × 120"):
         calibrate(halved, TargetCaptures(board_captures))
+
+
+class Glaring(Capture):
+    """A camera sees something that shines more than the mirror, under whatever lamp."""
+
+    def light(self, light: str, camera: str) -> tuple[Floats, Bools]:
+        image, saturated = super().light(light, camera)
+        if camera == "cam_1":
+            image = image.copy()
+            image[20:24, 20:24] = 10 * image.max()
+        return image, saturated
+
+
+def test_what_shines_beside_a_mirror_is_warned_of(
+    nominal_rig: Rig, board_captures: list[Capture], mirror_captures: list[Capture]
+) -> None:
+    """Without it the highlights are met to under half a pixel."""
+    rig = replace(nominal_rig, projectors=())
+    for kind, warned in ((Capture, False), (Glaring, True)):
+        mirrors = [kind(c.path) for c in mirror_captures]
+        _, report = calibrate(rig, TargetCaptures(board_captures, mirrors))
+        stage = report["lights"]
+        assert (stage.figures["highlights_rms_px"] > 10) == warned
+        said = [w for w in stage.warnings if "does nothing else shine" in w]
+        assert len(said) == warned
+        assert all("is its radius 50 mm" in w for w in said)
 
 
 def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None:
