@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,10 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from reconstruction.arrays import Array
 from reconstruction.calibration.least_squares import minimise, numeric
-from reconstruction.geometry.cameras import Pinhole
+from reconstruction.geometry.cameras import Camera, Pinhole
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.rigid_motion import Rigid, align_devices
+
+NOMINAL = 0.03
+"""Metres: what nominal places are off by, all cameras' distances from their middle together."""
+SCALE = 0.05  # of a length: by more, with `NOMINAL`, the board's square is another than told
+ELSEWHERE, TURNED = 0.15, 15.0
+"""Metres and degrees from its nominal place where a camera is taken for another."""
 
 
 def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
@@ -72,6 +79,37 @@ def aligned(found: Rig, truth: Rig) -> Rig:
         lights=tuple(x.moved(back.rotation, back.translation) for x in found.lights),
         projectors=tuple(map(back.seen_by, found.projectors)),
     )
+
+
+def unlike_nominal(found: Sequence[Camera], nominal: Sequence[Camera], square: float) -> list[str]:
+    """Sentences on what of `found` cannot be as in `nominal`, whose cameras are the same in order.
+
+    Of `found` in the frame in which both agree best, by a board with squares of `square` metres: a
+    wrong length of them makes the stage larger or smaller, and what is called by another's name
+    stands elsewhere; neither shows in how well corners are met.
+    """
+    out = []
+    ours, theirs = (np.array([c.center for c in cameras]) for cameras in (found, nominal))
+    a, b = (float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean())) for x in (ours, theirs))
+    if b > NOMINAL and abs(a - b) > max(NOMINAL, SCALE * b):
+        out.append(
+            f"the cameras stand {abs(a / b - 1):.0%} "
+            f"{'further apart' if a > b else 'nearer together'} than in the nominal rig: is a "
+            f"square of the board {1e3 * square:g} mm?"
+        )
+    off = np.linalg.norm(ours - theirs, axis=1)
+    turn = [_turn_deg(*pair) for pair in zip(found, nominal, strict=True)]
+    elsewhere = [
+        f"{c.name} {1e2 * far:.0f} cm, {angle:.0f}°"
+        for c, far, angle in zip(found, off, turn, strict=True)
+        if far > ELSEWHERE or angle > TURNED
+    ]
+    if elsewhere:
+        out.append(
+            f"cameras stand elsewhere than in the nominal rig ({'; '.join(elsewhere)}): have two "
+            "of them each other's name? The world is laid by the nominal places"
+        )
+    return out
 
 
 def _ball() -> Array:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.calibration.boards import Board, CalibrationError, Sighting
+from reconstruction.calibration.rig_comparison import unlike_nominal
 from reconstruction.calibration.shading import refine_centres, shaded_light, with_intensity
 from reconstruction.calibration.solve_cameras import CameraSolution, calibrate_cameras
 from reconstruction.calibration.solve_lights import CalibratedLight, mirrored_lights
@@ -26,6 +27,8 @@ from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig
 from reconstruction.images.silhouettes import NoSilhouette, lit_image
 from reconstruction.report.report import Progress, Report, Stage, silent
+
+OFF = 1.0  # pixels: highlights of a mirror sphere alone are met better, root mean square
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,10 @@ def calibrate(
     in the report's stages under `undetermined`.
 
     The world is `nominal`'s: the rigid motion that fits its cameras best. Raises
-    `CalibrationError` where cameras stay open.
+    `CalibrationError` where cameras stay open, or took pictures of another size than `nominal` has.
     """
+    for capture in (*captures.boards, *captures.mirrors, *captures.diffuse):
+        _require_size(nominal, capture)
     report = Report()
     poses = {f"{k:02d} {c.path.name}": c for k, c in enumerate(captures.boards)}
     with report.stage("cameras") as stage:
@@ -95,6 +100,18 @@ def calibrate(
         with report.stage("lights") as stage:
             lights = _lights(nominal, found.cameras, targets, captures, stage, progress)
     return Rig(nominal.name, found.cameras, lights, projectors), report
+
+
+def _require_size(nominal: Rig, capture: Capture) -> None:
+    sizes = {c.name: (c.width, c.height) for c in capture.rig.cameras}
+    for c in nominal.cameras:
+        width, height = sizes.get(c.name, (c.width, c.height))
+        if (width, height) != (c.width, c.height):
+            raise CalibrationError(
+                f"{capture.path}: pictures of {c.name} have {width} × {height} pixels, in the "
+                f"nominal rig they have {c.width} × {c.height}: give the rig file of the stage as "
+                "it was shot, binning and all (--rig)"
+            )
 
 
 def sightings(captures: Mapping[str, Capture], camera: str, board: Board) -> dict[str, Sighting]:
@@ -132,6 +149,8 @@ def _cameras(
     for name, rms in found.rms.items():
         if rms > 0.3:
             stage.warn(f"{name}: corners are off by {rms:.2g} px (rms): is the board flat?")
+    for text in unlike_nominal(found.cameras, nominal.cameras, board.square):
+        stage.warn(text)
     return found
 
 
@@ -199,7 +218,7 @@ def _lights(
     if captures.diffuse:
         progress("diffuse sphere", 0.7)
         sphere = targets.diffuse_radius, targets.diffuse_albedo
-        shadings = gather_shading(captures.diffuse, cameras, *sphere, names)
+        shadings = gather_shading(captures.diffuse, cameras, *sphere, names, stage.warn)
         shadings = refine_centres(by_name, shadings)
         stage.figures["diffuse_centres"] = next(iter(shadings.values())).centres.tolist()
     found: dict[str, CalibratedLight] = {}
@@ -217,6 +236,12 @@ def _lights(
                 "frames, and is the sphere in view?"
             )
         by_mirror, centres, rms = mirrored_lights(by_name, glints, targets.mirror_radius, found)
+        if rms > OFF:
+            stage.warn(
+                f"mirror sphere: highlights are off by {rms:.2g} px (rms): is its radius "
+                f"{1e3 * targets.mirror_radius:g} mm, and does nothing else shine, as a light that "
+                "a camera sees?"
+            )
         for name, one in by_mirror.items():
             found[name] = with_intensity(one, shadings[name]) if name in found else one
         stage.figures.update(

@@ -16,6 +16,8 @@ from reconstruction.images.silhouettes import background_noise
 
 RIM = 0.2  # pixels: what a point of the outline is off by
 SPOT = 0.3  # pixels: a highlight within one pixel, anywhere in it
+OTHER_RADIUS = 0.01
+"""A radius is another than the outlines' by more than this share of it, and 2.5 times `RIM`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +70,14 @@ def find_outline(image: AnyFloats) -> Array:
 
 def sphere_centre(
     cameras: Sequence[Camera], outlines: Mapping[str, Array], radius: float, what: str
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, float | None]:
     """Centre `(3,)` of a sphere of `radius` (metres) from its `outlines`, and covariance `(3, 3)`.
 
     Rays through the outline pass the centre at one radius; how far outside of the rim all outlines
-    are found is solved for, too, or it would be taken for depth. One camera suffices; the more,
-    the better the depth. Raises `CalibrationError` naming `what` where no camera has an outline.
+    are found is solved for, too, or it would be taken for depth. Where that is further than rims
+    are found off, the third is the radius that the outlines have, else None. One camera suffices,
+    but tells no radius; the more, the better the depth. Raises `CalibrationError` naming `what`
+    where no camera has an outline.
     """
     seen = [c for c in cameras if len(outlines.get(c.name, ())) >= 20]
     if not seen:
@@ -99,7 +103,9 @@ def sphere_centre(
 
     begin = np.append(np.median(start, axis=0), 0.0)
     solution = minimise(numeric(residual), begin, huber=2.0)
-    return solution.x[:3], solution.covariance[:3, :3]
+    outside = float(solution.x[3] * np.median(size))
+    other = abs(solution.x[3]) > 2.5 and abs(outside) > OTHER_RADIUS * radius
+    return solution.x[:3], solution.covariance[:3, :3], radius + outside if other else None
 
 
 def find_highlight(image: AnyFloats, saturated: Bools) -> Highlight | None:

@@ -32,7 +32,8 @@ class Visibility:
         dense = Resampling(strands, pixel)
         count = int(dense.offsets[-1])
         some, _ = dense(np.arange(0, count, max(1, count // 500_000)))
-        self._buffers = [_DepthBuffer(camera, some, pixel) for camera in cameras]
+        corners = None if head is None else head.vertices
+        self._buffers = [_DepthBuffer(camera, some, pixel, corners) for camera in cameras]
         for first in range(0, count if self._buffers else 0, CHUNK):
             points, _ = dense(np.arange(first, min(first + CHUNK, count)))
             for buffer in self._buffers:
@@ -59,10 +60,13 @@ class Visibility:
 class _DepthBuffer:
     """The nearest depth behind every pixel of a finer image of the part that shows the strands.
 
-    It is a pinhole's image: the camera's own lens only says what falls on its picture.
+    And the `head (V, 3)`, where there is one: what other strands have beside the true ones may lie
+    behind it. It is a pinhole's image: the camera's own lens only says what falls on its picture.
     """
 
-    def __init__(self, camera: Camera, strands: AnyFloats, pixel: float) -> None:
+    def __init__(
+        self, camera: Camera, strands: AnyFloats, pixel: float, head: AnyFloats | None = None
+    ) -> None:
         self.lens = camera
         self.camera = camera = camera.pinhole()
         pixels, depth = camera.project(strands)
@@ -80,6 +84,9 @@ class _DepthBuffer:
             self.shape = (int(height), int(width))
             # what is nearer than the median is imaged larger: samples there must lie closer
             self.span = float(np.quantile(depth[front], 0.02)) / (focal * self.scale)
+            if head is not None:
+                pixels, depth = camera.project(head)
+                self._extend(np.clip(pixels[depth > 1e-6], first, end))
         self.depth = np.full(self.shape[0] * self.shape[1], np.inf, np.float32)
         # world to homogeneous buffer pixels; the third row gives the depth
         to_buffer = np.diag([self.scale, self.scale, 1.0])
@@ -88,6 +95,17 @@ class _DepthBuffer:
         self.b = (to_buffer @ camera.K @ camera.t).astype(np.float32)[:, None]
         corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
         self.image = (corners - self.low) * self.scale
+
+    def _extend(self, pixels: Array) -> None:
+        """Hold `pixels (N, 2)` of the camera too, whose grid stays, where memory allows it."""
+        if not len(pixels):
+            return
+        at, size = (pixels - self.low) * self.scale, np.array(self.shape[::-1])
+        before = np.maximum(np.ceil(-at.min(axis=0)), 0)
+        size = before + np.maximum(size, np.floor(at.max(axis=0)) + 1)
+        if np.prod(size) <= MOST_PIXELS:
+            self.low = self.low - before / self.scale
+            self.shape = (int(size[1]), int(size[0]))
 
     def _project(self, points: AnyFloats) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
         """Chunk by chunk: which points, column, row and depth; behind the camera column is -inf."""

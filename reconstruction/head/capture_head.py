@@ -171,7 +171,9 @@ def fit_capture_head(
     """
     own = None if head_mesh is None else read_obj(head_mesh)
     try:
-        shape = generic_head() if own is None else template(own, seed=seed)[0]
+        shape, marked = (generic_head(), None) if own is None else template(own, seed=seed)
+        for warning in marked.warnings if marked is not None else ():
+            stage.warn(f"{head_mesh}: its scalp: {warning}")
 
         def fitted(turn: float | None) -> HeadFit:
             hints = replace(points.hints, turn=turn)

@@ -46,10 +46,11 @@ def lit_skin(
     """The largest piece of `skin (H, W)` of a camera, above the height `lowest`, metres.
 
     Its pixels are averaged until they are as wide as the voxels of the subject's `hull`. None
-    where fewer than `FEWEST_LIGHTS` were shot or fewer than `FEWEST_PIXELS` hang together. On
-    rendered faces the shape is within 1 to 2 mm, and within 3 mm of where it is.
+    where fewer than `FEWEST_LIGHTS` that reach the head were shot or fewer than `FEWEST_PIXELS`
+    hang together. On rendered faces the shape is within 1 to 2 mm, and within 3 mm of where it is.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera.name)]
+    names = [n for n in names if capture.rig.light(n).intensity_towards(np.zeros(3)).any()]
     if len(names) < FEWEST_LIGHTS:
         return None
     names = names[:: -(-len(names) // MOST_LIGHTS)]
@@ -67,7 +68,7 @@ def lit_skin(
     for k, (name, light) in enumerate(zip(names, lights, strict=True)):
         image, saturated = capture.light(name, whole.name)
         strength = float(light.intensity_towards(np.zeros(3)).mean())
-        values[:, k] = _blocks(grey(image), by).mean(axis=(1, 3))[skin] / max(strength, 1e-12)
+        values[:, k] = _blocks(grey(image), by).mean(axis=(1, 3))[skin] / strength
         known[:, k] = ~_blocks(saturated, by).max(axis=(1, 3))[skin]
     places = np.stack([light.position for light in lights])
     depth = surface = first[skin]

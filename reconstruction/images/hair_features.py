@@ -56,9 +56,10 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     The log of the gloss, see `matte_fit`; log ratios of red to green and of green to blue under all
     lights that do not saturate the pixel together; the log of the matte surface's albedo. Gloss and
     albedo of answers averaged over 3×3 pixels. At most about `lights` of the lights are read. None
-    where fewer than `FEWEST_LIGHTS` were shot, or the subject is empty.
+    where fewer than `FEWEST_LIGHTS` that reach the head were shot, or the subject is empty.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
+    names = [n for n in names if capture.rig.light(n).intensity_towards(np.zeros(3)).any()]
     if len(names) < FEWEST_LIGHTS or not subject.any():
         return None
     names = names[:: max(1, len(names) // lights)]
@@ -69,7 +70,7 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     for k, name in enumerate(names):
         intensity = capture.rig.light(name).intensity_towards(np.zeros(3)).mean()
         image, saturated = capture.light(name, camera)
-        image = image / np.float32(max(intensity, 1e-12))
+        image = image / np.float32(intensity)
         colour += np.where(saturated[subject][:, None], 0, image[subject])
         known[:, k] = ~ndimage.maximum_filter(saturated & subject, 3)[subject]
         mean = grey(image)

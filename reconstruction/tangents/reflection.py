@@ -97,8 +97,10 @@ def observe(
     square = (away**2).sum(axis=2)
     to_light = (away / np.sqrt(square)[..., None]).astype(np.float32)
     strength = np.stack([x.intensity_towards(points[index]).mean(axis=-1) for x in lights], axis=1)
-    known = answers.known[:, y, x].T
-    response = np.maximum(answers.olat[:, y, x].T, 0) * square / np.maximum(strength, 1e-30)
+    shines = strength > 0  # what a dark lamp's frames hold is noise
+    known = answers.known[:, y, x].T & shines
+    response = np.maximum(answers.olat[:, y, x].T, 0) * square
+    response = np.divide(response, strength, out=np.zeros_like(response), where=shines)
     facing = np.einsum("pld,pd->pl", to_light, normals[index].astype(np.float32))
     front = (facing > _GRAZING) & known
     mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)

@@ -49,15 +49,19 @@ def run_fit(args: argparse.Namespace, output: Output) -> None:
     _require_obj(args.out)
     if args.turn_deg is not None and not np.isfinite(args.turn_deg):
         raise BadArgument(f"--turn-deg {args.turn_deg}: expected a number of degrees")
-    shape = generic_head() if args.mesh is None else template(read_obj(args.mesh))[0]
+    shape, marked = generic_head(), None
+    if args.mesh is not None:
+        shape, marked = template(read_obj(args.mesh))
     points, normals = read_points(args.points)
     turn = None if args.turn_deg is None else float(np.radians(args.turn_deg))
     fit = fit_head(points, normals, shape, hints=HeadHints(part=args.part, turn=turn))
     with writing(args.out) as part:
         write_obj(part, fit.mesh)
     rms, used = 1e3 * fit.deformed.to_mesh_rms, 1 - float(fit.outliers.mean())
+    warnings = [f"{args.mesh}: its scalp: {w}" for w in (marked.warnings if marked else ())]
+    warnings += fit.warnings
     lines = [f"{args.out}: {rms:.2f} mm rms from {used:.0%} of {len(points)} points"]
-    lines += [f"warning: {w}" for w in fit.warnings]
+    lines += [f"warning: {w}" for w in warnings]
     output.result(
         {
             "head": str(args.out),
@@ -65,7 +69,7 @@ def run_fit(args: argparse.Namespace, output: Output) -> None:
             "rms_mm": rms,
             "used_share": used,
             "fit": fit.figures(),
-            "warnings": list(fit.warnings),
+            "warnings": warnings,
         },
         "\n".join(lines),
     )
@@ -88,9 +92,11 @@ def run_mark(args: argparse.Namespace, output: Output) -> None:
     assert mesh.scalp is not None
     scalp = float(mesh.face_areas()[mesh.scalp].sum() * 1e4)
     data = {"head": str(args.out), "faces": len(mesh.faces), "scalp_cm2": scalp}
+    lines = [f"{args.out}: {scalp:.0f} cm² of scalp on {len(mesh.faces)} faces"]
     if fit is not None:
         data |= {"unit_m": 1 / fit.pose.scale, "fit": fit.figures(), "warnings": list(fit.warnings)}
-    output.result(data, f"{args.out}: {scalp:.0f} cm² of scalp on {len(mesh.faces)} faces")
+        lines += [f"warning: {w}" for w in fit.warnings]
+    output.result(data, "\n".join(lines))
 
 
 def _require_obj(path: Path) -> None:

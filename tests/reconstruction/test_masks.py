@@ -184,6 +184,16 @@ def test_light_and_lines_tell_fibres_from_skin(hairy_capture: Capture) -> None:
         assert np.array_equal(mask.hair | mask.skin, mask.subject)
 
 
+def test_a_lamp_that_gives_no_light_does_not_move_the_masks(hairy_capture: Capture) -> None:
+    """The rig says of one lamp that it is dark; what its frames hold came from elsewhere."""
+    dark = replace(LIGHTS[10], intensity=np.zeros(3))
+    capture = hairy_capture.view()
+    lights = (*LIGHTS[:10], dark, *LIGHTS[11:])
+    capture.rig = replace(capture.rig, lights=lights)
+    for name, mask in hair_masks(capture).items():
+        assert iou(mask.hair, upper(capture.rig.camera(name))[1]) > 0.9
+
+
 def dome(count: int = 60) -> np.ndarray:
     positions = dome_positions(count, 1.2, -60.0)
     return np.asarray(positions / np.linalg.norm(positions, axis=1, keepdims=True))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from reconstruction import Capture, Rig
-from reconstruction.calibration.boards import CalibrationError
+from reconstruction.arrays import Bools, Floats
+from reconstruction.calibration.boards import Board, CalibrationError
 from reconstruction.calibration.rig_comparison import compare_rigs
 from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
 from stage_service.cli import main
@@ -40,10 +42,76 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
     for name, light in errors["lights"].items():
         assert light["position"] < 0.01, name
         assert light["intensity"] < 0.02, name
+    assert said["warnings"] == []
     report = json.loads(out.with_suffix(".report.json").read_text())
     assert [s["name"] for s in report["stages"]] == ["cameras", "projectors", "lights"]
     assert "rows say nothing" in said["stages"]["projectors"]["undetermined"]["beam"]
     assert said["stages"]["lights"]["undetermined"] == {}
+
+
+def test_a_square_of_another_length_than_told_is_warned_of(
+    nominal_rig: Rig, board_captures: list[Capture]
+) -> None:
+    """Squares of 27 mm that are taken for 30 mm make every length a ninth too large."""
+    rig = replace(nominal_rig, lights=(), projectors=())
+    for square in (0.027, 0.03, 0.024):
+        board = Board(square=square, marker=square * 21 / 27)
+        _, report = calibrate(rig, TargetCaptures(board_captures), Targets(board))
+        said = report["cameras"].warnings
+        assert len(said) == (square != 0.027)
+        for text in said:
+            share = float(text.partition(" stand ")[2].partition("%")[0]) / 100
+            assert share == pytest.approx(1 / 9, abs=0.025)  # nominal places are 1 cm off
+            assert ("further apart" if square > 0.027 else "nearer together") in text
+            assert f"is a square of the board {1e3 * square:g} mm?" in text
+
+
+def test_cameras_with_each_others_names_are_warned_of(
+    nominal_rig: Rig, board_captures: list[Capture]
+) -> None:
+    first, second, third = nominal_rig.cameras
+    mixed = (replace(third, name="cam_0"), second, replace(first, name="cam_2"))
+    rig = Rig("mixed", mixed, ())
+    _, report = calibrate(rig, TargetCaptures(board_captures))
+    (said,) = report["cameras"].warnings
+    assert "cam_0" in said
+    assert "cam_2" in said
+    assert "have two of them each other's name?" in said
+
+
+def test_a_nominal_rig_of_other_pictures_is_refused(
+    nominal_rig: Rig, board_captures: list[Capture]
+) -> None:
+    """The pictures have 288 × 240 pixels; a lens of theirs is none of a picture half as wide."""
+    halved = replace(nominal_rig, cameras=tuple(c.reduced(2) for c in nominal_rig.cameras))
+    with pytest.raises(CalibrationError, match=r"cam_0 have 288 × 240 pixels, .* have 144 × 120"):
+        calibrate(halved, TargetCaptures(board_captures))
+
+
+class Glaring(Capture):
+    """A camera sees something that shines more than the mirror, under whatever lamp."""
+
+    def light(self, light: str, camera: str) -> tuple[Floats, Bools]:
+        image, saturated = super().light(light, camera)
+        if camera == "cam_1":
+            image = image.copy()
+            image[20:24, 20:24] = 10 * image.max()
+        return image, saturated
+
+
+def test_what_shines_beside_a_mirror_is_warned_of(
+    nominal_rig: Rig, board_captures: list[Capture], mirror_captures: list[Capture]
+) -> None:
+    """Without it the highlights are met to under half a pixel."""
+    rig = replace(nominal_rig, projectors=())
+    for kind, warned in ((Capture, False), (Glaring, True)):
+        mirrors = [kind(c.path) for c in mirror_captures]
+        _, report = calibrate(rig, TargetCaptures(board_captures, mirrors))
+        stage = report["lights"]
+        assert (stage.figures["highlights_rms_px"] > 10) == warned
+        said = [w for w in stage.warnings if "does nothing else shine" in w]
+        assert len(said) == warned
+        assert all("is its radius 50 mm" in w for w in said)
 
 
 def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None:

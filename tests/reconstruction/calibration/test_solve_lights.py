@@ -57,6 +57,24 @@ def test_shading_corrects_where_outlines_put_the_sphere(
     assert (after < 0.5 * before).all()
 
 
+@pytest.mark.parametrize("radius", [0.05, 0.059, 0.06, 0.061, 0.07])
+def test_outlines_of_another_radius_than_told_are_warned_of(
+    true_rig: Rig, diffuse_captures: list[Capture], radius: float
+) -> None:
+    """The spheres' radius is 60 mm: of 50, the lamps would be three times as far as they are."""
+    warnings: list[str] = []
+    gather_shading(diffuse_captures, true_rig.cameras, radius, 0.8, ["lamp_0"], warnings.append)
+    assert len(warnings) == (0 if radius == 0.06 else 2)
+    for text, capture in zip(warnings, diffuse_captures, strict=False):
+        seen = float(text.split("a radius of ")[1].split(" mm")[0])
+        assert seen == pytest.approx(60, abs=1.0)
+        assert f"{capture.path}: " in text
+        assert f"not of {1e3 * radius:g} mm" in text
+    warnings.clear()  # one camera tells size or distance
+    gather_shading(diffuse_captures, true_rig.cameras[:1], radius, 0.8, ["lamp_0"], warnings.append)
+    assert warnings == []
+
+
 def test_a_mirror_sharpens_what_shading_says(
     true_rig: Rig, nominal_rig: Rig, shadings: dict[str, Shading], glints: list[Glint]
 ) -> None:

@@ -250,6 +250,24 @@ def test_the_head_hides_and_the_image_ends(front: Camera) -> None:
     assert not Visibility([front], behind)(points + np.float32(0.2)).any()
 
 
+def test_the_head_hides_where_the_true_strands_do_not_reach(front: Camera) -> None:
+    """Short hair above a plate; what is predicted further down behind it is not seen."""
+    plate = Mesh(
+        np.array([[-0.06, 0, -0.06], [0.06, 0, -0.06], [0.06, 0, 0.06], [-0.06, 0, 0.06]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    short = Strands.from_list([s * [0.2, 1, 0.1] + [0, 0, 0.06] for s in curtain()])
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-0.08, 0.01, -0.08), (0.08, 0.02, 0.04), (2000, 3))
+    at = points * (1 / (1 + points[:, 1:2]))  # where rays from (0, -1, 0) to them meet the plate
+    inside = (np.abs(at[:, [0, 2]]) < 0.059).all(axis=1)
+    outside = (np.abs(at[:, [0, 2]]) > 0.061).any(axis=1)
+    seen = Visibility([front], short, plate)(points)
+    assert not seen[inside].any()
+    assert seen[outside].all()
+    assert Visibility([front], short)(points).all()
+
+
 @pytest.mark.slow
 def test_a_hundred_thousand_strands_are_scored_in_half_a_gigabyte() -> None:
     """20 million points on both sides: docs/evaluation.md tells the figures."""

@@ -108,6 +108,25 @@ def test_few_points_give_a_pose() -> None:
     assert fit.deformed.to_points_median > 0.02  # and it shows that most of the head was not seen
 
 
+@pytest.mark.parametrize("part", ["head", "scalp"])
+def test_normals_that_point_into_the_head_are_an_error_that_says_so(part: str) -> None:
+    """As of scanners and meshes that are inside out; the head came out centimetres off."""
+    head = generic_head()
+    places, normals, face = surface_samples(head, 6e-3)
+    on = head.scalp[face] if part == "scalp" else np.ones(len(face), bool)
+    points, outward = 1.03 * places[on][::4] + [0.01, 0.02, 0.03], normals[on][::4]
+    hints = HeadHints(part=part)  # type: ignore[arg-type]
+    assert not fit_head(points, outward, hints=hints).warnings
+    with pytest.raises(HeadFitError, match="the normals point into the head: turn them round"):
+        fit_head(points, -outward, hints=hints)
+
+
+def test_a_mesh_that_is_inside_out_is_an_error_that_says_so() -> None:
+    head = generic_head()
+    with pytest.raises(HeadFitError, match=r"turn them round \(the faces, of a mesh\)"):
+        mark_scalp(Mesh(100 * head.vertices, head.faces[:, ::-1]))
+
+
 def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> None:
     points, normals = seen(crown, 500)
     fit = fit_head(points, normals, hints=HeadHints(part="scalp"))

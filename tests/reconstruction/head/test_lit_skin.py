@@ -156,6 +156,22 @@ def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -
     assert np.median(ClosestPoint(fitted, 8e-3)(scalp)[2]) < 2e-3
 
 
+def test_a_lamp_that_gives_no_light_does_not_move_the_head(head: Mesh) -> None:
+    """Its frames hold noise; the head is where it is without them."""
+
+    class OneDark(Shaded):
+        def light(self, light: str, camera: str) -> Any:
+            image, saturated = super().light(light, camera)
+            noise = np.random.default_rng(int(light[1:])).normal(0, 1e-3, image.shape)
+            return (noise + (image if light != dark.name else 0)).astype(np.float32), saturated
+
+    dark = Light(LIGHTS[7].name, LIGHTS[7].position, np.zeros(3))
+    capture = OneDark(head, around(120), (*LIGHTS[:7], dark, *LIGHTS[8:]))
+    masked = MaskedCapture(capture, capture.masks)
+    found = lit_skin_points(masked, subject_hull(masked, 3e-3))
+    assert np.median(ClosestPoint(head, 8e-3)(found.points)[2]) < 2e-3
+
+
 def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
     head: Mesh, tmp_path: Path
 ) -> None:

@@ -243,6 +243,20 @@ def test_observations_undo_distance_and_intensity() -> None:
     np.testing.assert_allclose(o.facing[0], cosines, rtol=1e-6)
 
 
+def test_a_lamp_that_gives_no_light_says_nothing() -> None:
+    """Of a matte point the other lamps' answers stay 1, whatever noise its frame holds."""
+    c = camera((1.0, 0.0, 0.0))
+    lights = [
+        Light(n, np.array([1.0, y, 0]), np.full(3, i)) for n, y, i in (("a", 0, 1), ("b", 1, 0))
+    ]
+    olat = np.array([1.0, 1e-3])[:, None, None] * np.ones((2, 64, 64))
+    answers = Answers(c, olat, np.ones(olat.shape, bool))
+    point, normal = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
+    o = observe(answers, lights, point, normal, np.array([True]))
+    assert o.known.tolist() == [[True, False]]
+    assert o.response[0, 0] == pytest.approx(1)
+
+
 def test_a_flat_table_has_no_contrast() -> None:
     assert Reflection(np.ones(8), np.ones(72)).contrast == pytest.approx(1)
 

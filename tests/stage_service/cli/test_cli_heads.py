@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction import Mesh, read_obj, write_obj
+from reconstruction import Mesh, Stage, read_obj, write_obj
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh_queries import surface_samples
+from reconstruction.head.capture_head import HeadPoints, fit_capture_head
+from reconstruction.head.fit import HeadHints
 from reconstruction.head.generic import generic_head
 from stage_service.cli import main
 
@@ -48,6 +50,36 @@ def test_a_mesh_in_inches_with_y_up_becomes_a_template(
     assert data["scalp_cm2"] == pytest.approx(1e4 * head.face_areas()[head.scalp].sum(), rel=0.1)
     marked = read_obj(tmp_path / "t.obj")
     assert np.abs(np.sort(marked.vertices[:, 2]) - np.sort(head.vertices[:, 2])).max() < 3e-3
+
+
+def egg() -> Mesh:
+    """As long as a head from chin to crown, and alike from all sides: it faces nowhere."""
+    around, down = np.meshgrid(np.arange(60) * np.pi / 30, np.linspace(0.02, np.pi - 0.02, 40))
+    level = np.stack([np.sin(down) * np.cos(around), np.sin(down) * np.sin(around)], axis=-1)
+    points = np.concatenate([0.09 * level, 0.12 * np.cos(down)[..., None]], axis=-1)
+    at = np.arange(40 * 60).reshape(40, 60)
+    a, b = at[:-1], at[1:]
+    c, d = np.roll(b, -1, axis=1), np.roll(a, -1, axis=1)
+    faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    return Mesh(points.reshape(-1, 3), faces)
+
+
+def test_a_mesh_whose_face_cannot_be_told_is_warned_of(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    own, head = tmp_path / "egg.obj", generic_head()
+    write_obj(own, egg())
+    assert main(["head", "mark", str(own), "--out", str(tmp_path / "t.obj")]) == 0
+    assert "warning: another pose fits nearly as well" in capsys.readouterr().out
+    points, _, face = surface_samples(head, 8e-3)
+    np.save(tmp_path / "scalp.npy", points[head.scalp[face]])
+    words = ["head", "fit", tmp_path / "scalp.npy", "--mesh", own, "--out", tmp_path / "h.obj"]
+    assert main([*map(str, words)]) == 0
+    assert f"warning: {own}: its scalp: another pose fits nearly as" in capsys.readouterr().out
+    stage = Stage("head")
+    known = HeadPoints(points[head.scalp[face]], None, HeadHints(part="scalp"), "scalp.npy")
+    fit_capture_head(known, own, stage)
+    assert any("egg.obj: its scalp: another pose" in w for w in stage.warnings)
 
 
 def test_what_is_wrong_is_said_with_exit_code_3(
