@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as hnp
 from pxr import Usd, UsdGeom
 
 from reconstruction import StrandFileError, Strands, read_strands, write_strands
+from reconstruction.files import durable
 from reconstruction.files.strands import READABLE, WRITABLE, read_poses
 
 BOTH_WAYS = [suffix for suffix in WRITABLE if suffix in READABLE]
@@ -488,6 +489,16 @@ def test_the_ponytail(shared_data: Callable[[str], Path]) -> None:
     assert [len(part) for part in parts] == [876, 3066, 517, 474]
     points = np.concatenate([part.points for part in parts]) * 0.003 - np.array([0, 0, 0.24])
     np.testing.assert_allclose(points, truth.points, atol=1e-6)
+
+
+def test_alembic_is_whole_before_it_gets_its_name(tmp_path: Path, monkeypatch) -> None:
+    """Ogawa's sixth byte is 255 in a file that is complete, 0 before."""
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    flushed: list[bytes] = []
+    monkeypatch.setattr(durable, "flush", lambda part: flushed.append(part.read_bytes()))
+    write_strands(tmp_path / "hair.abc", Strands.from_list([np.eye(3)]))
+    assert flushed == [(tmp_path / "hair.abc").read_bytes()]
+    assert flushed[0][:6] == b"Ogawa\xff"
 
 
 def test_archives_of_any_size_are_read(tmp_path: Path) -> None:
