@@ -14,7 +14,7 @@ import numpy as np
 from appearance.export.groom import Groom
 from reconstruction import Strands
 from reconstruction.arrays import AnyFloats, Ints
-from reconstruction.files.strands.alembic import add_curves, add_values, archive
+from reconstruction.files.strands.alembic import add_curves, add_values, write_archive
 
 CM = 100.0
 
@@ -28,11 +28,14 @@ def export_unreal(groom: Groom, path: Path) -> None:
     every = np.arange(len(groom.strands))
     colour = groom.colour(groom.looked_up[0])
     points = len(groom.strands.points) + len(groom.strands.subset(groom.guides).points)
-    with archive(path, 40 * points) as top:
+
+    def fill(top: Any) -> None:
         _curves(top, "hair", groom, every, colour)
         if len(groom.guides):
             guides = _curves(top, "guides", groom, groom.guides)
             add_values(guides, "groom_guide", np.array([1], np.int16), "constant")
+
+    write_archive(path, 40 * points, fill)
 
 
 def _curves(top: Any, name: str, groom: Groom, which: Ints, colour: AnyFloats | None = None) -> Any:

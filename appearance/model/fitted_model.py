@@ -178,8 +178,8 @@ class FittedModel:
     def scene(self, strands: Strands | None = None, head: Mesh | None = None) -> HairScene:
         """The scene for every renderer of `appearance.render`.
 
-        With moved `strands` and `head` of the same topology. Raises `ValueError` where the strands'
-        numbers of points differ.
+        With moved `strands` and `head` of the same topology; as thick as the model's, whatever a
+        file of a pose says. Raises `ValueError` where the strands' numbers of points differ.
         """
         moved = self.strands if strands is None else strands
         if not np.array_equal(moved.offsets, self.strands.offsets):
@@ -188,6 +188,7 @@ class FittedModel:
                 f"{len(moved)} strands of {len(moved.points)} points, expected "
                 f"{len(self.strands)} of {len(self.strands.points)}"
             )
+        moved = replace(moved, radius=self.strands.radius)
         base = build_scene(
             moved,
             self.head if head is None else head,

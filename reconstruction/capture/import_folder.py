@@ -54,7 +54,7 @@ from reconstruction.capture.import_tables import (
 )
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
-from reconstruction.files.masks import half_grey
+from reconstruction.files.masks import check_alpha, half_grey
 from reconstruction.files.pictures import PictureError, picture_size, read_picture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
@@ -414,6 +414,8 @@ def _mask(path: Path, camera: Camera) -> Bools:
     if image is None:
         raise ImportProblem(f"{path}: expected a PNG of {expected} pixels, got {found}")
     try:
-        return half_grey(np.asarray(image, np.uint8))
+        mask = half_grey(np.asarray(image, np.uint8))
+        check_alpha(path.read_bytes(), mask)
+        return mask
     except ValueError as error:
         raise ImportProblem(f"{path}: {error}") from error

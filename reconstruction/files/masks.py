@@ -14,6 +14,10 @@ from reconstruction.containment import plain_file
 
 _LENGTH = struct.Struct(">I")
 _SIZE = struct.Struct(">II")
+_COLOUR_TYPE = 25  # where a PNG says what its pixels are
+_MAYBE_TRANSPARENT = (3, 4, 6)  # a palette, grey or colour with alpha
+ALIKE = 0.9
+"""Of the pixels of either that are of both, where two masks are one: soft edges differ."""
 
 
 def read_mask(path: Path, width: int, height: int) -> Bools:
@@ -46,7 +50,10 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape != (height, width):
         raise ValueError(f"{expected}, got one that is damaged")
-    return half_grey(image)
+    mask = half_grey(image)
+    if data[_COLOUR_TYPE] in _MAYBE_TRANSPARENT:
+        check_alpha(data, mask)
+    return mask
 
 
 def half_grey(image: NDArray[np.uint8]) -> Bools:
@@ -61,3 +68,20 @@ def half_grey(image: NDArray[np.uint8]) -> Bools:
             ": write white (255) for a label"
         )
     return np.asarray(image >= 128)
+
+
+def check_alpha(data: bytes, mask: Bools) -> None:
+    """Raise `ValueError` where the alpha of a file's bytes is another mask than its grey `(H, W)`.
+
+    Nobody could say which of the two is meant.
+    """
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape != (*mask.shape, 4):
+        return
+    opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
+    either = (opaque | mask).sum()
+    if not opaque.all() and (opaque & mask).sum() < ALIKE * either:
+        raise ValueError(
+            f"is {opaque.mean():.0%} opaque and, alpha aside, {mask.mean():.0%} half grey and "
+            "above: write a grey PNG without alpha, white where the mask is"
+        )

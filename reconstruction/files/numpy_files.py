@@ -19,6 +19,8 @@ from reconstruction.containment import plain_file
 
 DEFLATE_AT_BEST = 1032
 """Bytes that one compressed byte can stand for in a deflated member, at the very most."""
+ANY_SIZE = 1 << 62
+"""Bytes of an archive: poses of a groom are large, and no array is larger than its file allows."""
 PLAIN = "biufU"
 """Kinds of types without objects."""
 
@@ -39,7 +41,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """An `.npz` archive; in the block, too, what is wrong with it is a `ValueError`."""
     try:
-        with zipfile.ZipFile(plain_file(path)) as archive:
+        with zipfile.ZipFile(plain_file(path, ANY_SIZE)) as archive:
             yield archive
     except FileNotFoundError:
         raise

@@ -187,6 +187,10 @@ def _exr(path: Path, sensor: Sensor) -> Picture:
     if not np.isfinite(image).all():
         raise PictureError(f"{path}: has pixels that are not finite numbers")
     white, black = sensor.white or 1.0, sensor.black or 0.0
+    if not black < white:
+        raise PictureError(
+            f"{path}: black {black:g} must be below white {white:g}: give `white` in its numbers"
+        )
     full = sensor.white or float(attributes.get("fullScale", np.inf))
     saturated = np.asarray((image >= full * (1 - 1e-5)).any(axis=-1))
     gamma = 1.0 if sensor.response is None else sensor.response

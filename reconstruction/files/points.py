@@ -24,8 +24,9 @@ def read_points(path: str | Path) -> tuple[Array, Array | None]:
     """Points `(N, 3)` of a file, and their unit normals `(N, 3)` where it has one for each.
 
     `.obj` and `.ply`: the vertices, faces are ignored. `.csv`: x, y, z and perhaps a normal a line,
-    between commas, semicolons or blanks, after perhaps one line of names. `.npy`: `(N, 3)` or
-    `(N, 6)`. Raises `ValueError` naming the file and what is wrong.
+    between commas, semicolons or blanks, after perhaps one line of names; beside semicolons a comma
+    is a decimal one. `.npy`: `(N, 3)` or `(N, 6)`. Raises `ValueError` naming the file and what is
+    wrong.
     """
     path = Path(path)
     readers: dict[str, Callable[[Path], Any]]
@@ -59,8 +60,12 @@ def _obj(path: Path) -> Array:
 
 def _csv(path: Path) -> Array:
     rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
-        words = [w for w in re.split(r"[,;\s]+", line.partition("#")[0].strip()) if w]
+    text = path.read_text(encoding="utf-8-sig")  # as spreadsheets write it
+    for number, line in enumerate(text.splitlines(), 1):
+        said = line.partition("#")[0]
+        if ";" in said:  # where numbers have a decimal comma
+            said = said.replace(",", ".")
+        words = [w for w in re.split(r"[,;\s]+", said.strip()) if w]
         if not words:
             continue
         try:

@@ -7,8 +7,7 @@ is up, and one unit is written a metre.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +26,14 @@ def write_abc(path: Path, strands: Strands) -> None:
 
     Raises `StrandFileError` where the extra is not installed.
     """
-    with archive(path, 20 * len(strands.points)) as top:
-        add_curves(top, "hair", strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3)))
+    turned = strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3))
+    write_archive(path, 20 * len(strands.points), lambda top: add_curves(top, "hair", turned))
 
 
-@contextmanager
-def archive(path: Path, needed: int) -> Iterator[Any]:
-    """The top object of a new archive; afterwards `path` is whole or not there.
+def write_archive(path: Path, needed: int, fill: Callable[[Any], Any]) -> None:
+    """Write an archive that `fill` puts into its top object; `path` is whole then or not there.
 
+    What `fill` makes it must not keep: the library completes the file when all of it is gone.
     Raises `StrandFileError` where the extra is not installed or the file cannot be written, and
     `DiskFull` where there is no room for `needed` bytes: the library, once it meets a full disk,
     ends the process.
@@ -50,9 +49,7 @@ def archive(path: Path, needed: int) -> Iterator[Any]:
     require_free(path, needed, reserve=0)
     try:
         with writing(path) as temporary:
-            made = Abc.OArchive(str(temporary))
-            yield made.getTop()
-            del made  # the file is complete when this and all curves in it are gone
+            fill(Abc.OArchive(str(temporary)).getTop())
     except RuntimeError as error:
         raise StrandFileError(f"{path}: cannot be written ({error})") from error
 

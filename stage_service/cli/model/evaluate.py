@@ -53,6 +53,11 @@ def run_geometry(args: argparse.Namespace, output: Output) -> None:
 
     if args.seed < 0:
         raise BadArgument(f"--seed {args.seed}: expected 0 or more")
+    if args.out is not None and any((args.out / f).exists() for f in ("strands.npz", "rig.json")):
+        raise BadArgument(
+            f"--out {args.out} is a model or a capture: its report.json would be replaced: choose "
+            "another folder"
+        )
     pred, true = read_strands(args.pred), read_strands(args.true)
     if not len(true):
         raise BadArgument(f"{args.true}: no strands to compare with")

@@ -68,6 +68,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         return
     if args.out is None:
         raise BadArgument("--out MODEL says where the strands go; or ask for an --estimate")
+    _check_folder(args.out)
     model = Model(args.out)
     with progress_bar("reconstruct") as progress:
         reconstruct(StepContext(args.capture, model, options, progress))
@@ -86,6 +87,24 @@ def run(args: argparse.Namespace, output: Output) -> None:
         {**data, "method": method, "seconds": seconds},
         f"{len(strands)} strands in {model.file('strands.npz')} ({seconds:.0f} s)",
     )
+
+
+def _check_folder(out: Path) -> None:
+    """`BadArgument` where a model, which removes what its folder holds of earlier ones (a head,
+    plots, pictures), would remove others' files."""
+    if out.exists() and not out.is_dir():
+        raise BadArgument(f"--out {out} is a file: a model is a folder")
+    there = {p.name for p in out.iterdir() if p.name[0] != "."} if out.exists() else set()
+    if there & {"rig.json", "cameras.json"}:
+        raise BadArgument(
+            f"--out {out} is a capture, or a folder to import: its head would be taken for an "
+            "earlier model's and removed: choose a new folder"
+        )
+    if there and not there & {"masks", "strands.npz", "report.json"}:
+        raise BadArgument(
+            f"--out {out} holds files and no model, which would remove those that are called as "
+            "its own: choose a new folder"
+        )
 
 
 def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:

@@ -28,6 +28,7 @@ from appearance.export.usd import export_usd
 from appearance.render.environment_maps import studio
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import BadOptions, Camera, Strands, parse_options, read_exr, read_strands
+from reconstruction.files import durable
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 SKIN = (0.3, 0.2, 0.1)
@@ -200,12 +201,14 @@ def test_usd_textures_hold_the_maps_where_st_looks_them_up(mapped, tmp_path):
         np.testing.assert_allclose(sigma_a[:, at], texture[row, column], rtol=1e-5)
 
 
-def test_unreal_alembic_is_in_centimetres_with_its_attributes(fitted, tmp_path):
+def test_unreal_alembic_is_in_centimetres_with_its_attributes(fitted, tmp_path, monkeypatch):
     pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
     from alembic3d import Abc, AbcGeom
 
-    groom = Groom.of(fitted, ExportOptions(guides=5))
+    groom, flushed = Groom.of(fitted, ExportOptions(guides=5)), []
+    monkeypatch.setattr(durable, "flush", lambda part: flushed.append(part.read_bytes()))
     export_unreal(groom, tmp_path / "g.abc")
+    assert flushed == [(tmp_path / "g.abc").read_bytes()], "whole before it gets its name"
     top = Abc.IArchive(str(tmp_path / "g.abc")).getTop()
     schema = AbcGeom.ICurves(top, "hair").getSchema()
     points = np.asarray(memoryview(schema.getValue().getPositions()))

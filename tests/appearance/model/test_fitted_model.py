@@ -28,6 +28,7 @@ from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.model.edit import cut, recoloured, restyled, wisp_of
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Camera, Model, Rig, read_exr
+from reconstruction.files.strands import read_poses
 
 HAIR = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 CAMERA = Camera.look_at("c", 16, 16, (0, -0.5, 0.1), (0, 0, 0.0), 12)
@@ -107,6 +108,16 @@ def test_maps_stay_on_strands_that_move_and_other_strands_are_refused(fitted, sm
     np.testing.assert_allclose(turned.mean((1, 2)), still.mean((1, 2)), rtol=0.05)
     with pytest.raises(ValueError, match="same numbers of points"):
         fitted.scene(strands=small.tuft(5))
+
+
+def test_poses_are_as_thick_as_the_models_strands(fitted, tmp_path):
+    """A file of poses holds points and offsets; a missing radius would be that of one hair."""
+    points, offsets = fitted.strands.points, fitted.strands.offsets
+    np.savez(tmp_path / "poses.npz", points=np.stack([points, points + 0.01]), offsets=offsets)
+    fitted = replace(fitted, strands=replace(fitted.strands, radius=3e-4))
+    scene = fitted.scene(read_poses(tmp_path / "poses.npz")[1])
+    radius = np.array(mi.traverse(scene.hair_shape)["control_points"]).reshape(-1, 4)[:, 3]
+    np.testing.assert_allclose(radius[:-4], 0.03, rtol=1e-6)  # centimetres; the last are a guard
 
 
 def test_maps_are_exported_as_layers_that_read_back(fitted, tmp_path):

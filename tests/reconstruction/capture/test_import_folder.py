@@ -172,6 +172,11 @@ def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "masks" / "left.png"), np.ones((6, 8), np.uint8))
     with pytest.raises(ImportProblem, match=r"left\.png: shows nothing: .* brightest pixel is 1"):
         import_folder(folder, tmp_path / "out")
+    cut_out = np.full((6, 8, 4), 255, np.uint8)
+    cut_out[:, 4:, 3] = 0  # white under a transparent background
+    cv2.imwrite(str(folder / "masks" / "left.png"), cut_out)
+    with pytest.raises(ImportProblem, match=r"left\.png: is 50% opaque and, .* 100% half grey"):
+        import_folder(folder, tmp_path / "out")
     (folder / "head.obj").write_text("v 0 0 0\n")
     (folder / "masks" / "left.png").unlink()
     with pytest.raises(ImportProblem, match=r"head\.obj: no faces"):

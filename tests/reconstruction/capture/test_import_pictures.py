@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 import pytest
 from dng_writer import BLACK, BLUE, GREEN, RED, WHITE, write_dng
 
-from reconstruction import Capture, import_folder, verify
+from reconstruction import Capture, import_folder, verify, write_exr
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
@@ -386,8 +386,6 @@ def test_a_broken_picture_says_what_to_do(folder, tmp_path, suffix, break_it, sa
         kind = np.uint8 if suffix == "jpg" else np.uint16
         old.unlink()
         if suffix == "exr":
-            from reconstruction import write_exr
-
             shape = (SIZE, SIZE // 2, 3) if break_it is is_smaller else (SIZE, SIZE, 3)
             write_exr(new, np.zeros(shape, np.float32))
         else:
@@ -424,6 +422,16 @@ def test_a_raw_file_of_a_sensor_that_is_not_known_is_refused(tmp_path, sensor, s
     write_dng(tmp_path / "odd.dng", np.full((24, 32), 1000, np.uint16), **sensor)
     with pytest.raises(PictureError, match=says):
         read_picture(tmp_path / "odd.dng", Sensor(), (32, 24))
+
+
+def test_an_exr_of_counts_needs_white_as_well_as_black(tmp_path):
+    """Its white is 1 where nothing says more: above a black of 64 light was negative."""
+    counts = np.full((3, 4, 3), 314, np.float32)
+    write_exr(tmp_path / "counts.exr", counts)
+    with pytest.raises(PictureError, match=r"counts\.exr: black 64 must be below white 1: give"):
+        read_picture(tmp_path / "counts.exr", Sensor(black=64), (4, 3))
+    picture = read_picture(tmp_path / "counts.exr", Sensor(black=64, white=1064), (4, 3))
+    np.testing.assert_allclose(picture.light, 0.25, rtol=1e-6)
 
 
 def test_numbers_of_each_camera_are_one_step_of_a_light(folder, tmp_path):

@@ -29,6 +29,22 @@ def test_labels_are_no_mask(tmp_path):
     assert not decode_mask(bytes(cv2.imencode(".png", 0 * labels)[1]), 3, 2).any()
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_mask_in_alpha_alone_is_not_taken_for_one_of_all_pixels(kind):
+    """White under a transparent background, as of a picture that was cut out, was hair all over."""
+    white = np.iinfo(kind).max
+    image = np.full((2, 3, 4), white, kind)
+    image[:, 1:, 3] = 0
+    with pytest.raises(ValueError, match="is 33% opaque and, alpha aside, 100% half grey"):
+        decode_mask(bytes(cv2.imencode(".png", image)[1]), 3, 2)
+    image[:, 1:, :3] = 0  # black there: the same mask twice
+    same = decode_mask(bytes(cv2.imencode(".png", image)[1]), 3, 2)
+    assert same.tolist() == [[True, False, False]] * 2
+    image[..., 3] = white
+    opaque = decode_mask(bytes(cv2.imencode(".png", image)[1]), 3, 2)
+    assert opaque.tolist() == same.tolist()
+
+
 def test_what_a_file_says_of_its_sizes_is_not_believed(png, monkeypatch):
     with pytest.raises(ValueError, match="expected a PNG of 2x3 pixels, got 3x2"):
         decode_mask(png, 2, 3)

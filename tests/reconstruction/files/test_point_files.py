@@ -52,6 +52,8 @@ def ply(form: str) -> bytes:
         ("d.obj", b"v .1 -.2 .3\nv 1.5 2.5 -3.5\nvn 0 0 2\nvn .6 .8 0\nf 1 2 1\n"),
         ("e.csv", b"x,y,z,nx,ny,nz\n.1, -.2, .3, 0, 0, 1\n# a comment\n1.5,2.5,-3.5,.6,.8,0\n"),
         ("f.csv", b".1 -.2 .3 0 0 1\n\n1.5;2.5;-3.5;0.6;0.8;0\n"),
+        ("g.csv", b"\xef\xbb\xbf.1,-.2,.3,0,0,1\n1.5,2.5,-3.5,.6,.8,0\n"),  # of a spreadsheet,
+        ("h.csv", b"x;y;z;a;b;c\n0,1;-0,2;0,3;0;0;1\n1,5;2,5;-3,5;0,6;0,8;0\n"),  # in German
     ],
 )
 def test_points_and_normals_are_read(tmp_path: Path, name: str, content: bytes) -> None:
@@ -66,6 +68,13 @@ def test_points_without_normals_are_read(tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", POINTS)
     points, normals = read_points(tmp_path / "p.npy")
     np.testing.assert_array_equal(points, POINTS)
+    assert normals is None
+
+
+def test_three_numbers_with_decimal_commas_are_no_point_with_a_normal(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("0,1;-0,2;0,3\n1,5;2,5;-3,5\n")
+    points, normals = read_points(tmp_path / "p.csv")
+    np.testing.assert_allclose(points, POINTS)
     assert normals is None
 
 

@@ -16,7 +16,8 @@ from hypothesis.extra import numpy as hnp
 from pxr import Usd, UsdGeom
 
 from reconstruction import StrandFileError, Strands, read_strands, write_strands
-from reconstruction.files.strands import READABLE, WRITABLE
+from reconstruction.files import durable
+from reconstruction.files.strands import READABLE, WRITABLE, read_poses
 
 BOTH_WAYS = [suffix for suffix in WRITABLE if suffix in READABLE]
 
@@ -488,3 +489,23 @@ def test_the_ponytail(shared_data: Callable[[str], Path]) -> None:
     assert [len(part) for part in parts] == [876, 3066, 517, 474]
     points = np.concatenate([part.points for part in parts]) * 0.003 - np.array([0, 0, 0.24])
     np.testing.assert_allclose(points, truth.points, atol=1e-6)
+
+
+def test_alembic_is_whole_before_it_gets_its_name(tmp_path: Path, monkeypatch) -> None:
+    """Ogawa's sixth byte is 255 in a file that is complete, 0 before."""
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    flushed: list[bytes] = []
+    monkeypatch.setattr(durable, "flush", lambda part: flushed.append(part.read_bytes()))
+    write_strands(tmp_path / "hair.abc", Strands.from_list([np.eye(3)]))
+    assert flushed == [(tmp_path / "hair.abc").read_bytes()]
+    assert flushed[0][:6] == b"Ogawa\xff"
+
+
+def test_archives_of_any_size_are_read(tmp_path: Path) -> None:
+    """24 poses of a million points are 288 MB. An archive may begin anywhere in its file: this one
+    does behind a hole as large as that, which takes no room on the disk."""
+    points = np.array([[0, 0, 0], [0, 0, 0.1]], np.float32)
+    with (tmp_path / "poses.npz").open("wb") as file:
+        file.seek(24 * 12 * 1_000_000)
+        np.savez(file, points=np.stack([points, points + 1]), offsets=np.array([0, 2]))
+    np.testing.assert_array_equal(read_poses(tmp_path / "poses.npz")[1].points, points + 1)

@@ -376,6 +376,17 @@ def test_another_unit_is_told_before_what_it_makes_long(capsys, tmp_path, monkey
     assert "both in metres?" in capsys.readouterr().err
 
 
+def test_evaluate_geometry_leaves_a_models_report_alone(capsys, tmp_path):
+    model, hair = tmp_path / "model", Strands.from_list([np.array([[0, 0, 0.1], [0, 0, 0.2]])])
+    model.mkdir()
+    write_strands(model / "strands.npz", hair)
+    (model / "report.json").write_text('{"stages": []}')
+    strands = model / "strands.npz"
+    code, data = run(capsys, "evaluate", "geometry", strands, strands, "--out", model)
+    assert (code, "choose another folder" in data["error"]["detail"]) == (3, True)
+    assert (model / "report.json").read_text() == '{"stages": []}'
+
+
 def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(200, 3))

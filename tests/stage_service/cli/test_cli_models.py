@@ -349,3 +349,19 @@ def test_exports_make_their_folders_and_take_no_place_of_a_models_files(made, ca
     assert {p: p.read_bytes() for p in made.folder.rglob("*") if p.is_file()} == before
     code, found = run(capsys, "edit", made.model, "--cut", 1, "--out", deep)
     assert (code, "no empty folder" in found["error"]["detail"]) == (3, True)
+
+
+def test_a_model_is_not_made_among_others_files(made, capsys, tmp_path, monkeypatch):
+    """It would remove a head.obj that is not its own, and plots with all that is in it."""
+    capture = shutil.copytree(made.capture, tmp_path / "capture")
+    work, model = tmp_path / "my work", shutil.copytree(made.model.path, tmp_path / "model")
+    (work / "plots").mkdir(parents=True)
+    for file in (capture / "head.obj", work / "head.obj", work / "plots" / "mine.png"):
+        file.write_text("mine")
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    for out in (capture, work, work / "head.obj"):
+        code, found = run(capsys, "reconstruct", made.capture, "--out", out)
+        assert (code, f"--out {out} " in found["error"]["detail"]) == (3, True)
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+    monkeypatch.setattr(steps, "reconstruct", lambda _: {})
+    assert run(capsys, "reconstruct", made.capture, "--out", model)[0] == 0  # once more
