@@ -20,6 +20,7 @@ FIELDS = ("none", "turns", "modulation", "additive", "interpolation")
 SIZE, FILM_SIZE = 512, 192
 """Pixels across of a picture and of an animation, where no camera of a rig says."""
 SPP, FILM_SPP = 64, 6
+FRAMES = 24
 
 
 def add(commands: Commands) -> None:
@@ -76,7 +77,7 @@ def add(commands: Commands) -> None:
     moves.add_argument(
         "--sway", type=float, metavar="DEGREES", help="an animation: the hair swings, at the tips"
     )
-    render.add_argument("--frames", type=int, default=24, help="of an animation")
+    render.add_argument("--frames", type=int, help=f"of an animation; default: {FRAMES}")
     render.add_argument("--size", type=int, help="pixels across, where no --camera says")
     render.add_argument(
         "--spp", type=int, help="samples a pixel; default: 64, in an animation 6, smoothed"
@@ -120,6 +121,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     only_lights = args.light and args.environment is None and args.strands is None
     if args.guide == "model" and not (only_lights and args.camera):
         raise ValueError("--guide model: for a --camera of the capture, its pose and --light")
+    if args.size is not None and args.camera is not None:
+        raise ValueError("--size: a --camera's pictures have its own size: leave out one of them")
     if args.size is not None and args.size < 16:
         raise ValueError(f"--size {args.size}: expected 16 or more")
     capture = Capture(args.capture) if args.capture is not None else None
@@ -136,9 +139,10 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     model = Model(args.model)
     of_model = None if args.field == "interpolation" else args.field
     fitted = FittedModel.load(model, capture).with_field_of(model, of_model)
-    camera = three_quarter_view(fitted.strands, args.size or (FILM_SIZE if moves else SIZE))
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
+    else:
+        camera = three_quarter_view(fitted.strands, args.size or (FILM_SIZE if moves else SIZE))
     environment = args.environment or (None if args.light else "studio")
     maps = [] if environment is None else [Environment(environment_map(environment))]
     lights = fitted.lights(args.light) if args.light else []
@@ -174,6 +178,8 @@ def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
     if args.out is not None and args.out.suffix not in suffixes:
         what = "an animation" if moves else "a picture"
         raise ValueError(f"--out {args.out}: {what} is {' or '.join(suffixes)}")
+    if args.frames is not None and (poses > 1 or not moves):
+        raise ValueError("--frames: of --turntable, --turning-light or --sway")
     if not moves:
         return
     if args.field == "interpolation":
@@ -187,7 +193,7 @@ def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
         raise ValueError(
             "--turntable and --turning-light are under a map: without --light and --camera"
         )
-    if not 2 <= args.frames <= 1000:
+    if args.frames is not None and not 2 <= args.frames <= 1000:
         raise ValueError(f"--frames {args.frames}: expected 2 to 1000")
 
 
@@ -209,11 +215,12 @@ def _animate(
     )
 
     camera, lights, maps, sampling = lit
+    count = args.frames or FRAMES
     if args.turntable or args.turning_light:
         turning = turntable if args.turntable else turning_light
-        frames = turning(fitted, maps[0], args.frames, camera.width, sampling, progress)
+        frames = turning(fitted, maps[0], count, camera.width, sampling, progress)
     else:
-        shown = poses or sway(fitted.strands, args.frames, args.sway)
+        shown = poses or sway(fitted.strands, count, args.sway)
         frames = moving(fitted, shown, camera, (lights, maps), sampling, progress)
     write_animation(out, frames)
     return {"frames": len(frames)}

@@ -290,6 +290,9 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
         (("--spp", "0"), "--spp 0: expected 1 or more"),
         (("--guide", "none"), "go with --field interpolation"),
         (("--refine",), "go with --field interpolation"),
+        (("--frames", "9"), "--frames: of --turntable"),
+        (("--turntable", "--frames", "1"), "--frames 1: expected 2 to 1000"),
+        (("--capture", "{capture}", "--camera", "c0", "--size", "64"), "--size: a --camera's"),
         (
             ("--capture", "{capture}", "--field", "interpolation", "--guide", "none", "--refine"),
             "not those of --guide none",
