@@ -140,12 +140,12 @@ class _Runs:
 def _without_help(runs: _Runs, case: SubjectCaptures, folder: Path) -> dict[str, float]:
     """Adds the rows; returns how far off the calibrated rig is."""
     capture, to = Capture(case.still[0]), folder / "capture"
+    runs.add("laid head", copied(capture, to, head=False))
+    copied(capture, to)
+    write_hair_masks(Capture(to), case.still[1])
+    runs.add("true masks", Capture(to))
     runs.progress("calibrating", 0.0)
     rig = calibrated(capture.rig)
-    given = copied(capture, to)
-    write_hair_masks(given, case.still[1])
-    runs.add("true masks", Capture(to))
-    runs.add("laid head", copied(capture, to, head=False))
     runs.add("calibrated rig", copied(capture, to, rig=rig))
     runs.add("without help", copied(capture, to, rig=rig, head=False))
     return rig_errors(rig, capture.rig)

@@ -24,7 +24,7 @@ from simulators.subject.props import SPHERES, PropResponder, SphereProp, board_p
 
 BOARD = Board()
 POSES = range(16)
-SWEPT = 3
+SWEPT = 2
 """Boards that each projector sweeps: those that face it most."""
 EXPOSURE = 0.02
 
