@@ -20,7 +20,7 @@ MEMORY = 1 << 30
 _ROWS = 64
 """Directions from zenith to nadir at least that a map is taken apart into: texels may be large."""
 _DIM = 1e-3
-"""Of the brightest light's irradiance in a colour: dimmer ones are given none of a map."""
+"""Of the usual light's irradiance in a colour: dimmer ones are given none of a map."""
 
 
 class LightSums:
@@ -77,7 +77,8 @@ def weights_of_environment(
     position = np.array([light.position for light in lights])
     unit = position / np.linalg.norm(position, axis=1, keepdims=True)
     own, sent = irradiance(lights), image.reshape(-1, 3) * solid[:, None]
-    shines = own > _DIM * own.max(axis=0)
+    usual = [np.median(x[x > 0]) if x.any() else 0.0 for x in own.T]
+    shines = (own > 0) & (own >= _DIM * np.array(usual))
     weights = np.zeros_like(own)
     for lit in np.unique(shines, axis=1).T:  # of white lights one set, of red, green and blue three
         some, colours = np.flatnonzero(lit), (shines == lit[:, None]).all(axis=0)
