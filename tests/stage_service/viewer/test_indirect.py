@@ -21,11 +21,18 @@ LITTLE = BakeOptions(size=20, views=24, lights=32, spp=48, cells=12)
 
 
 @pytest.fixture(scope="module")
-def lit():
-    """The grid of some hair, the scene, and the box that it fills."""
+def some_hair():
+    """The scene of some hair, and the box that it fills."""
     subject = make_subject("wavy", 1, strands=400)
     scene = build_scene(subject.strands, subject.head, hair=subject.hair, skin=subject.skin)
     box = tuple(f(subject.strands.points, axis=0).astype(float) for f in (np.min, np.max))
+    return scene, box
+
+
+@pytest.fixture(scope="module")
+def lit(some_hair):
+    """The grid of some hair, the scene, and the box that it fills."""
+    scene, box = some_hair
     return bake(scene, box, LIGHTS, LITTLE), scene, box
 
 
@@ -68,9 +75,9 @@ def test_where_nothing_is_there_is_no_light(lit):
     assert not grid.lit(LIGHTS[0].position[None], np.ones((1, 3))).any()
 
 
-def test_a_lamp_of_one_colour_makes_of_it_what_a_white_one_does(lit):
+def test_a_lamp_of_one_colour_makes_of_it_what_a_white_one_does(some_hair):
     """Light adds up: nothing of the colours that it has not, and the other lamps are no darker."""
-    _, scene, box = lit
+    scene, box = some_hair
     options = BakeOptions(size=8, views=4, lights=6, spp=8, cells=4)
     white = LIGHTS[::10]
     red = [replace(white[0], intensity=(6, 0, 0)), *white[1:]]
