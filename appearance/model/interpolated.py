@@ -19,7 +19,7 @@ from appearance.fields.search import refined, searched
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
-from appearance.render.environment_maps import check_environment
+from appearance.render.environment_maps import check_environment, subdivided
 from appearance.render.mixed import Environment
 from appearance.render.olat import render_olat
 from appearance.scene.hair_scene import HairScene
@@ -254,7 +254,8 @@ def environment_lights(environment: Environment, rows: int = ROWS) -> list[Light
 
     A cell's light comes from its brightness-weighted middle; their sum is the map's irradiance.
     """
-    lit = _texels(environment)
+    envmap = check_environment(environment.envmap, "environment")
+    lit = _texels(replace(environment, envmap=subdivided(envmap, rows)))
     cells = [
         np.array_split(np.arange(n), m) for n, m in zip(lit[0].shape, (rows, 2 * rows), strict=True)
     ]
@@ -262,7 +263,6 @@ def environment_lights(environment: Environment, rows: int = ROWS) -> list[Light
         light
         for r in cells[0]
         for c in cells[1]
-        if len(r) and len(c)
         for light in _far(f"cell_{r[0]}_{c[0]}", *(x[np.ix_(r, c)] for x in lit))
     ]
 

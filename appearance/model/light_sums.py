@@ -10,13 +10,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.render.environment_maps import check_environment
+from appearance.render.environment_maps import check_environment, subdivided
 from reconstruction import Camera, Capture, Light
-from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.blocks import block_means
 
 MEMORY = 1 << 30
 """Bytes that one camera's frames may take; larger ones are reduced by whole factors."""
+_ROWS = 64
+"""Directions from zenith to nadir at least that a map is taken apart into: texels may be large."""
+_DIM = 1e-3
+"""Of the usual light's irradiance in a colour: dimmer ones are given none of a map."""
 
 
 class LightSums:
@@ -58,10 +62,10 @@ def weights_of_environment(
     """What each of `lights` is to be multiplied by to stand for a map: `(L, 3)`.
 
     Every direction of the lat-long map `(h, w, 3)` (as in `render_environment`) is given to the
-    nearest light: what its cell sends over the light's own irradiance at the origin. Where the
-    lights leave a part of the sphere empty, the nearest ones stand for it.
+    nearest light that shines in its colour: what its cell sends over the light's own irradiance at
+    the origin. Where the lights leave a part of the sphere empty, the nearest ones stand for it.
     """
-    image = check_environment(envmap, "environment").astype(float)
+    image = subdivided(check_environment(envmap, "environment").astype(float), _ROWS)
     height, width = image.shape[:2]
     theta = np.pi * (np.arange(height) + 0.5) / height
     phi = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width) + np.radians(rotation_deg)
@@ -72,13 +76,43 @@ def weights_of_environment(
     solid = np.repeat((edges[:-1] - edges[1:]) * 2 * np.pi / width, width)
     position = np.array([light.position for light in lights])
     unit = position / np.linalg.norm(position, axis=1, keepdims=True)
-    nearest = np.empty(len(directions), np.int64)
+    own, sent = irradiance(lights), image.reshape(-1, 3) * solid[:, None]
+    usual = [np.median(x[x > 0]) if x.any() else 0.0 for x in own.T]
+    shines = (own > 0) & (own >= _DIM * np.array(usual))
+    weights = np.zeros_like(own)
+    for lit in np.unique(shines, axis=1).T:  # of white lights one set, of red, green and blue three
+        some, colours = np.flatnonzero(lit), (shines == lit[:, None]).all(axis=0)
+        if len(some):
+            nearest = some[_nearest(directions, unit[some])]
+            power = np.stack([np.bincount(nearest, x, len(own)) for x in sent[:, colours].T], -1)
+            weights[np.ix_(some, colours)] = power[some] / own[np.ix_(some, colours)]
+    return weights
+
+
+def stand_ins(lights: Sequence[Light], weights: Array, there: Bools) -> Array:
+    """`weights (L, 3)` of the lights that are `there (L,)` alone, which stand for all.
+
+    What each other light sends to the origin comes from the nearest that has its colours.
+    """
+    own, unit = irradiance(lights), np.array([x.position for x in lights])
+    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    out = np.where(there[:, None], weights, 0.0)
+    for i in np.flatnonzero(~there):
+        power = weights[i] * own[i]
+        able = np.flatnonzero(there & ((own > 0) | (power == 0)).all(axis=1))
+        if power.any() and len(able):
+            j = able[(unit[able] @ unit[i]).argmax()]
+            out[j] += np.divide(power, own[j], out=np.zeros(3), where=own[j] > 0)
+    return out
+
+
+def _nearest(directions: Array, unit: Array) -> Ints:
+    """The number of the nearest of `unit (L, 3)` to each of `directions (D, 3)`."""
+    out = np.empty(len(directions), np.int64)
     for part in range(0, len(directions), 65536):
         block = slice(part, part + 65536)
-        nearest[block] = (directions[block] @ unit.T).argmax(axis=1)
-    power = np.zeros((len(lights), 3))
-    np.add.at(power, nearest, image.reshape(-1, 3) * solid[:, None])
-    return power / np.maximum(irradiance(lights), 1e-12)
+        out[block] = (directions[block] @ unit.T).argmax(axis=1)
+    return out
 
 
 def irradiance(lights: Sequence[Light]) -> Array:
@@ -93,13 +127,16 @@ def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple
     """At most `most` of `lights` that stand for all at their `weights (L, 3)`: (number, weight).
 
     The brightest are taken apart first: each group, of the lights nearest to one of those chosen,
-    has the irradiance of its members and stands where its brightest one is.
+    has the irradiance of its members and stands where its brightest one is. None stands for a
+    colour that it does not shine in, unless `most` leaves no other.
     """
-    power, own = weights * irradiance(lights), irradiance(lights)
-    return [
-        (chosen, power[members].sum(axis=0) / np.maximum(own[chosen], 1e-12))
-        for chosen, members in _groups(lights, power, most)
-    ]
+    own = irradiance(lights)
+    power = weights * own
+    out = []
+    for chosen, members in _groups(lights, power, most):
+        total, given = power[members].sum(axis=0), own[chosen]
+        out.append((chosen, np.divide(total, given, out=np.zeros(3), where=given > 0)))
+    return out
 
 
 def lights_in_turn(
@@ -131,14 +168,20 @@ def _groups(lights: Sequence[Light], power: Array, most: int) -> list[tuple[int,
         return []
     unit = np.array([lights[int(i)].position for i in lit])
     unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    sends, shines = power[lit] > 0, irradiance(lights)[lit] > 0
+
+    def alike(others: list[int]) -> Array:
+        """Cosines between the lit and `others`; less than any where a colour would be lost."""
+        return unit @ unit[others].T - 4.0 * (sends[:, None] & ~shines[others]).any(axis=-1)
+
     chosen = [int(bright[lit].argmax())]
     while len(chosen) < min(most, len(lit)):
         # what is badly stood for: its power times its squared distance to the nearest chosen
-        cost = bright[lit] * (1 - (unit @ unit[chosen].T).max(axis=1)).clip(0)
+        cost = bright[lit] * (1 - alike(chosen).max(axis=1)).clip(0)
         if cost.max() <= 0:
             break
         chosen.append(int(cost.argmax()))
-    group = (unit @ unit[chosen].T).argmax(axis=1)
+    group = alike(chosen).argmax(axis=1)
     return [(int(lit[c]), lit[group == k]) for k, c in enumerate(chosen)]
 
 

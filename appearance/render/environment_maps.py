@@ -49,6 +49,16 @@ def check_environment(envmap: AnyFloats, name: str) -> Floats:
     return np.asarray(image, np.float32)
 
 
+def subdivided(envmap: AnyFloats, rows: int) -> AnyFloats:
+    """The same light as `envmap (h, w, 3)` in a map of at least `rows` rows, 2 `rows` columns.
+
+    Texels are as bright all over, and large ones shine from many directions.
+    """
+    height, width = envmap.shape[:2]
+    fine = envmap.repeat(max(1, -(-rows // height)), axis=0)
+    return fine.repeat(max(1, -(-2 * rows // width)), axis=1)
+
+
 def studio(height: int = 128) -> Floats:
     """A dim grey room `(h, 2 h, 3)` with key, cool fill and warm rim; `height` is h.
 

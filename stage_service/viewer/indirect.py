@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -94,10 +94,15 @@ def bake(
     Each pixel's radiance under each light, less the direct, is put at the mean place of what it
     sees; a cell's coefficients are those of least squares over the directions it was seen from.
     """
-    low, high = box
-    chosen = _spread(lights, options.lights)
+    (low, high), origin = box, np.zeros(3)
+    # of a red lamp nothing is learnt of green, and all that is told is over the irradiance
+    white = [replace(x, intensity=np.ones(3)) for x in lights]
+    chosen = _spread(
+        [x for x in white if x.intensity_towards(origin).any()] or white, options.lights
+    )
     way = np.array([x.position for x in chosen])
-    power = np.array([x.intensity_towards(np.zeros(3)) / (x.position @ x.position) for x in chosen])
+    power = np.array([x.intensity_towards(origin) / (x.position @ x.position) for x in chosen])
+    power[power == 0] = 1
     n = options.cells
     seen = [
         _seen(scene, camera, chosen, options, k)

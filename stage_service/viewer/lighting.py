@@ -15,10 +15,12 @@ import numpy as np
 from appearance import Exposure, FittedModel
 from appearance.bsdf.far_field import azimuthal_table
 from appearance.bsdf.lobes import logistic_scale, variances
+from appearance.inverse_rendering.found_lights import lights_as_found
 from appearance.model.light_sums import (
     LightSums,
     few_lights,
     lights_in_turn,
+    stand_ins,
     weights_of_environment,
 )
 from appearance.model.relight import PROCEDURAL
@@ -39,6 +41,8 @@ LIGHTS_AT_REST = 32
 TURNS_OF_A_LIGHT = 8
 """Lights of the rig that stand for one of these by turns, at rest."""
 COSINES, TURNS = 24, 96
+SEEN_CAMERAS, SEEN_LIGHTS, SEEN_PIXELS = 2, 8, 512
+"""Cameras, frames of each and pixels on a side that an exposure is made of without a fit."""
 KEPT_LIGHTS = 48
 """Lights whose shadows are kept: a byte for each point of the strands and of the head."""
 DOME_LIGHTS, DOME_RADIUS = 331, 1.5
@@ -57,9 +61,9 @@ class Lighting:
 
     @cached_property
     def lights(self) -> list[Light]:
-        """The rig's lights that were shot, or a dome where there is no capture."""
+        """The rig's lights that were shot, as a fit found them, or a dome without a capture."""
         if self._capture is not None and (names := self._capture.olat_lights()):
-            return [self._capture.rig.light(n) for n in names]
+            return lights_as_found(self._model, [self._capture.rig.light(n) for n in names])
         bright = np.full(3, 10.0)
         places = dome_positions(DOME_LIGHTS, DOME_RADIUS, -60)
         return [Light(f"light_{i:03d}", p, bright) for i, p in enumerate(places)]
@@ -71,10 +75,11 @@ class Lighting:
 
     @cached_property
     def exposure(self) -> Exposure:
-        """The capture's as the fit has it, else what the frames under one light want."""
+        """The capture's as the fit has it, else what some frames under one light want."""
         if self._model.has("appearance.json"):
             return self.fitted.appearance.exposure
-        return Exposure(1.0)
+        with self._lock:
+            return Exposure(1.0) if self._capture is None else _exposure(self._capture)
 
     def about(self) -> dict[str, Any]:
         """Lights, and the material if one was fitted; JSON-ready."""
@@ -82,6 +87,7 @@ class Lighting:
             "lights": [{"name": x.name, "position": x.position.tolist()} for x in self.lights],
             "exposure": self.exposure.scale,
             "captured": self._capture is not None and bool(self._capture.olat_lights()),
+            "missing": self._missing(),
             "material": None,
         }
         if self._model.has("appearance.json"):
@@ -100,6 +106,14 @@ class Lighting:
                 "field": fitted.field is not None,
             }
         return out
+
+    def _missing(self) -> dict[str, int]:
+        """Lights that a camera has no frame of, by its name; none where it has all or no frames."""
+        if self._capture is None:
+            return {}
+        has, names = self._capture.has_light, self._capture.olat_lights()
+        found = {c.name: sum(not has(n, c.name) for n in names) for c in self._capture.rig.cameras}
+        return {c: n for c, n in found.items() if 0 < n < len(names)}
 
     def table(self) -> bytes:
         """`azimuthal_table` of the hair `(4, COSINES, TURNS, 4)`, float32; the last is not used."""
@@ -220,7 +234,8 @@ class Lighting:
 
     def sum(self, camera: str, weights: dict[int, list[float]], exposure: float) -> bytes:
         """A PNG of `camera`'s frames under lights (number: RGB): their sum, times `exposure`, in
-        the sRGB curve, each value rounded once."""
+        the sRGB curve, each value rounded once. The nearest light stands for one whose frame is
+        missing."""
         if self._capture is None:
             raise BadLight("there are no frames: name the capture with --capture")
         with self._lock:
@@ -228,11 +243,24 @@ class Lighting:
                 self._sums = None  # the old one's memory first
                 self._sums = camera, LightSums(self._capture, camera)
             sums = self._sums[1]
-        try:
-            radiance = sums({self.lights[i].name: w for i, w in weights.items()})
-        except (ValueError, IndexError) as error:
-            raise BadLight(f"{camera}: {error}") from error
+        if not sums.names:
+            raise BadLight(f"{camera}: the capture has no frame of it under a single light")
+        there = np.isin([x.name for x in self.lights], sums.names)
+        full = stand_ins(self.lights, self._full(weights), there)
+        radiance = sums({self.lights[i].name: full[i] for i in np.flatnonzero(full.any(axis=1))})
         values = np.rint(255 * Exposure(exposure)(radiance)).astype(np.uint8)
         return cv2.imencode(".png", values[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[
             1
         ].tobytes()
+
+
+def _exposure(capture: Capture) -> Exposure:
+    """What some of the frames under one light want: 1 where they are black."""
+    lights, has, pixels = capture.olat_lights(), capture.has_light, [np.zeros((0, 3), np.float32)]
+    shot = {c.name: [n for n in lights if has(n, c.name)] for c in capture.rig.cameras}
+    for camera in [c for c, names in shot.items() if names][:SEEN_CAMERAS]:
+        for name in shot[camera][:: -(-len(shot[camera]) // SEEN_LIGHTS)]:
+            frame = capture.light(name, camera)[0]
+            some = -(-max(frame.shape) // SEEN_PIXELS)
+            pixels.append(frame[::some, ::some].reshape(-1, 3))
+    return Exposure.of_picture(np.concatenate(pixels))

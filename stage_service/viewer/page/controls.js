@@ -50,6 +50,8 @@ export class Controls {
     if (this.relight.told.material) this.colour.append(
       element("option", { value: "lit", textContent: "lit" }));
     this.panel.append(...this.relight.controls());
+    const { camera } = viewer.picture.state;  // chosen meanwhile
+    if (camera) await this.look(camera.name);
   }
 
   cameras() {

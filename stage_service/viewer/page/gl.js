@@ -6,8 +6,11 @@ export function context(canvas) {
     powerPreference: "high-performance", preserveDrawingBuffer: true,
   });
   if (!gl) throw new Error("this browser has no WebGL2: the viewer cannot draw here");
-  gl.getExtension("EXT_color_buffer_float");
-  gl.getExtension("EXT_float_blend");
+  const [half, full, blend] = ["EXT_color_buffer_half_float", "EXT_color_buffer_float", "EXT_float_blend"]
+    .map((name) => gl.getExtension(name));
+  if (!half && !full) throw new Error("this browser's WebGL2 draws no floats: the viewer cannot draw here");
+  // tablets have no blending of full floats: halves are added up there
+  gl.summed = full && blend ? gl.RGBA32F : gl.RGBA16F;
   gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   return gl;
 }

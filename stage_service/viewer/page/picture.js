@@ -25,7 +25,7 @@ export class Picture {
     this.copy = new Program(gl, shaders.SCREEN_VERTEX, shaders.COPY_FRAGMENT);
     this.show = new Program(gl, shaders.SCREEN_VERTEX, shaders.SHOW_FRAGMENT);
     this.film = new Film(gl, gl.RGBA16F, "drawn");
-    this.mean = new Film(gl, gl.RGBA32F, "none");
+    this.mean = new Film(gl, gl.summed, "none");
     this.shadow = new Film(gl, gl.R32UI, "read");
     this.empty = gl.createVertexArray();
     this.samples = 0;

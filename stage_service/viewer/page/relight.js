@@ -173,9 +173,10 @@ export class Relight {
     this.paintDome?.();
     if (this.under) { this.again = true; return; }  // one at a time: the latest wins
     this.under = true;
-    try {
-      do { this.again = false; await this.apply(); } while (this.again);
-    } catch (error) { this.viewer.status(error.message); }
+    do {
+      this.again = false;
+      try { await this.apply(); } catch (error) { this.viewer.status(error.message); }
+    } while (this.again);
     this.under = false;
   }
 
@@ -197,12 +198,14 @@ export class Relight {
 
   async showSum(camera, body) {
     this.viewer.status("adding up captured frames");
-    const answer = await net.ask(net.ofModel(`/sums/${camera}.png`), body);
+    const answer = await net.ask(net.ofModel(`/sums/${encodeURIComponent(camera)}.png`), body);
     const shown = document.getElementById("sum");
     if (shown.src) URL.revokeObjectURL(shown.src);
     shown.src = URL.createObjectURL(await answer.blob());
     await shown.decode();
-    this.viewer.status("");
+    const missing = this.told.missing[camera];
+    this.viewer.status(
+      missing ? `${missing} frames of ${camera} are missing: those of the nearest lights stand for them` : "");
   }
 
   async shade(body) {

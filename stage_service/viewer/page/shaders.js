@@ -34,7 +34,7 @@ vec3 across(vec3 t, vec3 view) {  // to the right of the strand, seen from the e
 export const STRAND_VERTEX = (lighting) => STRAND + `
 uniform sampler2D uLevel;
 uniform vec3 uFlat;
-uniform float uLongest;
+uniform float uLongest, uExposure;
 uniform int uMode;
 out vec3 vColour, vPlace;
 ${lighting}
@@ -60,7 +60,7 @@ void main() {
   else if (uMode == 3) c = ramp(own(strand).x / uLongest);
   else if (uMode == 5) c = uFlat;
   if (uMode == 4) c = lit(p, t, view, strand, texel(strand, k));
-  else c = pow(c, vec3(2.2)) * (0.35 + 0.65 * length(cross(t, view)));
+  else c = pow(c, vec3(2.2)) * (0.35 + 0.65 * length(cross(t, view))) / uExposure;  // the same in any
   vColour = c;
   vPlace = p;
   gl_Position = uMatrix * vec4(q, 1.0);
@@ -174,9 +174,11 @@ out vec3 vColour;
 void main() { vColour = aColour; gl_Position = uMatrix * vec4(aPlace, 1.0); gl_PointSize = 5.0; }`;
 
 export const WIRE_FRAGMENT = HEAD + `
+uniform float uExposure;
+uniform int uLinear;
 in vec3 vColour;
 out vec4 oColour;
-void main() { oColour = vec4(vColour, 1.0); }`;
+void main() { oColour = vec4(uLinear == 1 ? pow(vColour, vec3(2.2)) / uExposure : vColour, 1.0); }`;
 
 export const SCREEN_VERTEX = HEAD + `
 out vec2 vAt;

@@ -15,6 +15,10 @@ class Viewer {
     this.about = about;
     this.canvas = $("canvas");
     this.gl = context(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", () => {
+      this.status("the graphics card has lost the picture: load the page again");
+      $("status").className = "wrong";
+    });
     this.picture = new Picture(this.gl, this.canvas);
     const { low, high } = about.strands.model;
     this.orbit = new Orbit(low, high);

@@ -299,6 +299,15 @@ class TestEnvironments:
         total = sum(irradiance(x, np.zeros((1, 3))) for x in lights)
         np.testing.assert_allclose(total, 4 * np.pi, rtol=1e-4)
 
+    @pytest.mark.parametrize("shape", [(1, 1), (3, 5)])
+    def test_a_uniform_map_of_few_texels_shines_from_all_sides(self, shape):
+        """By symmetry no side of it is brighter: its vector irradiance is 0."""
+        lights = environment_lights(Environment(np.ones((*shape, 3), np.float32)))
+        each = np.array([irradiance(x, np.zeros((1, 3)))[0, 0] for x in lights])
+        assert each.sum() == pytest.approx(4 * np.pi, rel=1e-4)
+        ways = np.array([unit(x.position) for x in lights])
+        np.testing.assert_allclose(each @ ways, 0, atol=0.05)
+
     def test_a_single_texel_shines_from_where_it_is(self):
         envmap = np.zeros((32, 64, 3), np.float32)
         envmap[16, 32] = (1, 2, 3)  # below the horizon by half a texel, +x

@@ -17,6 +17,12 @@ from appearance.model.light_sums import (
 from reconstruction import Light
 from reconstruction.geometry.lights import dome_positions
 
+COLOURED = [
+    Light(f"{name}{i}", p, np.eye(3)[k] * (2.0, 3.0, 4.0))
+    for i, p in enumerate(dome_positions(60, 1.3))
+    for k, name in enumerate("rgb")
+]
+"""A red, a green and a blue lamp in each of 60 places."""
 DOME = [Light(f"l{i}", p, (2.0, 3.0, 4.0)) for i, p in enumerate(dome_positions(200, 1.3))]
 
 
@@ -51,6 +57,30 @@ def test_an_even_environment_keeps_its_irradiance_and_spreads_it():
     np.testing.assert_allclose(power.sum(axis=0), 4 * np.pi * 0.7, rtol=1e-6)
     assert power.min() > 0.5 * power.mean()
     assert power.max() < 1.6 * power.mean()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 4), (5, 3)])
+def test_of_a_map_of_few_texels_light_comes_from_everywhere(shape):
+    """An even map is the same light, however many texels it has."""
+    power = weights_of_environment(DOME, np.full((*shape, 3), 0.7)) * irradiance(DOME)
+    np.testing.assert_allclose(power.sum(axis=0), 4 * np.pi * 0.7, rtol=1e-6)
+    assert power.min() > 0.5 * power.mean()
+    assert power.max() < 1.6 * power.mean()
+
+
+def test_lamps_of_one_colour_and_lamps_that_look_away_keep_a_maps_light():
+    """Each colour of an even map comes from all 60 places, by the lamps that have it."""
+    away = Light("away", (0, 0, 1.29), (5, 5, 5), orientation=np.eye(3), size=(0.1, 0.1))
+    lights = [*COLOURED, away]
+    weights = weights_of_environment(lights, np.full((64, 128, 3), (0.7, 0.2, 0.4)))
+    power = weights * irradiance(lights)
+    np.testing.assert_allclose(power.sum(axis=0), 4 * np.pi * np.array((0.7, 0.2, 0.4)), rtol=1e-6)
+    for k in range(3):
+        assert not np.delete(weights[:, k], np.s_[k:180:3]).any()
+        assert power[k:180:3, k].min() > 0.5 * power[k:180:3, k].mean()
+    few = few_lights(lights, weights, 8)
+    given = sum(w * irradiance(lights)[i] for i, w in few)
+    np.testing.assert_allclose(given, power.sum(axis=0), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("rotation", "towards"), [(0, (1, 0, 0)), (90, (0, 1, 0))])

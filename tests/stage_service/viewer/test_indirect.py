@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,11 +21,18 @@ LITTLE = BakeOptions(size=20, views=24, lights=32, spp=48, cells=12)
 
 
 @pytest.fixture(scope="module")
-def lit():
-    """The grid of some hair, the scene, and the box that it fills."""
+def some_hair():
+    """The scene of some hair, and the box that it fills."""
     subject = make_subject("wavy", 1, strands=400)
     scene = build_scene(subject.strands, subject.head, hair=subject.hair, skin=subject.skin)
     box = tuple(f(subject.strands.points, axis=0).astype(float) for f in (np.min, np.max))
+    return scene, box
+
+
+@pytest.fixture(scope="module")
+def lit(some_hair):
+    """The grid of some hair, the scene, and the box that it fills."""
+    scene, box = some_hair
     return bake(scene, box, LIGHTS, LITTLE), scene, box
 
 
@@ -64,6 +73,24 @@ def test_where_nothing_is_there_is_no_light(lit):
     far = np.array([5.0, 5.0, 5.0])
     grid = bake(scene, (far, far + 0.1), LIGHTS, BakeOptions(size=4, views=1, lights=16, cells=2))
     assert not grid.lit(LIGHTS[0].position[None], np.ones((1, 3))).any()
+
+
+def test_a_lamp_of_one_colour_makes_of_it_what_a_white_one_does(some_hair):
+    """Light adds up: nothing of the colours that it has not, and the other lamps are no darker."""
+    scene, box = some_hair
+    options = BakeOptions(size=8, views=4, lights=6, spp=8, cells=4)
+    white = LIGHTS[::10]
+    red = [replace(white[0], intensity=(6, 0, 0)), *white[1:]]
+    places = np.array([x.position for x in white])
+    expected, found = (
+        np.stack([bake(scene, box, x, options).lit(places[:1], np.array([c])) for c in np.eye(3)])
+        for x in (white, red)
+    )
+    assert np.isfinite(found).all()
+    assert found[0, ..., 0].any()
+    assert not found[0, ..., 1:].any()
+    for k in range(3):  # the irradiance is given: of a colour that it has, the same is told
+        np.testing.assert_allclose(found[k], expected[k], atol=0.05 * expected.max())
 
 
 def test_between_lights_what_is_smooth_is_found():

@@ -6,7 +6,10 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pytest
 
+from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.unknowns import LightDeviations
 from reconstruction import Camera, Capture, CaptureWriter, Light, Rig, Step
 from reconstruction.geometry.lights import dome_positions
 from stage_service.viewer.lighting import Lighting
@@ -41,6 +44,61 @@ def test_a_sum_of_frames_is_exact_to_8_bits(model):
     assert (found == np.rint(shown))[~near_half].all()
     assert near_half.mean() < 0.01
     assert 20 < found.mean() < 235
+
+
+def shot(folder, answers, lights, without=()):
+    """A capture of the camera "c" whose frames are `answers (L, H, W, 3)`, some of them missing."""
+    camera = Camera.look_at("c", 32, 24, (0, -1, 0), (0, 0, 0), 20.0)
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights)]
+    writer = CaptureWriter.create(folder, Rig("r", (camera,), lights), {"steps": steps})
+    for step, radiance in zip(steps, answers, strict=True):
+        if step.light not in without:
+            writer.write_frame(step, "c", radiance.astype(np.float32))
+    writer.finish("completed", {})
+    return Capture(folder)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e3])
+def test_without_a_fit_frames_are_neither_black_nor_white(model, tmp_path, scale):
+    """Whatever the unit of an import: the 99th percentile of all frames is about white."""
+    answers = scale * np.random.default_rng(6).gamma(0.5, 1, (12, 24, 32, 3))
+    lights = tuple(Light(f"l{i}", p, (1, 1, 1)) for i, p in enumerate(dome_positions(12, 1.3)))
+    lighting = Viewed(model, shot(tmp_path / "capture", answers, lights)).lighting
+    told = lighting.about()
+    white = told["exposure"] * np.percentile(answers, 99)
+    assert white == pytest.approx(1, rel=0.1)
+    png = lighting.sum("c", {3: [1, 1, 1]}, told["exposure"])
+    found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert 40 < found.mean() < 200
+    assert Viewed(model).lighting.about()["exposure"] == 1
+
+
+def test_a_missing_frame_is_stood_for_by_that_of_the_nearest_light(model, tmp_path):
+    """Light from there comes from beside it, as much of it; a map can still be shown."""
+    answers = np.random.default_rng(7).gamma(0.5, 0.02, (3, 24, 32, 3))
+    places = ((0, -1.0, 0), (0, -2.0, 0.2), (0, 1.0, 0))
+    lights = tuple(Light(f"l{i}", p, (1, 1, 1)) for i, p in enumerate(places))
+    capture = shot(tmp_path / "capture", answers, lights, without=("l1",))
+    lighting = Viewed(model, capture).lighting
+    assert lighting.about()["missing"] == {"c": 1}
+    png = lighting.sum("c", {i: [1, 2, 3] for i in range(3)}, exposure=1.3)
+    found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    # l1 is twice as far: over 4.04 squared metres
+    x = np.clip(1.3 * np.array((1, 2, 3)) * (answers[0] * (1 + 1 / 4.04) + answers[2]), 0, 1)
+    shown = 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    assert np.abs(found - shown).max() < 0.51
+
+
+def test_lights_shine_as_inverse_rendering_found_them(model, tmp_path):
+    places = dome_positions(3, 1.3)
+    lights = tuple(Light(f"l{i}", p, (4, 4, 4)) for i, p in enumerate(places))
+    still, moved = np.zeros((3, 3)), np.array([[0.02, 0, 0], [0, 0, 0], [0, 0, 0]])
+    found = LightDeviations(moved, still, np.array([0.5, 1, 1]), np.ones(3))
+    save_lights(model, found, lights)
+    lighting = Viewed(model, shot(tmp_path / "capture", np.ones((3, 24, 32, 3)), lights)).lighting
+    (told,) = lighting.few({0: [1, 1, 1]})
+    np.testing.assert_allclose(told["intensity"], 2)
+    np.testing.assert_allclose(told["position"], places[0] + [0.02, 0, 0])
 
 
 def test_all_lights_together_are_the_captured_frame_of_all(model, tmp_path):

@@ -200,6 +200,39 @@ def test_at_rest_light_between_fibres_is_that_of_the_path_tracer(seen, model, vi
     assert seen.complaints == []
 
 
+@pytest.mark.parametrize("model", ["fibre"], indirect=True)
+def test_the_truth_has_its_own_colours_in_whatever_exposure_the_model_is_lit(seen, model):
+    """In motion and at rest: directions are red, green and blue of the same brightness."""
+
+    def shown() -> list[np.ndarray]:
+        return [np.array(seen.page.evaluate(SHOWN, rests), np.uint8) for rests in (False, True)]
+
+    seen.drawn("viewer.relight")
+    seen.page.evaluate("() => { viewer.frame = () => {}; }")
+    seen.page.select_option("select >> nth=1", "truth")
+    unlit = shown()
+    seen.page.select_option("select >> nth=0", "lit")
+    seen.page.wait_for_function("viewer.relight.seen", timeout=PATIENCE_MS)
+    for exposure in (8, 0.1):
+        seen.page.evaluate(f"() => {{ viewer.picture.state.exposure = {exposure}; }}")
+        for expected, found in zip(unlit, shown(), strict=True):
+            assert expected.any()
+            assert np.abs(found.astype(int) - expected).mean() < 1
+    assert seen.complaints == []
+
+
+SHOWN = """(rests) => {
+    const { picture, canvas } = viewer, gl = picture.gl, out = new Uint8Array(4 * 96 * 96);
+    canvas.width = canvas.height = 96;
+    picture.moving(viewer.view);
+    while (rests && picture.samples < picture.enough())
+        for (const _ of picture.oneSample(viewer.view));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, 96, 96, gl.RGBA, gl.UNSIGNED_BYTE, out);
+    return Array.from(out);
+}"""
+
+
 AT_REST = """async (ambient) => {
     const { picture, canvas, relight } = viewer;
     canvas.width = canvas.height = 96;
