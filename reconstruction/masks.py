@@ -22,6 +22,7 @@ from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import depth_map, mesh_depth
+from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.hair_features import (
     FAINTEST_LINES,
     TwoClasses,
@@ -34,6 +35,7 @@ from reconstruction.images.hair_features import (
 )
 from reconstruction.images.segmentation import Network
 from reconstruction.images.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
+from reconstruction.images.visual_hull import trim_edges, visual_hull
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Stage
 
@@ -78,6 +80,18 @@ class MaskedCapture:
     def cameras(self) -> list[Camera]:
         """Those that have a mask."""
         return [c for c in self.capture.rig.cameras if c.name in self.masks]
+
+    def subject_hull(self, spacing: float) -> VoxelGrid:
+        """The visual hull of hair and skin; ends where only skin runs out of the picture.
+
+        Raises `CaptureError` where there is none.
+        """
+        subjects = {k: trim_edges(m.subject, m.hair) for k, m in self.masks.items()}
+        try:
+            some = {k: subject for k, subject in subjects.items() if subject.any()}
+            return visual_hull(self.cameras, some, spacing=spacing)
+        except ValueError as error:
+            raise CaptureError(f"{self.capture.path}: no volume for hair: {error}") from error
 
 
 def hair_masks(

@@ -105,7 +105,7 @@ def build_hull(
 
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
-    hull = envelope = subject_hull(masked, grid)
+    hull = envelope = masked.subject_hull(grid)
     hair, skin = _shown(hull, masked)
     if skin.any():
         # of a volume without any hair there is no distance to it
@@ -127,19 +127,6 @@ def build_hull(
         for c in masked.cameras
     }
     return envelope, hull.inside & ~envelope.inside, depths
-
-
-def subject_hull(masked: MaskedCapture, spacing: float) -> VoxelGrid:
-    """The visual hull of hair and skin; ends where only skin runs out of the picture.
-
-    Raises `CaptureError` where there is none.
-    """
-    subjects = {k: trim_edges(m.subject, m.hair) for k, m in masked.masks.items()}
-    try:
-        some = {k: subject for k, subject in subjects.items() if subject.any()}
-        return visual_hull(masked.cameras, some, spacing=spacing)
-    except ValueError as error:
-        raise CaptureError(f"{masked.capture.path}: no volume for hair: {error}") from error
 
 
 def _shown(hull: VoxelGrid, masked: MaskedCapture) -> tuple[Bools, Bools]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.growth.hair_envelope import subject_hull
 from reconstruction.head.capture_head import (
     FittedHead,
     HeadPoints,
@@ -54,7 +53,7 @@ class Heads:
         with self.report.stage("head") as stage:
             self.progress("looking for a face", 0.0)
             try:
-                points = lit_skin_points(masked, subject_hull(masked, self.options.grid))
+                points = lit_skin_points(masked, masked.subject_hull(self.options.grid))
                 seed = self.options.seed
                 head = fit_capture_head(points, self.options.head_mesh, stage, seed=seed)
                 off = stage.figures["posed_rms_mm"]

@@ -26,7 +26,6 @@ from reconstruction import (
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh_queries import mesh_depth, surface_samples
-from reconstruction.growth.hair_envelope import subject_hull
 from reconstruction.head.capture_head import fit_capture_head, lit_skin_points
 from reconstruction.head.generic import generic_head
 from reconstruction.head.heads import Heads
@@ -146,7 +145,7 @@ def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -
     """Finer pixels than the hull's voxels are averaged, and find the same."""
     capture = Shaded(head, around(size), LIGHTS)
     masked = MaskedCapture(capture, capture.masks)
-    found = lit_skin_points(masked, subject_hull(masked, 3e-3))
+    found = lit_skin_points(masked, masked.subject_hull(3e-3))
     assert found.source in [f"skin under single lights, c{k}" for k in (0, 1, 7)]  # in front
     assert found.hints.turn == pytest.approx(0, abs=0.8)
     apart = ClosestPoint(head, 8e-3)(found.points)[2]
@@ -168,7 +167,7 @@ def test_a_lamp_that_gives_no_light_does_not_move_the_head(head: Mesh) -> None:
     dark = Light(LIGHTS[7].name, LIGHTS[7].position, np.zeros(3))
     capture = OneDark(head, around(120), (*LIGHTS[:7], dark, *LIGHTS[8:]))
     masked = MaskedCapture(capture, capture.masks)
-    found = lit_skin_points(masked, subject_hull(masked, 3e-3))
+    found = lit_skin_points(masked, masked.subject_hull(3e-3))
     assert np.median(ClosestPoint(head, 8e-3)(found.points)[2]) < 2e-3
 
 
@@ -195,9 +194,9 @@ def test_few_lights_or_little_skin_tell_nothing(head: Mesh) -> None:
     few = Shaded(head, around(120), LIGHTS[:20])
     masked = MaskedCapture(few, few.masks)
     with pytest.raises(CaptureError, match="24 single lights"):
-        lit_skin_points(masked, subject_hull(masked, 3e-3))
+        lit_skin_points(masked, masked.subject_hull(3e-3))
     capture = Shaded(head, around(120), LIGHTS)
-    camera, hull = capture.rig.cameras[0], subject_hull(masked, 3e-3)
+    camera, hull = capture.rig.cameras[0], masked.subject_hull(3e-3)
     spot = capture.masks[camera.name].skin.copy()
     spot[:, :57] = False
     spot[:, 63:] = False
