@@ -52,6 +52,7 @@ from reconstruction.capture.import_tables import (
     projectors_of,
     scalp_of,
 )
+from reconstruction.capture.likely_lights import LIKELY, likely_strength
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
 from reconstruction.files.masks import check_alpha, half_grey
@@ -66,8 +67,8 @@ from reconstruction.report.report import Progress, silent
 
 FLAT_FULL = 0.01
 """Share of a flat field that may saturate: specks."""
-BALL_FRAMES = 48
-"""Frames that are read, evenly spread, for what a grey ball says."""
+LOOKS = 48
+"""Frames that are read, evenly spread, for what a grey ball says, or how strong lights may be."""
 
 
 def import_folder(
@@ -231,13 +232,21 @@ class Import:
         """
         subjects = self._subjects(progress)
         masks = {n: _mask(p, self.shot[n]) for n, p in self.found.hair.items()}
-        said: dict[str, Any] = {"notes": [*self.found.notes, *self._ball_says]}
+        strength, lit = self._strength, [*self.found.notes, *self._ball_says]
+        if strength != 1:
+            lit.append(
+                f"the lights' intensities are multiplied by {strength:.3g}, by which the subject "
+                f"reflects {LIKELY:.0%} of their light: a guess, of brown hair and fair skin"
+            )
+        lights = tuple(replace(x, intensity=strength * x.intensity) for x in self.rig.lights)
+        said: dict[str, Any] = {"notes": lit}
         said["relative"] = self.relative
         if self.origin.moved:
             said["origin"] = self.origin.point.tolist()
         plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": said}
         writer = CaptureWriter.create(
-            out, self.rig, plan, masks=self._undistorted(masks), head=self.head,
+            out, replace(self.rig, lights=lights), plan,
+            masks=self._undistorted(masks), head=self.head,
             subjects=self._undistorted(subjects),
         )  # fmt: skip
         frames = [(s, c) for s in self.found.steps for c in self.shot]
@@ -279,7 +288,7 @@ class Import:
 
     @cached_property
     def _scale(self) -> Scale:
-        """The user's scale, or the grey ball's, by `BALL_FRAMES` frames at most."""
+        """The user's scale, or the grey ball's, by `LOOKS` frames at most."""
         if self.ball is None:
             return Scale(self.settings.scale, 0.0, ())
         shown = [
@@ -289,7 +298,7 @@ class Import:
             if step.kind == "olat" and (step.index, camera) in self.found.frames
         ]
         factors = []
-        for step, camera in shown[:: -(-len(shown) // BALL_FRAMES) or 1]:
+        for step, camera in shown[:: -(-len(shown) // LOOKS) or 1]:
             merged = self._merged(self.found.frames[step.index, camera], camera, 1.0)
             light = self.rig.light(str(step.light))
             image, bad = merged.radiance, merged.saturated
@@ -298,6 +307,23 @@ class Import:
             return Scale.of([f for f in factors if f is not None])
         except ValueError as error:
             raise ImportProblem(f"grey_ball: {error}") from error
+
+    @cached_property
+    def _strength(self) -> float:
+        """By what the lights are stronger than their file says, for pictures in relative units."""
+        if not self.relative or self.settings.scale != 1:
+            return 1.0
+        shown = [
+            (step, camera)
+            for step in self.found.steps
+            for camera in self.shot
+            if step.kind == "olat" and (step.index, camera) in self.found.frames
+        ]
+        few = shown[:: -(-len(shown) // LOOKS) or 1]
+        return likely_strength(
+            (self.rig.light(str(s.light)), self.frame(self.found.frames[s.index, c], c).radiance)
+            for s, c in few
+        )
 
     @property
     def _ball_says(self) -> list[str]:

@@ -21,6 +21,8 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import silhouette
 
 MM = 1000.0
+EXPOSURE = 0.02
+"""Seconds, of all pictures but the shorter ones of 8 bits."""
 BRACKET = (1 / 64, 1 / 8, 1.0)
 """Exposures of 8-bit pictures, of the longest."""
 BLACK, WHITE = 512, 16383
@@ -138,8 +140,9 @@ class _Pictures:
         kind = self.written.kind
         light = radiance / np.float32(self.full)
         if kind == "exr":
-            values = np.minimum(radiance, self.full) if self.written.blown else radiance
-            scale = {"fullScale": self.full} if self.written.blown else {}
+            full = EXPOSURE * self.full if self.written.blown else np.inf
+            values = np.minimum(np.float32(EXPOSURE) * radiance, np.float32(full))
+            scale = {"fullScale": full} if self.written.blown else {}
             write_exr(path.with_suffix(".exr"), values.astype(np.float32), scale, compress=False)
         elif kind == "png16":
             _save(path.with_suffix(".png"), np.clip(light, 0, 1) * 65535, np.uint16)
@@ -180,7 +183,7 @@ class _Pictures:
         exposure = "_{exposure}" if kind == "png8" else ""
         lines = [
             *(["exposures = { e0 = 0.0003125, e1 = 0.0025, e2 = 0.02 }"] if kind == "png8" else []),
-            *(["exposure = 0.02"] if kind != "png8" else []),
+            *([f"exposure = {EXPOSURE}"] if kind != "png8" else []),
             "[pictures]",
             *(
                 f'{role} = "{role}/{{camera}}/{name}{exposure}{suffix}"'
