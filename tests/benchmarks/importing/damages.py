@@ -18,15 +18,14 @@ from typing import Any
 
 from appearance import HeldOut, assess, fit
 from appearance.model.options import AssessOptions
-from benchmarks.captures import SimulatedCapture
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, within
 from benchmarks.importing.folders import Written, write_folder
-from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
+from benchmarks.light_planes.subjects import FRAMINGS, demo_capture, subject_capture
 from benchmarks.results import markdown, save
 from benchmarks.strand_truth import StrandTruth
 from reconstruction import Capture, Model, Progress, ReconstructOptions, parse_options, reconstruct
 from stage_service.cli.support.children import own_command
-from stage_service.cli.support.commands import CommandError, rig_path
+from stage_service.cli.support.commands import CommandError
 
 ALL = "all of them, in 8-bit PNG"
 DAMAGES = {
@@ -91,9 +90,7 @@ def _shot(args: argparse.Namespace, progress: Progress) -> tuple[Capture, Path]:
         framing = replace(FRAMINGS["curly"], rows=21, coarser=6)
         made, cameras, every = subject_capture("curly", framing, args.cache, 0.0), 4, 1
     else:
-        text = rig_path("demo").read_text()
-        made = SimulatedCapture("importing", text, "wavy", spp=16, seed=args.seed)
-        cameras, every = 6, 5
+        made, cameras, every = demo_capture(args.seed), 6, 5
     path, truth = made.make(args.cache, progress)
     whole = Capture(path)
     names = [c.name for c in whole.rig.cameras][:cameras]

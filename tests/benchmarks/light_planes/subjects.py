@@ -1,7 +1,8 @@
-"""The light-plane method on three subjects, still and drifting, beside baselines.
+"""The light-plane method on three subjects, still and drifting, and the demo's, beside baselines.
 
-Sintel and a ponytail come from the folder of data; curls are procedural. Captures go through the
-wires once and are kept. Leaves `light_planes/SUBJECT/` and `light_planes.json`.
+Sintel and a ponytail come from the folder of data; curls and the demo's waves are procedural.
+Captures go through the wires once and are kept. Leaves `light_planes/SUBJECT/` and
+`light_planes.json`.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from reconstruction import (
 )
 from reconstruction.head.fit import HeadHints, fit_head
 from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
+from stage_service.cli.support.commands import rig_path
 
 CAMERAS, PROJECTORS = 8, 3
 WIDTH, HEIGHT, ROWS, LIGHTS = 320, 400, 256, 120
@@ -137,29 +139,35 @@ def subject_capture(
     return SimulatedCapture(label, rig, subject, head, drift_mm, spp)
 
 
+def demo_capture(seed: int = 0) -> SimulatedCapture:
+    """That of `make demo`."""
+    return SimulatedCapture("demo", rig_path("demo").read_text(), "wavy", spp=16, seed=seed)
+
+
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Each subject that there is data for; see `study`."""
     folder = args.out / "light_planes"
-    framings = {k: v for k, v in FRAMINGS.items() if args.only in (None, k)}
+    framings = {k: v for k, v in {**FRAMINGS, "demo": None}.items() if args.only in (None, k)}
     if not framings:
-        raise LeftOut(f"no subject {args.only!r}; there are {', '.join(FRAMINGS)}")
+        raise LeftOut(f"no subject {args.only!r}; there are {', '.join(FRAMINGS)} and demo")
     also = ["drifting"] if args.quick else args.also  # a board does not show in so few pixels
     if args.quick:
         framings = {"curly": replace(FRAMINGS["curly"], rows=21, coarser=6)}
     for k, (name, framing) in enumerate(framings.items()):
-        if name != "curly" and data_folder() is None:
+        if name in ("sintel", "ponytail") and data_folder() is None:
             continue
         tell = within(progress, name, k / len(framings), 1 / len(framings))
-        captures = [
-            subject_capture(name, framing, args.cache, drift).make(args.cache, tell)
-            for drift in ((0.0, DRIFT_MM) if "drifting" in also else (0.0,))
-        ]
-        options = replace(OPTIONS, max_length=framing.longest)
+        if framing is None:
+            made, options = [demo_capture(args.seed)], ReconstructOptions()
+        else:
+            drifts = (0.0, DRIFT_MM) if "drifting" in also else (0.0,)
+            made = [subject_capture(name, framing, args.cache, drift) for drift in drifts]
+            options = replace(OPTIONS, max_length=framing.longest)
         if args.quick:
             options = replace(options, grid=4e-3, roots=500)
         study(
             folder / name,
-            SubjectCaptures(*captures),
+            SubjectCaptures(*(capture.make(args.cache, tell) for capture in made)),
             options,
             without_help="without_help" in also,
             studies=name == "sintel" and "studies" in also,

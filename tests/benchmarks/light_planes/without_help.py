@@ -22,8 +22,9 @@ from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
 from reconstruction.capture.folder import StepKind
 from simulators.subject.props import SPHERES, PropResponder, SphereProp, board_pose
 
-BOARD = Board()
 POSES = range(16)
+SQUARE = 20
+"""Pixels that a square of the board is wide, at least: its marker has six cells a side."""
 SWEPT = 2
 """Boards that each projector sweeps: those that face it most."""
 EXPOSURE = 0.02
@@ -35,14 +36,17 @@ def calibrated(rig: Rig) -> Rig:
     From nominal places that are centimetres off; moved to where the true cameras are, as the world
     of strands is nobody's error.
     """
-    nominal = believed(rig)
+    nominal, board = believed(rig), _board(rig)
+    swept = {p.name: _facing(p, board) for p in rig.projectors}
     with TemporaryDirectory() as folder:
         boards = [
             shoot(
                 Path(folder) / f"board-{pose}",
                 rig,
-                PropResponder(rig, board_pose(pose, BOARD), samples=2),
-                _steps(_all_on(), *(_sweep(p) for p in rig.projectors if pose in _facing(p))),
+                PropResponder(rig, board_pose(pose, board), samples=2),
+                _steps(
+                    _all_on(), *(_sweep(p) for p in rig.projectors if pose in _facing(p, board))
+                ),
                 written=nominal,
             )
             for pose in POSES
@@ -57,7 +61,7 @@ def calibrated(rig: Rig) -> Rig:
             )
             for k, place in enumerate(SPHERES)
         ]
-        found, _ = calibrate(nominal, TargetCaptures(boards, diffuse=spheres), Targets(BOARD, 0.8))
+        found, _ = calibrate(nominal, TargetCaptures(boards, diffuse=spheres), Targets(board, 0.8))
     return aligned(found, rig)
 
 
@@ -83,10 +87,19 @@ def rig_errors(found: Rig, truth: Rig) -> dict[str, float]:
     }
 
 
-def _facing(projector: Projector) -> list[int]:
+def _board(rig: Rig) -> Board:
+    """The usual one, or one of fewer and larger squares where pixels are wide."""
+    pixel = max(float(np.linalg.norm(c.center)) / c.K[0, 0] for c in rig.cameras)
+    usual = Board()
+    if SQUARE * pixel <= usual.square:
+        return usual
+    return Board(6, 5, SQUARE * pixel, SQUARE * pixel * usual.marker / usual.square)
+
+
+def _facing(projector: Projector, board: Board) -> list[int]:
     """Numbers of the boards whose front faces it most."""
     away = projector.center / np.linalg.norm(projector.center)
-    facing = [-board_pose(n, BOARD).rotation[:, 2] @ away for n in POSES]
+    facing = [-board_pose(n, board).rotation[:, 2] @ away for n in POSES]
     return np.argsort(facing)[-SWEPT:].tolist()
 
 
