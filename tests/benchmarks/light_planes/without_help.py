@@ -44,9 +44,7 @@ def calibrated(rig: Rig) -> Rig:
                 Path(folder) / f"board-{pose}",
                 rig,
                 PropResponder(rig, board_pose(pose, board), samples=2),
-                _steps(
-                    _all_on(), *(_sweep(p) for p in rig.projectors if pose in _facing(p, board))
-                ),
+                _steps(_all_on(), *(_sweep(p) for p in rig.projectors if pose in swept[p.name])),
                 written=nominal,
             )
             for pose in POSES
