@@ -22,8 +22,8 @@ from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
 from reconstruction.capture.folder import StepKind
 from simulators.subject.props import SPHERES, PropResponder, SphereProp, board_pose
 
-POSES = range(16)
-SQUARE = 20
+POSES = range(32)
+SQUARE = 24
 """Pixels that a square of the board is wide, at least: its marker has six cells a side."""
 SWEPT = 2
 """Boards that each projector sweeps: those that face it most."""
@@ -44,7 +44,7 @@ def calibrated(rig: Rig) -> Rig:
                 Path(folder) / f"board-{pose}",
                 rig,
                 PropResponder(rig, board_pose(pose, board), samples=2),
-                _steps(_all_on(), *(_sweep(p) for p in rig.projectors if pose in swept[p.name])),
+                _steps(_all_on(rig), *(_sweep(p) for p in rig.projectors if pose in swept[p.name])),
                 written=nominal,
             )
             for pose in POSES
@@ -54,7 +54,7 @@ def calibrated(rig: Rig) -> Rig:
                 Path(folder) / f"sphere-{k}",
                 rig,
                 PropResponder(rig, SphereProp(place, 0.05, 0.8), samples=2),
-                _steps(_all_on(), _single_lights(rig)),
+                _steps(_all_on(rig), _single_lights(rig)),
                 written=nominal,
             )
             for k, place in enumerate(SPHERES)
@@ -91,7 +91,7 @@ def _board(rig: Rig) -> Board:
     usual = Board()
     if SQUARE * pixel <= usual.square:
         return usual
-    return Board(6, 5, SQUARE * pixel, SQUARE * pixel * usual.marker / usual.square)
+    return Board(6, 4, SQUARE * pixel, SQUARE * pixel * usual.marker / usual.square)
 
 
 def _facing(projector: Projector, board: Board) -> list[int]:
@@ -105,8 +105,9 @@ def _steps(*parts: Iterator[Step] | Sequence[Step]) -> list[Step]:
     return [replace(step, index=k) for k, step in enumerate(chain(*parts))]
 
 
-def _all_on() -> list[Step]:
-    return [_step("dark", level=0.0), _step("all_on", level=0.05)]
+def _all_on(rig: Rig) -> list[Step]:
+    """So many lamps as the rigs have, dimmed until white paper is half of a full channel."""
+    return [_step("dark", level=0.0), _step("all_on", level=min(1.0, 6 / len(rig.lights)))]
 
 
 def _single_lights(rig: Rig) -> Iterator[Step]:
