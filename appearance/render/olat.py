@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
@@ -24,15 +23,15 @@ from appearance.render.tracing import (
     Paths,
     add_light,
     follow,
+    render_again,
     tile_count,
 )
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera, Light
-from reconstruction.arrays import Floats, Ints
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.options import Count, options
 
-_log = logging.getLogger(__name__)
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many
 _PILOT_STREAM = 1 << 31
@@ -138,14 +137,14 @@ def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = Fal
         for k in range(tiles):
             part = slice(k, None, tiles)
             out[:, part] = plan.render(index[part], options.spp, (seed, k))
-        # seen once in hundreds of renders, in two pixels, and never again with the same numbers
-        bad = np.flatnonzero(~np.isfinite(out).all(axis=(0, 2)))
-        if len(bad):
-            where = f"{camera.name}: light is not finite in pixels {index[bad][:10].tolist()}"
-            _log.warning("%s, seed %d; they are rendered again", where, seed)
+
+        def again(bad: Ints) -> None:
             out[:, bad] = plan.render(index[bad], options.spp, (seed, tiles))
-            if not np.isfinite(out[:, bad]).all():
-                raise FloatingPointError(f"{where}, twice: look at the strands and lights there")
+
+        def finite() -> Bools:
+            return np.asarray(np.isfinite(out).all(axis=(0, 2)))
+
+        render_again(camera, index, finite, again, seed)
     return out
 
 

@@ -21,12 +21,13 @@ from appearance.render.tracing import (
     Paths,
     add_light,
     follow,
+    render_again,
     tile_count,
 )
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction import Camera, Projector
-from reconstruction.arrays import Floats, Ints
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.options import Count, options
 
 _PILOT = 512  # pixels of the pilot pass
@@ -76,10 +77,21 @@ def render_scanlines(
     if len(index):
         plan = _plan(scene, camera, sweep, index, chosen, seed)
         tiles = tile_count(index, 3 * 12 * sum(len(r) for _, r in sweep), chosen.memory)
+        places = index if pixels is None else np.arange(len(index))
+
+        def render(part: Any, stream: int) -> None:
+            for name, film in plan.render(index[part], chosen.spp, (seed, stream)).items():
+                out[name][:, places[part]] = film
+
+        def finite() -> Bools:
+            every: Bools = np.ones(len(index), bool)
+            for film in out.values():
+                every &= np.asarray(np.isfinite(film).all(axis=(0, 2)))[places]
+            return every
+
         for k in range(tiles):
-            part = slice(k, None, tiles)
-            for name, film in plan.render(index[part], chosen.spp, (seed, k)).items():
-                out[name][:, index[part] if pixels is None else part] = film
+            render(slice(k, None, tiles), k)
+        render_again(camera, index, finite, lambda bad: render(bad, tiles), seed)
     if pixels is not None:
         return out
     return {n: o.reshape(len(o), camera.height, camera.width, 3) for n, o in out.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -15,8 +16,10 @@ from appearance.render.paths import Surface, jittered, seed_state, stream_of
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import Ints
+from reconstruction.arrays import Bools, Ints
 from reconstruction.options import Count, options
+
+_log = logging.getLogger(__name__)
 
 LANE_BYTES = 512
 """What a path in flight takes, about."""
@@ -150,3 +153,26 @@ def add_light(film: Any, value: Any, first: Any, active: Any, stride: Any = 1) -
 def tile_count(pixels: Ints, each: int, memory: int) -> int:
     """In how many tiles to render `pixels (P,)`, which take `each` bytes beside a path's."""
     return -(-len(pixels) // max(1, memory // (each + LANE_BYTES)))
+
+
+def render_again(
+    camera: Camera,
+    index: Ints,
+    finite: Callable[[], Bools],
+    again: Callable[[Ints], None],
+    seed: int,
+) -> None:
+    """Render those of the flat pixels `index (P,)` once more whose light is not finite.
+
+    Seen twice in hundreds of renders, in a pixel or two, and never again with the same numbers.
+    `finite` says of each whether it is, `again` renders those at some places of `index` anew.
+    Raises `FloatingPointError` where light stays so.
+    """
+    bad = np.flatnonzero(~finite())
+    if not len(bad):
+        return
+    where = f"{camera.name}: light is not finite in pixels {index[bad][:10].tolist()}"
+    _log.warning("%s, seed %d; they are rendered again", where, seed)
+    again(bad)
+    if not finite().all():
+        raise FloatingPointError(f"{where}, twice: look at the strands and lights there")

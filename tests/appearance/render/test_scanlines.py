@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from appearance import HairAppearance, build_scene, render_olat, render_scanlines
+from appearance.render import scanlines
 from reconstruction import Camera, Light, Projector
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
@@ -150,3 +151,32 @@ def test_a_camera_that_sees_nothing_gets_black_rows(floor):
     swept = render_scanlines(floor, away, [projector()])["proj"]
     assert swept.shape == (16, 8, 8, 3)
     assert not swept.any()
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
+    floor, above, monkeypatch, caplog, chosen
+):
+    """Of the whole picture, and of some pixels of it; neither is as many as the other."""
+    pixels = np.arange(100, 1000, 3) if chosen else None
+    swept, right, times = projector(), scanlines._Plan.render, [0]
+    sound = render_scanlines(floor, above, [swept], spp=4, pixels=pixels)["proj"]
+    pixel = 487
+
+    def spoilt(plan, index, spp, seed):
+        out = right(plan, index, spp, seed)
+        if spp == 4 and times[0]:
+            out["proj"][3, index == pixel] = np.nan
+            times[0] -= 1
+        return out
+
+    monkeypatch.setattr(scanlines._Plan, "render", spoilt)
+    times[0] = 1
+    again = render_scanlines(floor, above, [swept], spp=4, pixels=pixels)["proj"]
+    assert np.isfinite(again).all()
+    changed = (again != sound).any(axis=(0, -1)).ravel()
+    assert np.flatnonzero(changed).tolist() == [129 if chosen else pixel]
+    assert str(pixel) in caplog.text
+    times[0] = 2
+    with pytest.raises(FloatingPointError, match=str(pixel)):
+        render_scanlines(floor, above, [swept], spp=4, pixels=pixels)
