@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
+
+import pytest
 
 from simulators.peers.faults import Fault, Faults
 
@@ -53,3 +58,16 @@ def gone(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
     except OSError:
         return True
+
+
+def orphan(code: str, folder: Path) -> int:
+    """A process that `code`, run on `folder`, has started, whose number it prints, and is killed
+    then. Skips where children are not tied."""
+    if shutil.which("setpriv") is None:
+        pytest.skip("there is no setpriv here: children outlive a service that is killed")
+    words = [sys.executable, "-c", code, folder]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
+        assert service.stdout is not None
+        child = int(service.stdout.readline())
+        service.kill()
+    return child

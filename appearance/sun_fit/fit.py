@@ -134,8 +134,8 @@ def fit(
             stage.warn(warning)
         if capture.plan.get("import", {}).get("relative"):
             stage.warn(
-                "the pictures are in relative units: how dark the hair is follows their "
-                "brightness; import them with a grey ball, or with `scale` and the lights' "
+                "the pictures are in relative units: how dark the hair is, is guessed with the "
+                "lights' strength; import them with a grey ball, or with `scale` and the lights' "
                 "intensities, to know it"
             )
     made = (colours.hair, colours.colour, colours.skin, exposure)

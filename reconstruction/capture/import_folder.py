@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ from reconstruction.report.report import Progress, silent
 FLAT_FULL = 0.01
 """Share of a flat field that may saturate: specks."""
 LOOKS = 48
-"""Frames that are read, evenly spread, for what a grey ball says, or how strong lights may be."""
+"""Frames that are read, drawn from all, for what a grey ball says, or how strong lights may be."""
 
 
 def import_folder(
@@ -291,14 +292,8 @@ class Import:
         """The user's scale, or the grey ball's, by `LOOKS` frames at most."""
         if self.ball is None:
             return Scale(self.settings.scale, 0.0, ())
-        shown = [
-            (step, camera)
-            for step in self.found.steps
-            for camera in self.ball.seen
-            if step.kind == "olat" and (step.index, camera) in self.found.frames
-        ]
         factors = []
-        for step, camera in shown[:: -(-len(shown) // LOOKS) or 1]:
+        for step, camera in self._some(self.ball.seen):
             merged = self._merged(self.found.frames[step.index, camera], camera, 1.0)
             light = self.rig.light(str(step.light))
             image, bad = merged.radiance, merged.saturated
@@ -313,17 +308,20 @@ class Import:
         """By what the lights are stronger than their file says, for pictures in relative units."""
         if not self.relative or self.settings.scale != 1:
             return 1.0
-        shown = [
-            (step, camera)
-            for step in self.found.steps
-            for camera in self.shot
-            if step.kind == "olat" and (step.index, camera) in self.found.frames
-        ]
-        few = shown[:: -(-len(shown) // LOOKS) or 1]
         return likely_strength(
             (self.rig.light(str(s.light)), self.frame(self.found.frames[s.index, c], c).radiance)
-            for s, c in few
+            for s, c in self._some(self.shot)
         )
+
+    def _some(self, cameras: Iterable[str]) -> list[tuple[Step, str]]:
+        """At most `LOOKS` frames of these cameras under single lights, at random: every so many
+        would be always the same camera's."""
+        shown = [
+            (step, camera)
+            for step, camera in product(self.found.steps, cameras)
+            if step.kind == "olat" and (step.index, camera) in self.found.frames
+        ]
+        return [shown[k] for k in np.random.default_rng(0).permutation(len(shown))[:LOOKS]]
 
     @property
     def _ball_says(self) -> list[str]:

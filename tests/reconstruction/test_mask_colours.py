@@ -18,6 +18,8 @@ from simulators.subject.drift import Drift
 from simulators.subject.subject import make_subject
 
 LIGHTS = 48
+LEAST = {"black": 0.8, "brown": 0.75, "red": 0.87, "blond": 0.95, "white": 0.95}
+"""Overlaps in the worse of two pictures: .88, .84, .93, .97, .97; .56 with the face as hair."""
 ABSORPTION = {
     "black": (3.0, 4.0, 6.0),
     "brown": (0.6, 0.9, 1.6),
@@ -51,4 +53,4 @@ def test_no_colour_of_hair_is_taken_for_skin(colour: str, tmp_path: Path) -> Non
         hair = (share["hair"] + share["head"] > 0.1) & (share["hair"] >= share["head"])
         found = masks[camera.name].hair
         overlap = (found & hair).sum() / (found | hair).sum()
-        assert overlap > 0.75  # .84 of brown to .98 of white; .56 with the face
+        assert overlap > LEAST[colour]

@@ -13,8 +13,6 @@ from reconstruction import Light, Rig, import_folder, write_exr
 from reconstruction.arrays import Floats
 from reconstruction.capture.likely_lights import LIKELY, likely_strength
 
-NAMES = ("light_000", "light_001", "light_002")
-
 
 def matte(albedo: float, unit: float, intensity: float = 8.0, border: int = 0) -> Floats:
     """A white light 2 m away on a matte plane that faces it: L = ρ I / (π d²); in any unit."""
@@ -39,32 +37,47 @@ def test_one_picture_in_three_decides_nothing_and_dark_ones_are_passed_over() ->
     assert likely_strength([]) == 1
 
 
-@pytest.mark.parametrize("suffix", [".png", ".exr"])
-def test_an_import_makes_lights_as_strong_and_says_so(tmp_path: Path, suffix: str) -> None:
-    """16 bits, a fifth of full: of lights of 1 W/sr, 2 m away, a matte plane sends ρ/(4 π)."""
-    folder = tmp_path / "folder"
+def written(folder: Path, suffix: str, lights: int = 3, dark: tuple[str, ...] = ()) -> Path:
+    """Even pictures, a fifth of full, of two cameras, one black; lights of 1 W/sr 2 m away."""
     K = [[30, 0, 7.5], [0, 30, 7.5], [0, 0, 1]]
     pose = {"width": 16, "height": 16, "K": K, "R": np.eye(3).tolist()}
     cameras = [{"id": c, **pose, "t": [i, 0, 1]} for i, c in enumerate(("left", "right"))]
-    place = {"intensity": [1, 1, 1]}
-    lights = [{"id": n, "position": [0, 0.01 * i, -2], **place} for i, n in enumerate(NAMES)]
+    names = [f"light_{k:03d}" for k in range(lights)]
+    place = {"position": [0, 0, -2], "intensity": [1, 1, 1]}
     for camera in ("left", "right"):
         (folder / "images" / camera).mkdir(parents=True)
-        for name in NAMES:
+        image = np.full((16, 16, 3), 0.0 if camera in dark else 0.2, np.float32)
+        for name in names:
             file = folder / "images" / camera / (name + suffix)
             if suffix == ".exr":
-                write_exr(file, np.full((16, 16, 3), 0.2, np.float32))
+                write_exr(file, image)
             else:
-                cv2.imwrite(str(file), np.full((16, 16, 3), round(0.2 * 65535), np.uint16))
+                cv2.imwrite(str(file), np.rint(image * 65535).astype(np.uint16))
     (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}))
-    (folder / "lights.json").write_text(json.dumps({"lights": lights}))
+    lit = [{"id": n, **place} for n in names]
+    (folder / "lights.json").write_text(json.dumps({"lights": lit}))
+    return folder
+
+
+def test_an_import_makes_lights_as_strong_and_says_so(tmp_path: Path) -> None:
+    """A matte plane sends ρ/(4 π) of such a light."""
+    capture = import_folder(written(tmp_path / "folder", ".png"), tmp_path / "out")
+    strength = Rig.load(capture.path / "rig.json").lights[0].intensity[0]
+    assert strength == pytest.approx(0.2 * 4 * np.pi / LIKELY, rel=1e-3)
+    assert "intensities are multiplied by 12.6" in " ".join(capture.plan["import"]["notes"])
+    assert capture.frame(capture.steps[0], "left").mean() == pytest.approx(0.2, rel=1e-3)
+
+
+def test_floats_are_radiance_and_their_lights_stay(tmp_path: Path) -> None:
+    capture = import_folder(written(tmp_path / "folder", ".exr"), tmp_path / "out")
+    assert (Rig.load(capture.path / "rig.json").lights[0].intensity == 1).all()
+    assert "multiplied" not in " ".join(capture.plan["import"]["notes"])
+
+
+@pytest.mark.parametrize("dark", ["left", "right"])
+def test_of_many_frames_those_of_all_cameras_are_looked_at(tmp_path: Path, dark: str) -> None:
+    """Every fourth frame is always of the first of two cameras."""
+    folder = written(tmp_path / "folder", ".png", lights=96, dark=(dark,))
     capture = import_folder(folder, tmp_path / "out")
     strength = Rig.load(capture.path / "rig.json").lights[0].intensity[0]
-    notes = " ".join(capture.plan["import"]["notes"])
-    if suffix == ".exr":  # floats are W/(sr m²) where nothing else is said
-        assert strength == 1
-        assert "multiplied" not in notes
-        return
     assert strength == pytest.approx(0.2 * 4 * np.pi / LIKELY, rel=1e-3)
-    assert "intensities are multiplied by 12.6" in notes
-    assert capture.frame(capture.steps[0], "left").mean() == pytest.approx(0.2, rel=1e-3)

@@ -17,7 +17,14 @@ from scipy.spatial.transform import Rotation
 from reconstruction import Mesh, read_obj
 from reconstruction.geometry.closest_point import ClosestPoint, closest_on_triangles
 from reconstruction.geometry.mesh_queries import surface_samples
-from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head, mark_scalp
+from reconstruction.head.fit import (
+    HeadFit,
+    HeadFitError,
+    HeadHints,
+    Part,
+    fit_head,
+    mark_scalp,
+)
 from reconstruction.head.generic import generic_head
 from reconstruction.head.pose import similarity
 from reconstruction.head.scalp_map import ScalpMap
@@ -109,13 +116,13 @@ def test_few_points_give_a_pose() -> None:
 
 
 @pytest.mark.parametrize("part", ["head", "scalp"])
-def test_normals_that_point_into_the_head_are_an_error_that_says_so(part: str) -> None:
+def test_normals_that_point_into_the_head_are_an_error_that_says_so(part: Part) -> None:
     """As of scanners and meshes that are inside out; the head came out centimetres off."""
     head = generic_head()
     places, normals, face = surface_samples(head, 6e-3)
     on = head.scalp[face] if part == "scalp" else np.ones(len(face), bool)
     points, outward = 1.03 * places[on][::4] + [0.01, 0.02, 0.03], normals[on][::4]
-    hints = HeadHints(part=part)  # type: ignore[arg-type]
+    hints = HeadHints(part=part)
     assert not fit_head(points, outward, hints=hints).warnings
     with pytest.raises(HeadFitError, match="the normals point into the head: turn them round"):
         fit_head(points, -outward, hints=hints)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -16,7 +13,7 @@ import numpy as np
 import pytest
 from serving import Client, serving, slug
 from shooting import shoot
-from waiting import gone, until
+from waiting import gone, orphan, until
 
 from reconstruction import Camera, Light, Rig, Step
 from reconstruction.calibration.boards import Board
@@ -106,8 +103,6 @@ def test_the_rig_that_comes_of_it_and_why_none_does(truth, http, tmp_path):
 
 
 def test_one_that_runs_ends_with_a_service_that_is_killed(nominal, tmp_path):
-    if shutil.which("setpriv") is None:
-        pytest.skip("there is no setpriv here: children outlive a service that is killed")
     code = """
 import os, signal, sys, time
 from pathlib import Path
@@ -127,9 +122,5 @@ print(child, flush=True)
 time.sleep(600)
 """
     (tmp_path / "nominal.json").write_text(json.dumps(nominal.to_dict()))
-    words = [sys.executable, "-c", code, tmp_path]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
-        assert service.stdout is not None
-        child = int(service.stdout.readline())
-        service.kill()
+    child = orphan(code, tmp_path)
     until(lambda: gone(child))

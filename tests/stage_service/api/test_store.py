@@ -7,8 +7,6 @@ import io
 import json
 import shutil
 import socket
-import subprocess
-import sys
 import tarfile
 import threading
 import time
@@ -18,9 +16,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 from serving import Client, serving, slug
-from waiting import gone, until
+from waiting import gone, orphan, until
 
 from reconstruction import Capture, Model, verify
 from stage_service.acquisition.states import CaptureStatus
@@ -250,8 +247,6 @@ def test_a_snapshot_is_there_until_the_next_one_whatever_becomes_of_the_service(
 
 
 def test_what_reads_a_capture_again_ends_with_a_service_that_is_killed(tmp_path):
-    if shutil.which("setpriv") is None:
-        pytest.skip("there is no setpriv here: children outlive a service that is killed")
     code = """
 import subprocess, sys, time
 from pathlib import Path
@@ -270,11 +265,7 @@ one.start()
 one.ask("any", root)
 time.sleep(600)
 """
-    words = [sys.executable, "-c", code, tmp_path]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
-        assert service.stdout is not None
-        child = int(service.stdout.readline())
-        service.kill()
+    child = orphan(code, tmp_path)
     until(lambda: gone(child))
 
 
