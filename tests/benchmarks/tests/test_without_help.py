@@ -15,12 +15,12 @@ from simulators.subject.props import PropResponder, SphereProp
 
 
 @pytest.mark.slow
-def test_props_calibrate_a_stage_as_well_as_is_documented(true_rig: Rig) -> None:
+def test_props_calibrate_a_stage_to_a_fraction_of_what_is_documented(true_rig: Rig) -> None:
     off = rig_errors(calibrated(true_rig), true_rig)
-    assert off["cameras: reprojection_px"] < 0.2
-    assert off["cameras: centre_mm"] < 2
-    assert off["projectors: plane_mm"] < 1
-    assert off["lights: position"] < 0.01
+    assert off["cameras: reprojection_px"] < 0.024
+    assert off["cameras: centre_mm"] < 1.2
+    assert off["projectors: plane_mm"] < 0.06
+    assert off["lights: position"] < 0.002
 
 
 def test_a_copy_has_another_rig_and_no_head_and_leaves_the_capture_alone(
