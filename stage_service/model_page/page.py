@@ -168,7 +168,8 @@ def _laid_head(model: Model) -> Iterator[tuple[str, list[str]]]:
     """Under what a head was laid that nobody measured, and how near it came."""
     laid = next((s.figures for s in model.report().stages if s.name == "head"), {})
     if model.has("head.obj") and {"template", "source", "rms_mm"} <= set(laid):
-        said = f": the {laid['template']} laid under {laid['source']}, {laid['rms_mm']:.1f} mm off"
+        where = f": the {laid['template']} laid under {laid['source']}"
+        said = f"{where}, {laid['rms_mm']:.1f} mm off what it was laid under, root mean square"
         yield "head", [link("head.obj"), said]
 
 

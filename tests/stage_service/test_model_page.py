@@ -104,7 +104,7 @@ def test_a_head_that_nobody_measured_is_called_what_it_is(model):
     model.write_head(Mesh(np.eye(3), np.array([[0, 1, 2]])))
     text = Page(model_page(model)).text
     assert said in text
-    assert "1.2 mm off" in text
+    assert "1.2 mm off what it was laid under" in text
 
 
 def test_names_and_messages_are_text_and_nothing_runs_or_is_fetched(model):
