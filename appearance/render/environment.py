@@ -26,7 +26,15 @@ from appearance.render.paths import (
     stream_of,
 )
 from appearance.render.pixel_field import DeviceField, PixelField, factor_of, field_of
-from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
+from appearance.render.tracing import (
+    SAMPLING,
+    PathPlan,
+    Paths,
+    Sampling,
+    add_light,
+    follow,
+    render_whole,
+)
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
@@ -49,7 +57,8 @@ def render_environment(
 
     `rotation_deg` turns the map counter-clockwise seen from above. Pixels off the subject are 0,
     or the map with `background`. Each vertex of a path asks one direction, drawn in proportion to
-    the map's brightness. Raises `ValueError` for maps that are negative or not finite.
+    the map's brightness. Raises `ValueError` for maps that are negative or not finite,
+    `FloatingPointError` where light is not finite.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
@@ -58,18 +67,20 @@ def render_environment(
         rays = camera_rays(camera, mi.Float(column + 0.5), mi.Float(row + 0.5))
         image[:] = rows_of(sky.radiance(rays.d))
     index = covered_pixels(scene, camera)
-    if len(index):
-        film = dr.zeros(mi.Float, 3 * len(index))
-        field = field_of(scene, camera, index)
+
+    def render(some: Ints, plan: PathPlan) -> None:
+        film = dr.zeros(mi.Float, 3 * len(some))
+        field = field_of(scene, camera, some)
         gather = _Gather(Surface(scene), film, sky, factor_of(field))
 
         def missed(ray: Any, paths: Paths) -> None:
             add_light(film, sky.radiance(ray.d), paths.slot * 3, paths.active & (paths.depth == 0))
 
-        escape = missed if background else None
-        follow(gather.surface, camera, index, sampling.plan(), gather, escape)
-        image[index] = np.array(film).reshape(len(index), 3) / np.float32(sampling.spp)
-        image[index] = _with_added(image[index], field, envmap, rotation_deg)
+        follow(gather.surface, camera, some, plan, gather, missed if background else None)
+        radiance = np.array(film).reshape(len(some), 3) / np.float32(plan.spp)
+        image[some] = _with_added(radiance, field, envmap, rotation_deg)
+
+    render_whole(camera, index, image, render, sampling.plan())
     return image.reshape(camera.height, camera.width, 3)
 
 

@@ -19,7 +19,15 @@ from appearance.render.lights import PackedLights
 from appearance.render.olat import render_olat
 from appearance.render.paths import Surface
 from appearance.render.pixel_field import DeviceField, factor_of, field_of
-from appearance.render.tracing import SAMPLING, Paths, Sampling, add_light, follow
+from appearance.render.tracing import (
+    SAMPLING,
+    PathPlan,
+    Paths,
+    Sampling,
+    add_light,
+    follow,
+    render_whole,
+)
 from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque
 from reconstruction import Camera, Light
@@ -64,7 +72,7 @@ def render_mixed(
     `weights` broadcasts to `(L, 3)`: a factor for each light and channel, of any sign (a light may
     be taken away). Every vertex asks one light, drawn in proportion to its mean contribution in a
     pilot pass, and one direction of each environment. Pixels that do not see the subject are 0.
-    Raises `ValueError` naming the fault.
+    Raises `ValueError` naming the fault, `FloatingPointError` where light is not finite.
     """
     weight = np.broadcast_to(np.asarray(weights, float), (len(lights), 3))
     of_maps = [np.broadcast_to(np.asarray(e.weight, float), 3) for e in environments]
@@ -73,12 +81,15 @@ def render_mixed(
     maps = [check_environment(e.envmap, f"environment {i}") for i, e in enumerate(environments)]
     image = np.zeros((camera.height * camera.width, 3), np.float32)
     index = covered_pixels(scene, camera)
-    if len(index) and (lights or environments):
-        field = field_of(scene, camera, index)
-        choice = _choice(scene, camera, lights, weight, index, sampling)
+    if not len(index) or not (lights or environments):
+        return image.reshape(camera.height, camera.width, 3)
+    choice = _choice(scene, camera, lights, weight, index, sampling)
+
+    def render(some: Ints, plan: PathPlan) -> None:
+        field = field_of(scene, camera, some)
         gather = _Gather(
             Surface(scene),
-            dr.zeros(mi.Float, 3 * len(index)),
+            dr.zeros(mi.Float, 3 * len(some)),
             PackedLights.of(lights, weight / choice[:, None]) if lights else None,
             mi.DiscreteDistribution(mi.Float(for_kernels(choice))) if lights else None,
             [
@@ -87,8 +98,8 @@ def render_mixed(
             ],
             factor_of(field),
         )
-        follow(gather.surface, camera, index, sampling.plan(), gather)
-        radiance = np.array(gather.film).reshape(len(index), 3) / np.float32(sampling.spp)
+        follow(gather.surface, camera, some, plan, gather)
+        radiance = np.array(gather.film).reshape(len(some), 3) / np.float32(plan.spp)
         if field is not None and field.additive:
             integrals = [
                 projected(m, e.rotation_deg, field.degree) * w
@@ -96,7 +107,9 @@ def render_mixed(
             ]
             added = field.added(lights, weight, integrals)
             radiance = np.maximum(added if field.alone else radiance + added, 0)
-        image[index] = radiance
+        image[some] = radiance
+
+    render_whole(camera, index, image, render, sampling.plan())
     return image.reshape(camera.height, camera.width, 3)
 
 

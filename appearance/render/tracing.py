@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import drjit as dr
@@ -16,7 +16,7 @@ from appearance.render.paths import Surface, jittered, seed_state, stream_of
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera
 from reconstruction.array_backend import for_kernels
-from reconstruction.arrays import Bools, Ints
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.options import Count, options
 
 _log = logging.getLogger(__name__)
@@ -153,6 +153,27 @@ def add_light(film: Any, value: Any, first: Any, active: Any, stride: Any = 1) -
 def tile_count(pixels: Ints, each: int, memory: int) -> int:
     """In how many tiles to render `pixels (P,)`, which take `each` bytes beside a path's."""
     return -(-len(pixels) // max(1, memory // (each + LANE_BYTES)))
+
+
+def render_whole(
+    camera: Camera,
+    index: Ints,
+    image: Floats,
+    render: Callable[[Ints, PathPlan], None],
+    plan: PathPlan,
+) -> None:
+    """Have `render` write the flat pixels `index (P,)` of `image (H W, 3)`; see `render_again`."""
+    if not len(index):
+        return
+
+    def again(bad: Ints) -> None:
+        render(index[bad], replace(plan, seeds=(*plan.seeds, 1)))
+
+    def finite() -> Bools:
+        return np.asarray(np.isfinite(image[index]).all(axis=1))
+
+    render(index, plan)
+    render_again(camera, index, finite, again, plan.seeds[0])
 
 
 def render_again(

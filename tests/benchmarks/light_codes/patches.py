@@ -11,6 +11,7 @@ import argparse
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,7 @@ def run_patch(
     cache: Path,
     *,
     thinner: bool = True,
+    seed: int = 0,
     samples: int = 10_000,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -85,6 +87,7 @@ def run_patch(
     capture = Capture(folder)
     write_hair_masks(capture, truth_folder)
     truth = StrandTruth(capture, truth_folder, here.ball, samples)
+    options = replace(OPTIONS, seed=seed)
     runs: list[tuple[str, Method, Capture]] = [(m, m, capture) for m in METHODS]
     if thinner:
         for n in CAMERAS:
@@ -97,7 +100,7 @@ def run_patch(
         model = Model(out / name.replace(", ", "_").replace(" ", "_"))
         begin = time.perf_counter(), time.process_time()
         tell = within(progress, name, k * part, part)
-        report = reconstruct(some, model, method=method, options=OPTIONS, progress=tell)
+        report = reconstruct(some, model, method=method, options=options, progress=tell)
         results["variants"][name] = {
             **truth.score(model.strands()),
             "seconds": time.perf_counter() - begin[0],
@@ -192,10 +195,14 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             if name == "imported":
                 results[name] = run_imported(out / name, cycles_folder(None), progress=progress)
             else:
-                here = patch(name, side=64, cameras=12, spp=1) if args.quick else patch(name)
-                thinner = name == "sintel"
+                least = {"side": 64, "cameras": 12, "spp": 1} if args.quick else {}
                 results[name] = run_patch(
-                    out / name, here, args.cache, thinner=thinner, progress=progress
+                    out / name,
+                    patch(name, seed=args.seed, **least),
+                    args.cache,
+                    thinner=name == "sintel",
+                    seed=args.seed,
+                    progress=progress,
                 )
         except LeftOut as error:
             results[name] = {"left_out": str(error)}

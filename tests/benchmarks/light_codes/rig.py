@@ -52,7 +52,9 @@ def rig_text(
     return rig_file("light_codes", dome, devices, levels(all_on=0.15))
 
 
-def patch(name: str, *, side: int = SIDE, cameras: int = CAMERAS, spp: int = SPP) -> Patch:
+def patch(
+    name: str, *, side: int = SIDE, cameras: int = CAMERAS, spp: int = SPP, seed: int = 0
+) -> Patch:
     """The patch of a subject in `TARGETS`. Raises `LeftOut` where Sintel's strands are missing."""
     subject, head, data = name, None, data_folder()
     if name == "sintel":
@@ -61,5 +63,5 @@ def patch(name: str, *, side: int = SIDE, cameras: int = CAMERAS, spp: int = SPP
         subject, head = (str(data / "sintel" / f) for f in ("sintel.npz", "sintel_head.obj"))
     target = TARGETS[name]
     rig = rig_text(target, side, cameras)
-    capture = SimulatedCapture(f"patch-{name}", rig, subject, head, 0.0, spp)
+    capture = SimulatedCapture(f"patch-{name}", rig, subject, head, 0.0, spp, seed)
     return Patch(capture, Ball(target, SIDE * PITCH / 2))

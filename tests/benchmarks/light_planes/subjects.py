@@ -120,7 +120,7 @@ def ponytail(source: Path, folder: Path) -> tuple[Path, Path]:
 
 
 def subject_capture(
-    name: str, framing: Framing, cache: Path, drift_mm: float, spp: int = 16
+    name: str, framing: Framing, cache: Path, drift_mm: float, spp: int = 16, seed: int = 0
 ) -> SimulatedCapture:
     """The capture of a subject of `FRAMINGS`."""
     subject, head, data = name, None, data_folder() or Path()
@@ -136,7 +136,7 @@ def subject_capture(
         subject, head = (str(made / f) for f in ("ponytail.npz", "ponytail_head.obj"))
     label = f"{name}-{'still' if drift_mm == 0 else 'drifting'}"
     rig = rig_text(framing, framing.rows if drift_mm > 0 else 64 // framing.coarser)
-    return SimulatedCapture(label, rig, subject, head, drift_mm, spp)
+    return SimulatedCapture(label, rig, subject, head, drift_mm, spp, seed)
 
 
 def demo_capture(seed: int = 0) -> SimulatedCapture:
@@ -161,8 +161,12 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             made, options = [demo_capture(args.seed)], ReconstructOptions()
         else:
             drifts = (0.0, DRIFT_MM) if "drifting" in also else (0.0,)
-            made = [subject_capture(name, framing, args.cache, drift) for drift in drifts]
+            made = [
+                subject_capture(name, framing, args.cache, drift, seed=args.seed)
+                for drift in drifts
+            ]
             options = replace(OPTIONS, max_length=framing.longest)
+        options = replace(options, seed=args.seed)
         if args.quick:
             options = replace(options, grid=4e-3, roots=500)
         study(
