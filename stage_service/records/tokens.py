@@ -145,12 +145,16 @@ def own_file() -> Path:
 
 
 def own_token() -> str:
-    """This user's own token; made where there is none. Raises `OSError`."""
+    """This user's own token; made where there is none. Raises `OSError`, also for an empty file: no
+    token at all would open everything."""
     file = own_file()
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         write_secret(file, secrets.token_urlsafe(32) + "\n")
-    return plain_file(file, most=1000).read_text().strip()
+    token = plain_file(file, most=1000).read_text().strip()
+    if not token:
+        raise OSError(f"{file} is empty: remove it to have another token")
+    return token
 
 
 def write_secret(path: Path, text: str) -> None:

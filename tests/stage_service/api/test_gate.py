@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import threading
@@ -19,6 +20,8 @@ from stage_service.api import event_stream, gate, login
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.cli import main
+from stage_service.cli.stage import processes
+from stage_service.cli.support.commands import Output
 from stage_service.config import RigFile
 from stage_service.jobs.records import PipelineRequest
 from stage_service.records.tokens import SCOPES, TokenError, Tokens
@@ -183,6 +186,16 @@ def test_a_damaged_file_of_tokens_opens_nothing(ask, tokens, tmp_path):
         with pytest.raises(TokenError, match=r"tokens\.json"):
             tokens.make("bob", ())
     assert ask("GET /lease", "mine").status_code == 200  # of whoever runs the service
+
+
+def test_an_empty_file_of_one_s_own_token_opens_nothing(service, tmp_path, monkeypatch, capsys):
+    (tmp_path / "token").write_text("\n")
+    monkeypatch.setenv("HAIRSTAGE_TOKEN_FILE", str(tmp_path / "token"))
+    args = argparse.Namespace(no_auth=False, root=tmp_path / "root")
+    app = create_app(service, processes._access(args, set(), Output(as_json=False)))
+    refused(send(app, "GET /audit", {"Authorization": "Bearer "}), "unauthorized", 401)
+    assert "is empty: remove it" in capsys.readouterr().err
+    assert main(["token", "show"]) == 3
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "x"])
