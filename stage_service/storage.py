@@ -188,12 +188,17 @@ class Storage:
         with self._emptying:
             old = [r for r in self.trash() if r.removed <= before]
             for found in [] if dry_run else old:
-                work = partial(shutil.rmtree, self._trash / str(found.name))
+                work = partial(self._delete, found)
                 detail = f"{found.bytes:,} bytes"
                 self._control.do(
                     by, f"{found.kind}.delete", work, found.id, detail=detail, steers=False
                 )
         return old
+
+    def _delete(self, found: Removed) -> None:
+        place = self._trash / str(found.name)
+        shutil.rmtree(place / found.id)  # first: what is left of it stays listed until all has gone
+        shutil.rmtree(place)
 
     def uploads(self) -> list[Folder]:
         """What was uploaded, by subject."""

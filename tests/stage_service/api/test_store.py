@@ -366,6 +366,26 @@ def test_what_is_deleted_twice_at_once_is_deleted_once(http):
     assert http.get("/trash").json() == http.get("/uploads").json() == []
 
 
+def test_what_a_kill_left_of_the_trash_is_listed_until_it_has_gone(http, monkeypatch):
+    capture = shot(http)
+    removed = http.delete(f"/captures/{capture['id']}").json()
+    place = Path(capture["path"]).parents[1] / "trash" / removed["name"]
+    delete = shutil.rmtree
+
+    def cut_short(folder):
+        """Deletes as any disk may order it, the smallest file first, and dies."""
+        min(_files(folder), key=lambda file: file.stat().st_size).unlink()
+        raise OSError("the power is gone")
+
+    monkeypatch.setattr(shutil, "rmtree", cut_short)
+    assert http.delete("/trash", params={"older_than_days": 0}).status_code == 500
+    monkeypatch.setattr(shutil, "rmtree", delete)
+    assert _files(place)
+    assert http.get("/trash").json() == [removed]
+    assert http.delete("/trash", params={"older_than_days": 0}).json() == [removed]
+    assert not place.exists()
+
+
 def test_a_refusal_reaches_a_client_that_sends_on(http):
     """What a connection was told is lost where it is closed before all was read."""
     size = 4 * gate.MOST_BODY
