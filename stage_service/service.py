@@ -176,7 +176,9 @@ class Service:
     def _prepared(
         self, request: CaptureRequest | QueueRequest, armed_by: str | None = None
     ) -> Callable[..., str]:
-        """What starts the capture, its head and masks read. Raises `BadInput`, `NotThere`."""
+        """What starts the capture, its head and masks read. Raises `BadInput`, `NotThere`,
+        `NoStage`."""
+        _ = self._captures.stage.devices  # of no use without: what waits would wait for ever
         given, folder = request.head, request.masks
         if request.upload is not None:
             if given is not None or folder is not None:

@@ -29,6 +29,7 @@ from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.control import Forbidden
 from stage_service.captures.latch import CannotAcknowledge, Unsafe
 from stage_service.captures.manager import Busy
+from stage_service.devices.device_set import NoStage
 from stage_service.devices.ownership import StageInUse
 from stage_service.frames import UnknownFrame
 from stage_service.inputs import BadInput
@@ -78,6 +79,9 @@ busy 409 Another capture is running
     The stage makes one capture at a time. Wait for `running`, or abort it.
 stage-in-use 409 Another service has this stage
     `detail` says which. Stop it; where its machine is dead, start this one with `--take-over`.
+no-stage 409 The rig file names no devices
+    Nothing can be shot or darkened from here. Start the service with a rig file that has `[devices]`,
+    or with `--devices`.
 flash-rate 422 A living subject would see flashes of 3 to 30 Hz
     `problems` has the ways out: a slower plan, or recorded consent that somebody at the stage
     arms. docs/safety.md says why. No lamp was touched.
@@ -165,6 +169,7 @@ BY_ERROR: dict[type[Exception], str] = {
     FlashRefusal: "flash-rate",
     Unsafe: "unsafe",
     StageInUse: "stage-in-use",
+    NoStage: "no-stage",
     CannotAcknowledge: "cannot-acknowledge",
     Leased: "leased",
     NoLease: "no-lease",

@@ -129,7 +129,8 @@ class Stage:
     def darkness(self) -> dict[str, Any]:
         """What is known of the lamps when no capture runs: {"state", "detail", "latched",
         "accepted"}; accepted: off was sent, and the rig file accepts that no more is known."""
-        last, latched = self._last or Blackout(False, "no blackout yet"), self.latch.latched
+        none_yet = "no blackout yet" if self.there else "the rig file names no devices"
+        last, latched = self._last or Blackout(False, none_yet), self.latch.latched
         if latched is not None:
             return unknown(latched.detail, latched.since)
         accepted = last.accepted and not last.said

@@ -32,6 +32,10 @@ Device = LightBank | TriggerBox | ProjectorController | CameraDevice
 D = TypeVar("D", bound=Device)
 
 
+class NoStage(RigError):
+    """The rig file has no `[devices]`."""
+
+
 @dataclass(frozen=True, eq=False)
 class DeviceSet:
     """The drivers of a stage; `projectors` is None where it has none.
@@ -48,13 +52,13 @@ class DeviceSet:
 
     @classmethod
     def of(cls, rig_file: RigFile, lit: LitTimes | None = None) -> Self:
-        """Make the drivers; connects to nothing. Raises `RigError` without `[devices]`.
+        """Make the drivers; connects to nothing. Raises `NoStage`, `RigError`.
 
         `lit` has how long lamps were lit before, for their duty, and goes on being kept.
         """
         config, rig = rig_file.devices, rig_file.rig
         if config is None:
-            raise RigError(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
+            raise NoStage(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
         if isinstance(config.lights, DmxConfig):
             lights: LightBank = DmxLightBank(config.lights, len(rig.lights))
         else:

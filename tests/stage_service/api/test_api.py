@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import httpx
 import numpy as np
 import pytest
 import uvicorn
+from serving import serving
 from waiting import until
 
 from reconstruction import Model, Step, read_exr
@@ -210,6 +212,18 @@ def test_devices_and_blackout(http, world):
 def snapshot(http: httpx.Client) -> dict[str, Any]:
     answer: dict[str, Any] = http.get("/captures/snapshot").json()
     return answer
+
+
+def test_without_devices_the_service_says_that_there_is_no_stage(rig_file, tmp_path):
+    with serving(replace(rig_file, devices=None), tmp_path / "root") as http:
+        for path in ("/captures", "/snapshot", "/queue"):
+            told = problem(http.post(path, json={}), "no-stage")
+            assert told["status"] == 409
+            assert "[devices] is missing" in told["detail"]
+        problem(http.post("/devices/blackout"), "no-stage")
+        problem(http.get("/ready"), "not-ready")
+        assert http.get("/health").json()["lamps_detail"] == "the rig file names no devices"
+        assert http.get("/queue").json()["waiting"] == http.get("/captures").json() == []
 
 
 def test_a_snapshot_shows_one_light_and_is_no_capture(http, world):
