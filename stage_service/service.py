@@ -243,8 +243,12 @@ class Service:
 
     def abort(self, capture_id: str, by: Caller) -> CaptureView:
         """Abort at the next step boundary; anybody may. Raises `UnknownCapture`, `WrongState`."""
-        self.queue.hold(f"capture {capture_id} was aborted by {by}")
-        work = partial(self._captures.abort, capture_id)
+
+        def work() -> CaptureStatus:
+            self._captures.get(capture_id)  # one that there is not holds nothing up
+            self.queue.hold(f"capture {capture_id} was to be aborted by {by}")
+            return self._captures.abort(capture_id)
+
         return self._view(self._control.do(by, "capture.abort", work, capture_id, steers=False))
 
     def _view(self, status: CaptureStatus) -> CaptureView:

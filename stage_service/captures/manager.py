@@ -458,7 +458,7 @@ class CaptureManager:
             status = self.get(capture_id)
             run = self._running
             if run is None or run.id != capture_id:
-                raise WrongState(action, status.state)
+                raise WrongState(action, status.state, status.outcome)
         getattr(run.sequencer, action)()
         return self.get(capture_id)
 

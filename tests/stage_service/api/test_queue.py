@@ -92,6 +92,20 @@ def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(ht
     assert ended(http, 2)[1]["request"] == {"queue": entry}
 
 
+def test_who_aborts_what_is_not_there_or_over_is_told_the_truth(http):
+    done = http.post("/captures", json=plan(3)).json()["id"]
+    http.service._captures.wait(done, 30)
+    http.post("/lease", json={"holder": "Ada"})  # so that what waits does
+    add(http, plan(4))
+    assert slug(http.post("/captures/20260101-000000-0000/abort")) == "unknown-capture"
+    assert http.get("/queue").json()["held"] is None
+    over = http.post(f"/captures/{done}/abort").json()
+    assert over["detail"].endswith("that is done; possible now: nothing")
+    assert "to be aborted by" in http.get("/queue").json()["held"]
+    refused = [a for a in http.get("/audit").json() if a["action"] == "capture.abort"]
+    assert [a["result"] for a in refused] == ["refused", "refused"]
+
+
 def test_nothing_begins_while_the_stage_is_latched_or_somebody_steers(http, world):
     lease = http.post("/lease", json={"holder": "Ada", "seconds": 60}).json()["token"]
     entry = add(http, plan(1))
