@@ -29,6 +29,8 @@ from reconstruction.geometry.rig import RigError
 
 SHORTEST_S, LONGEST_S = 1e-6, 10.0
 """Exposures that the trigger box makes."""
+PROJECTOR_LEVELS = 65535
+"""Above 0, on the projector controller's wire."""
 Exposure = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]

@@ -80,8 +80,8 @@ busy 409 Another capture is running
 stage-in-use 409 Another service has this stage
     `detail` says which. Stop it; where its machine is dead, start this one with `--take-over`.
 no-stage 409 The rig file names no devices
-    Nothing can be shot or darkened from here. Start the service with a rig file that has `[devices]`,
-    or with `--devices`.
+    Nothing can be shot or darkened from here. Start the service with a rig file that has
+    `[devices]`, or with `--devices`.
 flash-rate 422 A living subject would see flashes of 3 to 30 Hz
     `problems` has the ways out: a slower plan, or recorded consent that somebody at the stage
     arms. docs/safety.md says why. No lamp was touched.

@@ -6,9 +6,11 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from reconstruction import Rig
-from stage_service.config import LightBankConfig, SafetyLimits
+from stage_service.config import PROJECTOR_LEVELS, LightBankConfig, SafetyLimits
 from stage_service.plan.stepping import Run
 from stage_service.plan.timeline import Lit
+
+PROJECTORS = PROJECTOR_LEVELS, "projector controller"
 
 
 def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[str]:
@@ -45,14 +47,17 @@ def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[
 
 
 def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
-    """One sentence for each kind of step whose level the light bank would make another."""
+    """One sentence for each kind of step whose level the light bank would make another, or the
+    projectors darkness."""
     problems = {}
     for part in parts:
-        steps = bank.level_steps(by_table=part.stepping == "hardware")
+        lamps = bank.level_steps(by_table=part.stepping == "hardware")
         for step in part.steps:
-            if step.kind not in ("olat", "all_on"):
+            if step.kind == "dark":
                 continue
-            what = f"level.{step.kind}: the light bank of [devices.lights]"
+            of_lamps = step.kind in ("olat", "all_on")
+            steps, who = (lamps, "light bank of [devices.lights]") if of_lamps else PROJECTORS
+            what = f"level.{step.kind}: the {who}"
             if steps == 1 and step.level != 1:
                 problems[step.kind] = (
                     f"{what} has no levels, its lamps are at 1; {step.level:g} was asked for"

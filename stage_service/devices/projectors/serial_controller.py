@@ -5,12 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from stage_service.config import SerialConfig
+from stage_service.config import PROJECTOR_LEVELS, SerialConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities
 from stage_service.devices.serial_lines import SerialLines
-
-FULL_LEVEL = 65535
 
 
 class SerialProjectorController:
@@ -113,4 +111,4 @@ def _text(run: list[Pattern]) -> str:
 def _level(level: float) -> int:
     if not 0 <= level <= 1:
         raise ValueError(f"a projector's level is 0 to 1, got {level}")
-    return round(level * FULL_LEVEL)
+    return round(level * PROJECTOR_LEVELS)

@@ -294,6 +294,16 @@ def test_a_level_that_the_bank_does_not_have_is_refused_in_the_plan(demo, bank, 
     assert problem in error.value.problems[0]
 
 
+def test_a_sweep_that_the_projectors_would_not_show_is_refused(demo):
+    """Their wire has 65535 levels above 0 (docs/wire.md): 0.5 / 65535 is 7.63e-6."""
+    sweep = {"lights": (), "sentinels": False}
+    resolve(CapturePlan(level={"scanline": 7.7e-6}, **sweep), demo)
+    with pytest.raises(PlanError, match=r"level\.tracking: the projector controller") as error:
+        resolve(CapturePlan(level={"scanline": 7.7e-6, "tracking": 7.6e-6}, **sweep), demo)
+    assert len(error.value.problems) == 1
+    assert "so that 7.6e-06 would be dark" in error.value.problems[0]
+
+
 def test_entries_of_a_table_have_levels_where_the_lamps_have_none(demo):
     without = LightRegisters(levels=None)
     lights = ModbusTcpConfig(registers=without, accept_unverified_blackout=True)
