@@ -29,6 +29,9 @@ export function pictures(grid, signal) {
       cell.next = next;
       if (more.lacks?.includes(name)) {
         image.removeAttribute("src");
+        cell.busy = false; // of what was on its way nothing more is heard
+        drawn.replaceChildren();
+        plot.remove();
         say(text, `${name}: no frame`);
         return;
       }

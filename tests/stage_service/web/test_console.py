@@ -303,6 +303,29 @@ def test_cameras_show_a_snapshot_and_the_stage_what_each_missed(console):
     assert "frames0" in card
 
 
+def test_after_a_frame_that_is_missing_the_camera_shows_the_next_ones(console):
+    http, pages = console(Fault("camera", "drop", 4, "cam_b"))
+    lights = [f"light_{n:03d}" for n in range(3)]
+    plan = {"projectors": [], "stepping": "software", "lights": lights, "retries": 0}
+    http.post("/captures", json={"plan": plan}).raise_for_status()
+    until(lambda: [c for c in http.service.captures(1) if c.state == "done"])
+    page = pages.open()
+    page.route("**/frames/2/cam_b.png*", lambda _route: None)  # on its way for ever
+    page.click("nav >> text=Frames")
+    page.wait_for_selector("img[src*='/frames/2/cam_b.png']")
+    page.click("label:has-text('histogram, focus')")
+    for step in (1, 2):
+        page.locator("input[type=range]").evaluate(
+            "(slider, step) => { slider.value = step; slider.dispatchEvent(new Event('input')); }",
+            step,
+        )
+        if step == 1:
+            page.wait_for_selector("figcaption:has-text('cam_b: no frame')")
+            assert page.locator("figure:has-text('no frame') .histogram").count() == 0
+    picture = page.wait_for_selector("img[src*='/frames/4/cam_b.png']")
+    until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
+
+
 def test_what_waits_is_put_elsewhere(console):
     http, pages = console()
     http.post("/queue:hold")
