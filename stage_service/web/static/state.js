@@ -102,9 +102,14 @@ function takeCapture(status) {
     if (S.capture && S.capture.id !== SNAPSHOT && status.id < S.capture.id && status.state === "done") return; // an older one
     S.missing = [];
     if (S.capture?.id !== SNAPSHOT) S.failed = null;
-  }
+  } else resumed(status.state);
   S.capture = status;
   if (status.state !== "done") S.failed = null;
+}
+
+/** What the capture lacked is shot now. */
+function resumed(state) {
+  if (S.capture.state === "done" && state !== "done") S.missing = [];
 }
 
 function heard(kind, data) {
@@ -116,6 +121,7 @@ function heard(kind, data) {
     } else load.capture(id).catch(() => {});
   } else if (kind === "capture.state") {
     if (S.capture?.id === data.id) {
+      resumed(data.state);
       S.capture = { ...S.capture, state: data.state, outcome: data.state === "done" ? data.outcome : null, error: data.error };
     }
     if (data.state === "done" && data.outcome === "failed") S.failed = { id: data.id, error: data.error };

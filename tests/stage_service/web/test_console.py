@@ -326,6 +326,18 @@ def test_after_a_frame_that_is_missing_the_camera_shows_the_next_ones(console):
     until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
 
 
+def test_what_was_shot_at_last_is_missing_no_more(console):
+    http, pages = console(Fault("camera", "drop", 4, "cam_b"))
+    page = pages.open()
+    http.post("/captures", json={"plan": {**PACED, "retries": 0}}).raise_for_status()
+    page.wait_for_selector(".missing:has-text('cam_b — given up')")
+    page.keyboard.press("F8")
+    page.click("button:text-is('Shoot what is missing')")
+    page.wait_for_selector(".said:has-text('is complete')")
+    assert http.service.captures(1)[0].frames_missing == 0
+    assert page.text_content(".missing") == "none"
+
+
 def test_what_waits_is_put_elsewhere(console):
     http, pages = console()
     http.post("/queue:hold")
