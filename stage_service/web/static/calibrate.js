@@ -14,9 +14,30 @@ const KINDS = {
 const LEAST = 8; // corners that count
 const LONGER = 40; // times the residuals are drawn
 
+const kept = { boards: [], diffuse: [], mirror: [] };
+const remember = () => Object.assign(kept, JSON.parse(localStorage.getItem("calibration") ?? "{}"));
+const keep = () => localStorage.setItem("calibration", JSON.stringify(kept));
+let waiting = null; // {kind, id}: what is shot for this page, whichever view it shows meanwhile
+let came = () => {}; // for the view that is open
+
+/** Keep what was shot, once it is complete. */
+async function learn() {
+  if (!waiting) return;
+  const { kind, id } = waiting;
+  const { state, outcome } = await get(`/captures/${id}`);
+  if (state !== "done" || waiting?.id !== id) return;
+  waiting = null;
+  if (outcome !== "completed") return;
+  remember();
+  kept[kind].push(id);
+  keep();
+  came(id);
+}
+for (const kind of ["capture.over", "fresh"]) events.addEventListener(kind, () => learn().catch(() => {}));
+
 export function open(view) {
   const controller = new AbortController();
-  const kept = { boards: [], diffuse: [], mirror: [], ...JSON.parse(localStorage.getItem("calibration") ?? "{}") };
+  remember();
   const seen = new Map(); // "capture/camera": what it shows of the board
   const number_ = (name, value, more = {}) => h("label", h("span", words(name)), h("input", { name, type: "number", step: "any", value, oninput: () => { seen.clear(); look(); }, ...more }));
   const board = h(".fields", number_("columns", 9, { step: 1 }), number_("rows", 7, { step: 1 }), number_("square_mm", 27), number_("marker_mm", 21));
@@ -34,7 +55,6 @@ export function open(view) {
       h("aside.after", h("fieldset", h("legend", "the board"), board), h("fieldset", h("legend", "what else stands there"), props), h(".line", begin), wrong, found)));
   let shown = kept.boards.at(-1) ?? null;
   let solution = null;
-  let waiting = null; // {kind, id}: what is shot for this page
 
   function sectionOf(kind, title, hint, plan) {
     const rows = h("tbody");
@@ -42,14 +62,13 @@ export function open(view) {
       await underLease();
       const made = await ask("POST /captures", { plan });
       waiting = { kind, id: made.id };
+      await learn();
     }, { ready: () => !busy() });
     return {
       kind, rows, shoot,
       element: h("section", h("h2", title), h("p.quiet", hint), h(".wide", { tabindex: "0", role: "region", "aria-label": `captures: ${title}` }, h("table.poses", kind === "boards" ? h("thead", h("tr", h("th", "capture"), S.rig.cameras.map((c) => h("th", c.name)), h("td"))) : "", rows)), h(".line", shoot.element)),
     };
   }
-
-  const keep = () => localStorage.setItem("calibration", JSON.stringify(kept));
 
   function list() {
     for (const { kind, rows } of sections) {
@@ -129,24 +148,17 @@ export function open(view) {
   }
 
   const onState = () => ask_().then(show).catch(() => {});
-  const onOver = ({ detail }) => {
-    if (detail.id !== waiting?.id) return;
-    if (detail.outcome === "completed") {
-      kept[waiting.kind].push(detail.id);
-      shown = detail.id;
-      keep();
-      list();
-      show();
-      look();
-    }
-    waiting = null;
+  came = (id) => {
+    shown = id;
+    list();
+    show();
+    look();
   };
   events.addEventListener("calibration.state", onState);
-  events.addEventListener("capture.over", onOver);
   list();
   onState();
   return {
     update() { for (const s of sections) s.shoot.update(); },
-    end() { controller.abort(); events.removeEventListener("calibration.state", onState); events.removeEventListener("capture.over", onOver); },
+    end() { controller.abort(); came = () => {}; events.removeEventListener("calibration.state", onState); },
   };
 }

@@ -133,6 +133,30 @@ def test_a_slow_step_says_how_many_cameras_have_answered(console, monkeypatch):
     says(page, "Dark, verified")
 
 
+def test_what_was_shot_for_a_calibration_is_kept_whatever_view_is_open(console, monkeypatch):
+    make, go_on = FrameMaker.counts, Event()
+
+    def slow(self, camera, shot, exposure):
+        assert go_on.wait(60)
+        return make(self, camera, shot, exposure)
+
+    monkeypatch.setattr(FrameMaker, "counts", slow)
+    http, pages = console()
+    page = pages.open("calibrate")
+    page.click("button:text-is('Shoot: board')")
+    page.fill("[name=holder]", "Ada")
+    page.click("dialog button")
+    says(page, "Calibrate")
+    until(lambda: http.get("/captures").json())
+    page.click("nav >> text=Now")
+    says(page, "Shooting")
+    go_on.set()
+    says(page, "Dark, verified")
+    (capture,) = http.get("/captures").json()
+    page.click("nav >> text=Calibrate")
+    page.wait_for_selector(f".poses button:text-is('{capture['id']}')")
+
+
 def test_a_lamp_that_stays_lit_cannot_be_missed(console):
     http, pages = console(Fault("lights", "stuck", 4))
     page = pages.open()
