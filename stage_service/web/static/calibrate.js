@@ -2,7 +2,7 @@
 
 import { attempt, steering, underLease } from "./acts.js";
 import { ask, get } from "./ask.js";
-import { button, clock, h, number, say, svg, words } from "./dom.js";
+import { button, clock, h, number, numberIn, say, svg, words } from "./dom.js";
 import { pictures } from "./pictures.js";
 import { S, busy, events } from "./state.js";
 
@@ -116,8 +116,8 @@ export function open(view) {
 
   async function solve() {
     const body = { boards: kept.boards, diffuse: kept.diffuse, mirror: kept.mirror, board: {} };
-    for (const x of board.querySelectorAll("input")) if (x.value) body.board[x.name] = Number(x.value);
-    for (const x of props.querySelectorAll("input")) if (x.type === "checkbox") body[x.name] = x.checked; else if (x.value) body[x.name] = Number(x.value);
+    for (const x of board.querySelectorAll("input")) body.board[x.name] = numberIn(x);
+    for (const x of props.querySelectorAll("input")) body[x.name] = x.type === "checkbox" ? x.checked : numberIn(x);
     tell(await ask("POST /calibration", body));
   }
 

@@ -2,7 +2,7 @@
 
 import { attempt, steering } from "./acts.js";
 import { ask, get } from "./ask.js";
-import { h, say, seconds } from "./dom.js";
+import { h, numberIn, say, seconds } from "./dom.js";
 import { pictures } from "./pictures.js";
 import { S, busy, events } from "./state.js";
 
@@ -36,8 +36,7 @@ export function open(view) {
   }
 
   async function shoot() {
-    const value = (field) => (field.value === "" ? null : Number(field.value));
-    await ask("POST /snapshot", { light: light.value || null, exposure: value(exposure), level: value(level) });
+    await ask("POST /snapshot", { light: light.value || null, exposure: numberIn(exposure), level: numberIn(level) });
   }
 
   async function look() {

@@ -85,6 +85,13 @@ export function bytes(n) {
   return `${n} B`;
 }
 
+/** What a field of numbers says: undefined where it is empty, and where it is no number a text, for the API to
+ * refuse: a browser shows "1e" and "0,5", and calls them empty. */
+export function numberIn(input) {
+  if (input.validity.badInput) return "no number";
+  return input.value === "" ? undefined : Number(input.value);
+}
+
 /** Three digits that count, thousands apart. */
 export function number(n) {
   if (n === null || n === undefined || !Number.isFinite(n)) return "–";

@@ -1,6 +1,6 @@
 // A form from a JSON schema, as pydantic writes it: what is left empty is left out.
 
-import { h, words } from "./dom.js";
+import { h, numberIn, words } from "./dom.js";
 
 const plain = (value) => (value === undefined || value === null ? "" : Array.isArray(value) ? value.join(", ") : String(value));
 
@@ -58,7 +58,7 @@ export function formOf(schema, defs, { hints = {}, skip = [], onchange }) {
     }
     if (kind.type === "number" || kind.type === "integer") {
       const input = h("input", { type: "number", step: kind.type === "integer" ? 1 : "any", min: kind.minimum ?? kind.exclusiveMinimum, max: kind.maximum, placeholder: hint ?? (kind.default ?? "") });
-      return { input, read: () => (input.value === "" ? undefined : Number(input.value)), write: (v) => { input.value = v ?? ""; } };
+      return { input, read: () => numberIn(input), write: (v) => { input.value = v ?? ""; } };
     }
     // Names, numbers with commas, or a text: what the API makes of it, it says itself.
     const many = (kind.kinds ?? [kind]).find((x) => x.type === "array");

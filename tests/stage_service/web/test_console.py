@@ -133,6 +133,24 @@ def test_a_slow_step_says_how_many_cameras_have_answered(console, monkeypatch):
     says(page, "Dark, verified")
 
 
+def test_what_is_no_number_is_refused_not_left_out(console):
+    http, pages = console()
+    page = pages.open("plan")
+    page.wait_for_selector("button:text-is('Start now'):enabled")
+    page.type("[name='exposure.olat']", "1e")
+    page.wait_for_selector(".cost .problems:has-text('exposure.olat')")
+    assert page.is_disabled("button:text-is('Start now')")
+    page.type("[name='exposure.olat']", "-2")
+    page.wait_for_selector("button:text-is('Start now'):enabled")
+    page.click("nav >> text=Cameras")
+    page.type("[name=exposure]", "1e")
+    page.click("text=Take a snapshot")
+    page.wait_for_selector(".notice:has-text('exposure: ')")
+    assert [a.result for a in http.service.audit(10) if a.action == "snapshot"] == []
+    assert [c for c in pages.complaints if "422" not in c] == []
+    pages.complaints.clear()
+
+
 def test_what_was_shot_for_a_calibration_is_kept_whatever_view_is_open(console, monkeypatch):
     make, go_on = FrameMaker.counts, Event()
 
