@@ -25,7 +25,6 @@ from stage_service.frames import UnknownFrame, read_frame, steps_of
 from stage_service.inputs import BadInput, check_kept, check_new, read_head, read_masks
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue, NoSuchJob
-from stage_service.jobs.slots import worker_is_alive
 from stage_service.leasing import Leasing
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
@@ -379,7 +378,8 @@ class Service:
         return self._control.audit.latest(limit)
 
     def health(self) -> Health:
-        """How service, lamps and jobs are; asks no device and no database."""
+        """How service, lamps and jobs are; asks no device, no database, waits for no disk."""
+        free_bytes, worker = self.watching.disk()
         lamps, latched = self._captures.safety(), self._captures.stage.latch.latched
         problems = [p for p in (self._queue.set_aside, self._queue.problem) if p is not None]
         if damaged := self._verifier.damaged:
@@ -391,14 +391,14 @@ class Service:
             version=version("hairstage"),
             rig=self.rig_file.rig.name,
             root=str(self.root),
-            worker=worker_is_alive(self.root),
+            worker=worker,
             capture=self._captures.running,
             unread=self.unread,
             lamps=lamps["state"],
             lamps_detail=lamps["detail"],
             lamps_accepted=lamps["accepted"],
             latch=LatchView.of(latched),
-            disk_free_bytes=self.watching.free_bytes(),
+            disk_free_bytes=free_bytes,
             problems=problems,
         )
 

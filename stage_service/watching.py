@@ -56,10 +56,14 @@ class Watching:
         unseen: dict[str, Any] = {"free": None, "workers": [], "gone": None}
         self._disk = LastSeen(self._look, unseen, LONGEST_LOOK_S)
 
-    def free_bytes(self) -> int | None:
-        """What the disk of the root folder has left; None where it does not answer."""
-        free = self._disk.get()["free"]
-        return None if free is None else int(free)
+    def disk(self) -> tuple[int | None, bool]:
+        """What the disk of the root folder has left, None where it does not answer; and whether it
+        has said that a worker runs."""
+        seen = self._disk.get()
+        worker = any(w.alive for w in seen["workers"])
+        if seen["free"] is None or self._disk.looking_s() > SILENT_S:
+            return None, worker
+        return int(seen["free"]), worker
 
     def problems(self) -> list[str]:
         """Why no capture could begin, a sentence each; one that runs is no reason."""

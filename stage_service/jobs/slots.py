@@ -115,11 +115,6 @@ def workers_seen(root: Path) -> list[WorkerSeen]:
     return found
 
 
-def worker_is_alive(root: Path) -> bool:
-    """Whether any worker of this root runs."""
-    return any(worker.alive for worker in workers_seen(root))
-
-
 def hold_dead(root: Path, executor: str) -> IO[str] | None:
     """The lock of a dead worker of this machine, by its name in the database; None where it lives
     or is of another machine. Nobody gets its name until the file is closed."""

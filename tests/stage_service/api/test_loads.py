@@ -20,10 +20,12 @@ from serving import Client, serving
 from waiting import until
 
 from reconstruction import CaptureWriter, Step
+from stage_service import watching
 from stage_service.captures import control, status_index
 from stage_service.captures import manager as manager_module
 from stage_service.captures.catalogue import Catalogue
 from stage_service.devices.lights.modbus import ModbusLightBank
+from stage_service.jobs.slots import WorkerSlot
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
@@ -205,6 +207,18 @@ def test_while_the_disk_hangs(rig_file, world, tmp_path, monkeypatch):
         assert http.get(f"/captures/{capture}").json()["state"] != "done"
         assert http.post("/captures", json=LONG).status_code == 409
         assert time.monotonic() - start < manager_module.STOP_WITHIN_S
+
+
+def test_health_is_told_while_the_root_folder_s_disk_hangs(rig_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(watching, "SILENT_S", 0.0)
+    slot = WorkerSlot(tmp_path)
+    with serving(rig_file, tmp_path) as http:
+        until(lambda: http.get("/health").json()["worker"])
+        with stuck(monkeypatch, Path, "glob") as waiting:
+            health = http.get("/health").json()
+            assert waiting() > 0
+            assert (health["worker"], health["disk_free_bytes"]) == (True, None)  # as last seen
+    slot.release()
 
 
 def test_a_blackout_that_fails_over_a_run_that_hangs_is_told(
