@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from pydantic import BaseModel
 
-from reconstruction import Camera, Capture, MissingFrame, Rig
+from reconstruction import Capture, MissingFrame, Rig
 from reconstruction.calibration.boards import Board
 from reconstruction.capture.writer import utc_now
 from reconstruction.images.silhouettes import NoSilhouette, lit_image
@@ -167,8 +167,12 @@ class Calibrating:
 
     def look(self, capture: Capture, camera: str, size: BoardSize, calibrated: bool) -> BoardView:
         """What a camera's lit frame in `capture` shows of the board, by the capture's lens or the
-        calibrated one. Raises `MissingFrame`, `CalibrationError`, `RigError`."""
-        lenses = Rig.load(self.rig) if calibrated and self.rig.is_file() else capture.rig
+        calibrated one, where there is one of this camera. Raises `MissingFrame`,
+        `CalibrationError`, `RigError`."""
+        lens = nominal = capture.rig.camera(camera)
+        for other in Rig.load(self.rig).cameras if calibrated and self.rig.is_file() else ():
+            if (other.name, other.width, other.height) == (camera, nominal.width, nominal.height):
+                lens = other
         board = board_of(size)
         try:
             seen = board.find(lit_image(capture, camera))
@@ -178,12 +182,11 @@ class Calibrating:
             corners=len(seen),
             of=len(board.corners),
             pixels=_points(seen.pixels),
-            lens="nominal" if lenses is capture.rig else "calibrated",
+            lens="nominal" if lens is nominal else "calibrated",
         )
         flat = board.corners[seen.ids]
         if len(seen) < LEAST or np.linalg.matrix_rank(flat - flat.mean(axis=0), 1e-6) < 2:
             return view
-        lens: Camera = lenses.camera(camera)
         how = lens.K, lens.distortion
         found, turn, shift = cv2.solvePnP(flat, seen.pixels, *how, flags=cv2.SOLVEPNP_IPPE)
         if not found:

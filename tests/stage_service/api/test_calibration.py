@@ -81,6 +81,20 @@ def test_corners_are_where_the_camera_has_them(truth, http):
     assert ask.get("/calibration").json()["state"] == "none"
 
 
+def test_a_camera_that_the_calibrated_rig_lacks_is_shown_by_its_own_lens(truth, http, tmp_path):
+    ask = http(0)
+    calibrated = tmp_path / "root" / "calibration" / "rig.json"
+    calibrated.parent.mkdir(exist_ok=True)
+    one, other = truth.cameras
+    for cameras in ((one,), (one, replace(other, width=other.width // 2))):
+        calibrated.write_text(json.dumps(replace(truth, cameras=cameras).to_dict()))
+        views = [
+            ask.get(f"/captures/pose-0/board/{c.name}?calibrated=true").json()
+            for c in truth.cameras
+        ]
+        assert [view["lens"] for view in views] == ["calibrated", "nominal"]
+
+
 @pytest.mark.slow
 def test_the_rig_that_comes_of_it_and_why_none_does(truth, http, tmp_path):
     ask = http(0, 1, 16)
