@@ -237,6 +237,7 @@ class Service:
             by.require("arm")
         work = partial(self._captures.resume, capture_id, armed_by=armed_by)
         status = self._control.do(by, "capture.resume", work, capture_id)
+        self._verifier.forget(capture_id)  # what was found wrong may be what is shot now
         self._control.record_arming(by, capture_id, armed_by)
         return self._view(status)
 

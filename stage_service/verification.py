@@ -88,9 +88,11 @@ class Verifier(Background):
             return last
 
     def forget(self, capture: str) -> None:
-        """It is here no more."""
+        """It is here no more, or no more what was read."""
         with self._changed:
             self._waiting.pop(capture, None)
+            if self._running == capture:
+                self._running = None  # what is being found counts for nothing
             if self._known.pop(capture, None) is None:
                 return
             kept = self._kept()
@@ -112,28 +114,28 @@ class Verifier(Background):
                     self._waiting = self._overdue()
                 if not self._waiting:
                     continue
-                self._running = next(iter(self._waiting))
-                folder = self._waiting.pop(self._running)
+                self._running = capture = next(iter(self._waiting))
+                folder = self._waiting.pop(capture)
             try:
-                found = self._verify(self._running, folder)
+                found = self._verify(capture, folder)
             except OSError as error:  # there is no process to be had: the next one may have one
                 log.exception("%s", folder)
                 found = [f"it could not be read again: {printable(str(error))}"]
             # One that was removed meanwhile is nobody's damage.
-            self._learn(self._running, found if folder.is_dir() else None)
+            self._learn(capture, found if folder.is_dir() else None)
 
     def _overdue(self) -> dict[str, Path]:
         """The one that was read longest ago, where that is too long."""
         if self._days is None:
             return {}
         before = (datetime.now(UTC) - timedelta(days=self._days)).isoformat()
-        last = {c.id: (self._known.get(c.id) or Verification(capture=c.id)) for c in self._due()}
-        old = sorted((v.finished or "", i) for i, v in last.items() if (v.finished or "") < before)
         paths = {c.id: Path(c.path) for c in self._due()}
+        last = {i: (self._known.get(i) or Verification(capture=i)) for i in paths}
+        old = sorted((v.finished or "", i) for i, v in last.items() if (v.finished or "") < before)
         return {old[0][1]: paths[old[0][1]]} if old else {}
 
     def _verify(self, capture: str, folder: Path) -> list[str] | None:
-        """What is wrong; None where the service ends first."""
+        """What is wrong; None where the service ends first, or it is of no use any more."""
         command = [sys.executable, "-m", "stage_service.cli", "verify", str(folder), "--json"]
         child = subprocess.Popen(
             tied(command, "KILL"),  # one that stands still would never end
@@ -151,7 +153,7 @@ class Verifier(Background):
                     break
                 except subprocess.TimeoutExpired:
                     pass
-                if self._closed:
+                if self._closed or self._running != capture:
                     return None
                 if (busy := self._busy()) != stopped:
                     child.send_signal(signal.SIGSTOP if busy else signal.SIGCONT)
@@ -169,8 +171,8 @@ class Verifier(Background):
 
     def _learn(self, capture: str, problems: list[str] | None) -> None:
         with self._changed:
-            self._running = None
-            if problems is None:
+            forgotten, self._running = self._running != capture, None
+            if problems is None or forgotten:
                 return
             found = Verification(
                 capture=capture,

@@ -207,6 +207,36 @@ def test_a_capture_is_read_again_beside_the_service_and_damage_is_told(http):
     assert http.get("/health").json()["status"] == "ok"
 
 
+def test_what_was_wrong_with_a_capture_that_goes_on_is_told_no_more(http, world):
+    capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+    path = f"/captures/{capture}"
+    until(lambda: world.pulses > 3)
+    http.post(f"{path}/abort")
+    until(lambda: http.get(path).json()["state"] == "done")
+    http.post(f"{path}/verify")
+    assert until(lambda: _done(http, path), pause=0.1)["wrong"] > 0
+    assert http.get("/health").json()["status"] == "degraded"
+    http.post(f"{path}/resume").raise_for_status()
+    until(lambda: http.get(path).json()["state"] == "done")
+    assert http.get(path).json()["outcome"] == "completed"
+    assert http.get(f"{path}/verification").json()["state"] == "never"
+    assert http.get("/health").json()["status"] == "ok"
+
+
+def test_what_is_being_read_of_a_capture_that_goes_on_counts_for_nothing(http, monkeypatch):
+    capture = shot(http)
+    found = threading.Event()
+    verifier = http.service._verifier
+    monkeypatch.setattr(verifier, "_verify", lambda *_: found.wait(60) and ["of before"])
+    verifier.ask(capture["id"], Path(capture["path"]))
+    until(lambda: verifier.get(capture["id"]).state == "running")
+    verifier.forget(capture["id"])
+    found.set()
+    verifier.ask("another", Path(capture["path"]))
+    until(lambda: verifier.get("another").state == "done")
+    assert verifier.damaged == ["another"]
+
+
 def _done(http: Client, path: str, after: str = "") -> Any:
     found = http.get(f"{path}/verification").json()
     return found if found["state"] == "done" and found["finished"] > after else None
