@@ -6,10 +6,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from pydantic import ValidationError
+
+from reconstruction.options import sentence
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import CaptureQueue, Entry
 from stage_service.captures.control import Caller, Control
 from stage_service.captures.manager import Busy, CaptureManager
+from stage_service.inputs import BadInput
 from stage_service.plan.resolved import resolve
 from stage_service.service_models import CaptureRequest, QueueRequest, QueueView
 
@@ -112,7 +116,11 @@ class Queueing:
         return self._shoot(entry, None, since)
 
     def _shoot(self, entry: Entry, armed_by: str | None, since: int) -> str:
-        request = QueueRequest.model_validate(entry.request)
+        try:
+            request = QueueRequest.model_validate(entry.request)
+        except ValidationError as error:
+            told = f"{entry.id} is what another version could shoot: {sentence(error)}"
+            raise BadInput(told) from error
         capture = self._prepare(request, armed_by)(since, queue=entry.id)
         who = f"the queue, for {entry.by}"
         self._control.audit.record(who, "capture.start", capture, detail=then(request))

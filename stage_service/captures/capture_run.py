@@ -6,7 +6,10 @@ import threading
 from collections import Counter, defaultdict
 from typing import Any
 
+from pydantic import ValidationError
+
 from reconstruction import Capture, CaptureWriter
+from reconstruction.options import sentence
 from stage_service.acquisition.exposing import FlashWatch
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.acquisition.states import OUTCOMES, CaptureStatus, read_status
@@ -123,7 +126,12 @@ def plan_of(capture: Capture, rig_file: RigFile) -> ResolvedPlan:
         raise PlanError([f"{capture.path}: this capture was not shot by a plan"])
     if capture.rig.to_dict() != rig_file.rig.to_dict():
         raise PlanError([f"{rig_file.path}: the rig has changed since this capture: begin anew"])
-    plan = resolve(CapturePlan.model_validate(capture.plan["plan"]), rig_file)
+    try:
+        asked = CapturePlan.model_validate(capture.plan["plan"])
+    except ValidationError as error:
+        told = f"{capture.path}: its plan is one of another version: {sentence(error)}"
+        raise PlanError([told]) from error
+    plan = resolve(asked, rig_file)
     if plan.steps != capture.steps:
         changed = "[capture] has changed since this capture, and with it the plan's steps"
         raise PlanError([f"{rig_file.path}: {changed}: begin anew"])

@@ -231,6 +231,20 @@ def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, t
     assert world.pulses == 0
 
 
+def test_what_another_version_put_in_is_told_in_a_sentence(rig_file, tmp_path):
+    """Every second row: plans of earlier versions could have that."""
+    old = {"id": "q-1", "by": "Ada", "added": "", "request": {"plan": {"rows": {"step": 2}}}}
+    (tmp_path / "queue.json").write_text(json.dumps({"held": "by Ada", "waiting": [old]}))
+    with serving(rig_file, tmp_path) as http:
+        refused = http.post("/queue/q-1/start")
+        assert slug(refused) == "bad-input"
+        assert "q-1 is what another version could shoot: plan.rows.step" in refused.json()["detail"]
+        http.post("/queue:go-on")
+        held = until(lambda: http.get("/queue").json()["held"])
+        assert held.startswith("q-1 cannot begin: q-1 is what another version could shoot")
+        assert "\n" not in held
+
+
 def test_a_blackout_wins_over_a_capture_that_is_about_to_begin(rig_file, world, tmp_path):
     manager = CaptureManager(rig_file, tmp_path / "root")
     try:

@@ -353,6 +353,18 @@ def test_a_capture_is_not_continued_on_another_stage(
         assert http.get(f"/captures/{capture}").json()["outcome"] == "aborted"
 
 
+def test_a_capture_of_a_plan_of_another_version_is_not_continued(http):
+    """Every second row: plans of earlier versions could have that."""
+    capture = interrupted(http)
+    file = Path(done(http, capture)["path"]) / "plan.json"
+    told = json.loads(file.read_text())
+    told["plan"]["rows"]["step"] = 2
+    file.write_text(json.dumps(told))
+    problem = refused(http.post(f"/captures/{capture}/resume"), "invalid-plan")
+    assert "plan is one of another version: rows.step: Input should be 1" in problem["detail"]
+    assert done(http, capture)["outcome"] == "aborted"
+
+
 def test_the_stage_keeps_the_limits_of_the_rig_file(rig_file):
     lights = DeviceSet.of(replace(rig_file, safety=SafetyLimits(max_lamps=5))).lights
     with pytest.raises(RuntimeError, match="max_lamps"):
