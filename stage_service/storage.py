@@ -12,8 +12,8 @@ import secrets
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -306,7 +306,15 @@ def files_of(folder: Path) -> dict[str, Path]:
     return Model(folder).artifacts()
 
 
+def sizes_of(files: Mapping[str, Path]) -> dict[str, int]:
+    """Their bytes, by name; what a job has removed meanwhile is none of them."""
+    sizes = {}
+    for name, path in files.items():
+        with suppress(FileNotFoundError):
+            sizes[name] = path.stat().st_size
+    return sizes
+
+
 def _listed(folder: Path) -> Folder:
-    files = files_of(folder)
-    size = sum(path.stat().st_size for path in files.values())
-    return Folder(name=folder.name, files=list(files)[:1000], bytes=size)
+    sizes = sizes_of(files_of(folder))
+    return Folder(name=folder.name, files=list(sizes)[:1000], bytes=sum(sizes.values()))

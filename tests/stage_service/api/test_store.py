@@ -256,6 +256,25 @@ def test_damage_of_captures_that_are_gone_is_told_no_more(rig_file, tmp_path):
         assert http.get("/health").json()["status"] == "ok"
 
 
+def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monkeypatch):
+    capture = shot(http)
+    pipeline = {"name": "reconstruct", "options": {"method": "auto"}}
+    job = http.post("/jobs", json={"capture": capture["id"], "pipeline": pipeline}).json()
+    model = Path(job["model"])
+    model.mkdir(parents=True)
+    (model / "strands.npz").write_bytes(b"kept")
+    list_all = Model.artifacts
+
+    def and_one_more(self):
+        return {**list_all(self), "relit.png": self.path / "relit.png"}  # removed since
+
+    monkeypatch.setattr(Model, "artifacts", and_one_more)
+    (listed,) = http.get("/models").json()
+    assert listed == {"name": model.name, "files": ["strands.npz"], "bytes": 4}
+    files = http.get(f"/jobs/{job['id']}/artifacts").json()
+    assert files == [{"path": "strands.npz", "bytes": 4}]
+
+
 def test_a_snapshot_is_nothing_to_keep(http):
     http.post("/snapshot", json={})
     until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
