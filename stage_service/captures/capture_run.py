@@ -42,6 +42,7 @@ class CaptureRun:
         self._events = events
         self._writer = writer
         self._first = read_status(writer.path)
+        self._lacked = {id(r): r for r in writer.records.values() if r.file is None}
         living = plan.rig_file.safety.living_subject
         free = not living or (plan.plan.consent is not None and consented)
         self.sequencer = Sequencer(
@@ -68,10 +69,12 @@ class CaptureRun:
 
     def frames(self) -> Counter[str]:
         """What this run made of frames: "written", "missing" and shot "again"."""
-        written, missing = self._writer.counts()
-        before = self._first.frames_written
+        written, _ = self._writer.counts()
+        records = list(self._writer.records.values())
         return Counter(
-            written=written - before, missing=missing, again=self.sequencer.progress.again
+            written=written - self._first.frames_written,
+            missing=sum(r.file is None and id(r) not in self._lacked for r in records),
+            again=self.sequencer.progress.again,
         )
 
     def give_up(self) -> None:

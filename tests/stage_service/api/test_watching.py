@@ -71,6 +71,23 @@ def test_frames_captures_and_faults_are_counted(rig_file, world, tmp_path):
         assert figures(http)["device_reachable", "lights"] == 1
 
 
+def test_a_frame_that_is_missing_is_counted_once_however_often_its_capture_goes_on(
+    rig_file, world, tmp_path
+):
+    with serving(rig_file, tmp_path) as http:
+        world.drop = {("cam_1", 3)}
+        plan = {"projectors": [], "retries": 0}
+        capture = http.post("/captures", json={"plan": plan}).json()["id"]
+        until(lambda: world.pulses > 4)
+        http.post(f"/captures/{capture}/abort")
+        until(lambda: http.get(f"/captures/{capture}").json()["state"] == "done")
+        assert figures(http)["frames_total", "missing"] == 1
+        world.busy = {"cam_1": 10**9}  # it goes on with that frame, and waits for it
+        http.post(f"/captures/{capture}/resume").raise_for_status()
+        assert figures(http)["frames_total", "missing"] == 1
+        http.post("/devices/blackout")
+
+
 def test_workers_disk_and_jobs_are_as_they_were_last_seen(rig_file, tmp_path, monkeypatch):
     slot = WorkerSlot(tmp_path)
     usage = namedtuple("usage", "total used free")(10**12, 0, 5 * 10**11)
