@@ -129,7 +129,8 @@ root = Path(sys.argv[1])
 one = Calibrating(root / "calibration", load_rig_file(root / "nominal.json"), EventLog())
 one.begin(CalibrationRequest(boards=["pose"]), lambda _: root / "pose")
 child = one._process.pid
-while b"setpriv" in Path(f"/proc/{child}/cmdline").read_bytes():
+words = Path(f"/proc/{child}/cmdline")
+while b"setpriv" in (said := words.read_bytes()) or not said:  # none: it becomes setpriv just now
     time.sleep(0.01)
 os.kill(child, signal.SIGSTOP)  # it would end by itself otherwise
 print(child, flush=True)
