@@ -265,6 +265,18 @@ def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
         FittedAppearance.load(model)
 
 
+def test_an_appearance_of_an_earlier_version_is_fitted_again(tmp_path):
+    made = (TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT)
+    model = Model(tmp_path)
+    FittedAppearance(*made).save(model)
+    path = tmp_path / "appearance.json"
+    data = json.loads(path.read_text())
+    del data["fibres"]
+    for damaged in (json.dumps(data), "{"):
+        path.write_text(damaged)
+        assert not FittedAppearance.is_of(model, LEFT_OUT)
+
+
 @pytest.mark.parametrize(
     ("as_are", "fibres", "degrees", "error", "told"),
     [
