@@ -45,8 +45,6 @@ def fit_validated(
     directions = np.array([training.rig.light(name).position for name in names])
     order = far_apart(directions, request.lights + judges)
     used = [names[k] for k in order]
-    model.remove("rejected")
-    model.remove(FIELD_FILE)  # it belonged to other maps
     result = fit_maps(
         training.view(lights=used),
         model,
