@@ -145,7 +145,7 @@ def fit(
     known = Fibres(fibres.beta_m, fibres.error, fibres.low, fibres.high, *turns)
     model.forget_appearance()
     FittedAppearance(*made, *variances, held_out, known, (red, green, blue)).save(model)
-    for stale in ("inverse_rendering", "images"):
+    for stale in ("inverse_rendering", "field", "images"):
         report.drop(stale)
     model.write_report(report)
     progress("appearance fitted", 1.0)

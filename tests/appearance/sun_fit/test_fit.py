@@ -1,6 +1,7 @@
 """The whole fit on a small capture that was rendered with a known appearance."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,9 @@ from reconstruction import (
     Mesh,
     Model,
     ModelError,
+    Report,
     Rig,
+    Stage,
     Step,
     Strands,
     write_strands,
@@ -108,6 +111,20 @@ def test_fit_reports_what_it_did(made, fitted):
     assert min(errors) < 0.05
     assert len(report["roughness"].series[0].points) == 2
     assert made[1].report().to_dict() == report.to_dict()
+
+
+def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path):
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    report = Report([Stage("field", figures={"rendered": True}), Stage("head")])
+    other.write_report(report)
+    other.file("field.npz").write_bytes(b"of an earlier fit")
+    few = replace(OPTIONS, roughness_spp=2, colour_spp=2, iterations=1)
+    fit(capture, other, held_out=HeldOut(("cam_2",)), options=few)
+    assert not other.has("field.npz")
+    names = [stage.name for stage in other.report().stages]
+    assert names == ["head", "samples", "roughness", "colour"]
 
 
 def test_fit_says_how_far_off_it_may_be(fitted):
