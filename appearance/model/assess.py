@@ -168,6 +168,8 @@ class _Comparison:
                     image.frames["mean_colour"] = np.broadcast_to(colour, (*image.mask.shape, 3))
                     groups[group].append(image)
             self._interpolate(groups[group], scene, own=group == "held_out_lights")
+            if not groups[group]:
+                stage.warn(f"{group}: no frame of it shows lit hair: nothing is compared")
         result: dict[str, Any] = {
             group: {n: _scores(images, n, exposure) for n in images[0].frames if n != "captured"}
             for group, images in groups.items()
@@ -181,8 +183,10 @@ class _Comparison:
         others = [name for name in lit if name in FITS[1:] and (shown or name != rendered)]
         columns = ["captured", "ours", *others, "diffuse", "interpolated"]
         rows = [r for g, images in groups.items() for r in self._rows(g, images, exposure)]
-        with self.model.writing("comparison.png") as part:
-            comparison_picture(part, rows, columns)
+        self.model.remove("comparison.png")
+        if rows:
+            with self.model.writing("comparison.png") as part:
+                comparison_picture(part, rows, columns)
         return result
 
     def _observed(self) -> list[Observed]:

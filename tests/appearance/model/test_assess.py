@@ -149,6 +149,30 @@ def test_a_black_frame_is_told_and_not_compared(made, monkeypatch):
     assert "cam_0, l4: the hair is black" in " ".join(model.report()["images"].warnings)
 
 
+def test_where_every_held_out_frame_is_black_the_model_is_relit_and_it_is_said(
+    made, tmp_path, monkeypatch
+):
+    capture, model, _ = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    other.file("comparison.png").write_bytes(b"of an earlier fit")
+    of_light = Capture.light
+
+    def black(self, name, camera):
+        image, saturated = of_light(self, name, camera)
+        return (0 * image if name == "l4" else image), saturated
+
+    monkeypatch.setattr(Capture, "light", black)
+    options = replace(OPTIONS, spp=2)
+    found = assess(capture, other, held_out=HeldOut((), ("l4",)), options=options)
+    assert set(found) == {"lpips"}
+    told = other.report()["images"].warnings
+    assert sum("black or saturated" in w for w in told) == 2
+    assert told[-1] == "held_out_lights: no frame of it shows lit hair: nothing is compared"
+    assert not other.has("comparison.png")
+    assert other.has("relit.png")
+
+
 def test_with_nothing_held_out_the_model_is_relit_and_it_is_said(made, tmp_path):
     capture, model, _ = made
     copy = Model(tmp_path / "copy")
