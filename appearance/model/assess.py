@@ -87,7 +87,7 @@ def assess(
     - "three_nearest", of held-out lights: the camera's own frames under the three nearest training
       lights, interpolated
     - "nearest_cameras", of a held-out camera: other cameras' frames laid on our geometry, see
-      `NearestCameras`; left out where there is no other camera
+      `NearestCameras`; left out where there is no other camera, or one of them meets no strand
     - "three_nearest_own_frames", of a held-out camera: its own frames, which no other method has,
       under the three nearest other training lights
 
@@ -171,7 +171,11 @@ class _Comparison:
             if not groups[group]:
                 stage.warn(f"{group}: no frame of it shows lit hair: nothing is compared")
         result: dict[str, Any] = {
-            group: {n: _scores(images, n, exposure) for n in images[0].frames if n != "captured"}
+            group: {
+                n: _scores(images, n, exposure)
+                for n in images[0].frames
+                if n != "captured" and all(n in image.frames for image in images)
+            }
             for group, images in groups.items()
             if images
         }

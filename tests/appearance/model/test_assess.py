@@ -9,6 +9,7 @@ import pytest
 
 from appearance import Exposure, HairAppearance, HeldOut, Sampling, assess, build_scene, render_olat
 from appearance.metrics.pictures import comparison_picture
+from appearance.model import baselines
 from appearance.model.assess import front_lights, judge
 from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
@@ -171,6 +172,25 @@ def test_where_every_held_out_frame_is_black_the_model_is_relit_and_it_is_said(
     assert told[-1] == "held_out_lights: no frame of it shows lit hair: nothing is compared"
     assert not other.has("comparison.png")
     assert other.has("relit.png")
+
+
+def test_a_camera_that_meets_no_strand_leaves_out_the_baseline_on_strands(
+    made, tmp_path, monkeypatch
+):
+    capture, model, _ = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    first_hits = baselines._first_hits
+
+    def hits(scene, camera, mask):
+        points, met = first_hits(scene, camera, mask)
+        return points, met & (camera.name != "cam_2")
+
+    monkeypatch.setattr(baselines, "_first_hits", hits)
+    held_out = HeldOut(("cam_1", "cam_2"))
+    found = assess(capture, other, held_out=held_out, options=replace(OPTIONS, spp=2))
+    rows = set(found["held_out_camera"])
+    assert rows == {"ours", "mean_colour", "diffuse", "three_nearest_own_frames"}
 
 
 def test_with_nothing_held_out_the_model_is_relit_and_it_is_said(made, tmp_path):
