@@ -211,6 +211,16 @@ def test_one_view_is_enough(made, tmp_path):
     np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.3)
 
 
+@pytest.mark.slow
+def test_a_channel_that_frames_do_not_have_tells_nothing(made, tmp_path):
+    """As of infrared frames: the next darkest channel has the roughness."""
+    change = (np.array([1, 1, 0], np.float32), np.inf)
+    appearance, report = fit_of(tmp_path, made, change)
+    assert report["roughness"].figures["channel"] == "G"
+    assert covers(appearance, report, TRUTH.beta_m)
+    np.testing.assert_allclose(appearance.hair.sigma_a[:2], TRUTH.sigma_a[:2], rtol=0.2)
+
+
 def test_one_light_is_refused(made, tmp_path):
     with pytest.raises(ValueError, match="needs more lights"):
         fit_of(tmp_path, made, (1.0, np.inf), lights=["l3"])
