@@ -452,6 +452,12 @@ def test_relighting_names_and_views():
     pixels, depth = view.project(strands.points)
     assert view.inside(pixels).all()
     assert (depth > 0).all()
+    for shape in ((0.09, 0.09, 0.6), (0.0, 0.0, 0.9), (0.5, 0.5, 0.01)):  # long, one hair, flat
+        around = np.random.default_rng(0).normal(size=(200, 3))
+        around = around / np.linalg.norm(around, axis=1, keepdims=True) * shape
+        for turned in range(0, 360, 45):
+            view = three_quarter_view(Strands.from_list([around]), 64, turned)
+            assert view.inside(view.project(around)[0]).all()
     still = Strands.from_list([np.full((2, 3), 0.1)])
     np.testing.assert_allclose(three_quarter_view(still, 64).project(still.points)[0], 31.5)
     with pytest.raises(ValueError, match="no strands to see"):
