@@ -100,6 +100,25 @@ def test_pixels_beside_each_other_tell_how_far_strands_turn(turn_deg, noise):
     assert abs(found.degrees - turn_deg) <= 3 * found.error
 
 
+@pytest.fixture(scope="module")
+def turned():
+    return [(d, highlight(0.3, d, seed=7 + k)) for k, d in enumerate((0, 8, 16, 24))]
+
+
+def test_a_disorder_that_is_told_as_none_says_how_large_it_may_be(turned):
+    """Turns of 4°, near half of whose 24 draws read 0: with the answers' own scatter 8 were off."""
+    found = [match_disorder(highlight(0.3, 4, 0.5, seed=100 + k), turned) for k in range(24)]
+    assert sum(d.degrees == 0 for d in found) > 8
+    assert sum(abs(d.degrees - 4) > 2 * d.error for d in found) <= 5
+
+
+def test_a_disorder_beyond_what_was_rendered_is_not_told_as_exact(turned):
+    for seed in range(4):
+        found = match_disorder(highlight(0.3, 30, 0.5, seed=seed), turned)
+        assert found.degrees == 24
+        assert 3 < found.error < 12
+
+
 def test_alike_are_pixels_of_one_highlight_and_not_those_of_strangers():
     whole = np.ones((1, VIEWS * SIDE**2))
     assert highlight(0.1).likeness(whole) == pytest.approx(1, abs=0.05)
