@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -97,8 +98,8 @@ def fit_field_validated(
     otherwise it goes to the model's folder "rejected", with a warning in the report, and an earlier
     field stays. What is kept is fitted to all of the frames. Writes `field.npz` and the stage
     "field" of the report. Returns `{"validation": {group: {"without", "with", "spread"}} in dB,
-    "gain", "rendered", "ridge", "clamped", "lights"}`, or "left_out" where no field is asked for;
-    that removes an earlier one.
+    "gain" (and its spread, None where nothing could be left out), "rendered", "ridge", "clamped",
+    "lights"}`, or "left_out" where no field is asked for; that removes an earlier one.
     """
     held_out, request = held_out or HeldOut(), request or FieldRequest()
     report = model.report()
@@ -130,11 +131,11 @@ def fit_field_validated(
             stage.warn(f"{request.field}, {doubt}: it is not rendered{stays}")
         result: dict[str, Any] = {
             "validation": found.validation,
-            "gain": found.gain,
+            "gain": _known(found.gain),
             "rendered": not doubts,
             "field": found.field.kind,
             "ridge": found.ridge,
-            "ridges": found.tried,
+            "ridges": [_known(tried) for tried in found.tried],
             "clamped": found.clamped,
             "lights": len(used),
         }
@@ -143,6 +144,11 @@ def fit_field_validated(
     shutil.rmtree(model.work("field"), ignore_errors=True)
     progress("field fitted", 1.0)
     return result
+
+
+def _known(values: Sequence[float]) -> list[float | None]:
+    """`values` for JSON: a spread is infinite where nothing could be left out."""
+    return [x if np.isfinite(x) else None for x in values]
 
 
 def far_apart(positions: Array, most: int) -> list[int]:

@@ -219,6 +219,17 @@ def test_an_earlier_field_stays_until_a_better_one_is_known_or_none_is_asked_for
     assert "field" not in [stage.name for stage in model.report().stages]
 
 
+def test_of_one_camera_and_three_lights_none_is_left_out_and_the_field_is_not_rendered(own):
+    capture, model = own
+    few = capture.view(cameras=["c0"], lights=["l0", "l5", "l9"])
+    result = fit_field_validated(few, model, request=REQUEST)
+    assert not result["rendered"]
+    assert result["gain"] == [0.0, None]
+    assert model.rejected().has("field.npz")
+    told = model.report()["field"].warnings
+    assert sum("nothing could be left out" in w for w in told) == 1
+
+
 def test_a_killed_fit_renders_no_view_twice_and_memory_is_refused(own, monkeypatch):
     capture, model = own
 
