@@ -11,6 +11,7 @@ import numpy as np
 from appearance.inverse_rendering.descent import Adam, Convergence
 from appearance.inverse_rendering.unknowns import Raw
 from reconstruction.arrays import Array
+from reconstruction.files.durable import writing
 
 
 @dataclass
@@ -51,9 +52,8 @@ class State:
             "level_began": self.level_began,
             "history": self.history,
         }
-        part = path.with_suffix(".part.npz")
-        np.savez(part, numbers=np.array(json.dumps(numbers)), **arrays)  # type: ignore[arg-type]
-        part.replace(path)
+        with writing(path) as part:
+            np.savez(part, numbers=np.array(json.dumps(numbers)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, path: Path | None, fingerprint: str) -> State | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.found_lights import lights_as_found, save_lights
+from appearance.inverse_rendering.found_lights import LIGHTS_FILE, lights_as_found, save_lights
 from appearance.inverse_rendering.global_parameters import FOUND
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import SURE, Monitor, Outcome, run
@@ -27,6 +28,7 @@ from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, St
 from reconstruction.arrays import Array
 from reconstruction.report.report import Series, free_memory, resident_memory
 
+FILES = "hair_maps.npz", LIGHTS_FILE
 JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
@@ -52,12 +54,13 @@ def fit_maps(
     The head is the model's. Writes `hair_maps.npz`, `lights.json`, `inverse_rendering.png` where
     images are held out (captured, rendered and error maps) and the stage "inverse_rendering" of
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
-    the fit is done. Where whole training pictures are not clearly better with what was found than
-    with Sun's fit, it goes to the model's folder "rejected", with a warning. Returns `{"ended",
-    "steps", "error", "start_error", "sure", "accepted", "doubts", "held_out": {"start" |
-    "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the latter where images are held
-    out; see `Outcome` for errors, of Sun's fit and of what was found; "doubts" are warnings for
-    whoever renders what was found. Raises `CaptureError` or `ModelError` naming what is missing.
+    the fit is done, and so do an earlier fit and the field on top of it. Where whole training
+    pictures are not clearly better with what was found than with Sun's fit, it goes to the model's
+    folder "rejected", with a warning. Returns `{"ended", "steps", "error", "start_error", "sure",
+    "accepted", "doubts", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
+    "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
+    fit and of what was found; "doubts" are warnings for whoever renders what was found. Raises
+    `CaptureError` or `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     training = held_out.training(capture)
@@ -85,8 +88,9 @@ def fit_maps(
             outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
             taken = taken or outcome.error < outcome.start_error
         found = outcome if taken or outcome.refused is None else outcome.refused
-        found.maps.save(model, mapped.root_uv)
-        save_lights(model, found.lights, problem.lights)
+        judged = Model(model.work("inverse_rendering")).create()
+        found.maps.save(judged, mapped.root_uv)
+        save_lights(judged, found.lights, problem.lights)
         progress("judging held-out images", 0.92)
         result: dict[str, Any] = {
             "ended": outcome.ended,
@@ -100,7 +104,7 @@ def fit_maps(
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
-            lights = tuple(lights_as_found(model, capture.rig.lights))
+            lights = tuple(lights_as_found(judged, capture.rig.lights))
             fits = {
                 name: Judged(mapped.with_maps(maps).with_skin(fitted.skin), rig)
                 for name, maps, rig in (
@@ -111,10 +115,16 @@ def fit_maps(
             judging = Sampling(request.judged_spp, depth, seed)
             result["held_out"] = judge(model, frames, fits, fitted.exposure, judging)
             result |= scores_unavailable()
-        if not taken:
-            model.reject("hair_maps.npz", "lights.json")
+        for place in (model, model.rejected()):
+            for earlier in ("field.npz", *FILES):  # a field belonged to the maps below it
+                place.remove(earlier)
+        place = model if taken else model.rejected().create()
+        for name in FILES:
+            judged.file(name).replace(place.file(name))
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
+    report.drop("field")
     model.write_report(report)
+    shutil.rmtree(judged.path)
     for variant in ("original", options.variant):
         model.checkpoint(variant).unlink(missing_ok=True)
     progress("inverse rendering done", 1.0)

@@ -87,7 +87,7 @@ def assess(
     - "three_nearest", of held-out lights: the camera's own frames under the three nearest training
       lights, interpolated
     - "nearest_cameras", of a held-out camera: other cameras' frames laid on our geometry, see
-      `NearestCameras`; left out where there is no other camera
+      `NearestCameras`; left out where there is no other camera, or one of them meets no strand
     - "three_nearest_own_frames", of a held-out camera: its own frames, which no other method has,
       under the three nearest other training lights
 
@@ -168,8 +168,14 @@ class _Comparison:
                     image.frames["mean_colour"] = np.broadcast_to(colour, (*image.mask.shape, 3))
                     groups[group].append(image)
             self._interpolate(groups[group], scene, own=group == "held_out_lights")
+            if not groups[group]:
+                stage.warn(f"{group}: no frame of it shows lit hair: nothing is compared")
         result: dict[str, Any] = {
-            group: {n: _scores(images, n, exposure) for n in images[0].frames if n != "captured"}
+            group: {
+                n: _scores(images, n, exposure)
+                for n in images[0].frames
+                if n != "captured" and all(n in image.frames for image in images)
+            }
             for group, images in groups.items()
             if images
         }
@@ -181,8 +187,10 @@ class _Comparison:
         others = [name for name in lit if name in FITS[1:] and (shown or name != rendered)]
         columns = ["captured", "ours", *others, "diffuse", "interpolated"]
         rows = [r for g, images in groups.items() for r in self._rows(g, images, exposure)]
-        with self.model.writing("comparison.png") as part:
-            comparison_picture(part, rows, columns)
+        self.model.remove("comparison.png")
+        if rows:
+            with self.model.writing("comparison.png") as part:
+                comparison_picture(part, rows, columns)
         return result
 
     def _observed(self) -> list[Observed]:

@@ -51,10 +51,12 @@ class FittedModel:
     field: Field | None = None
 
     @classmethod
-    def load(cls, model: Model, capture: Capture | None = None) -> FittedModel:
+    def load(
+        cls, model: Model, capture: Capture | None = None, *, with_field: bool = True
+    ) -> FittedModel:
         """Read a model; `capture` gives the rig, and the head where none was laid.
 
-        Raises `ModelError` naming what is missing.
+        Its field is not looked at unless `with_field`. Raises `ModelError` naming what is missing.
         """
         appearance, strands = FittedAppearance.load(model), model.strands()
         maps, placed = HairMaps.of(appearance.hair), model.root_uv(strands)
@@ -69,7 +71,7 @@ class FittedModel:
         if capture is not None:
             rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
         found = model.json(LIGHTS_FILE) if model.has(LIGHTS_FILE) else ()
-        field = Field.load(model) if model.has(FIELD_FILE) else None
+        field = Field.load(model) if with_field and model.has(FIELD_FILE) else None
         if field is not None and len(field.places.kept) != len(strands):
             raise ModelError(
                 f"{model.file(FIELD_FILE)} is of {len(field.places.kept)} strands and strands.npz "
@@ -99,7 +101,7 @@ class FittedModel:
         Without a field.
         One of them is what `load` gives; see `fit_validated`.
         """
-        ours = cls.load(model, capture).without_field()
+        ours = cls.load(model, capture, with_field=False)
         for folder in (model, model.rejected()):
             if folder.has("hair_maps.npz"):
                 maps, placed = HairMaps.load(folder)

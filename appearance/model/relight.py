@@ -14,8 +14,10 @@ from appearance.render.coverage import coverage
 from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.smoothed import SHOWN, environment_smoothed
 from reconstruction import Camera, Model, Strands, write_exr
-from reconstruction.arrays import AnyFloats, Floats
+from reconstruction.arrays import AnyFloats, Array, Floats
 
+MARGIN = 1.02
+"""Times what long hair fills of a picture."""
 LEAST = 1e-3
 """Metres about their middle that are seen of strands that all lie in one place."""
 PROCEDURAL = {"studio": studio, "sky": sky}
@@ -67,6 +69,22 @@ def three_quarter_view(strands: Strands, size: int, round_deg: float = 0.0) -> C
     c, s = np.cos(np.radians(round_deg)), np.sin(np.radians(round_deg))
     direction = np.array([0.62 * c + 0.75 * s, 0.62 * s - 0.75 * c, 0.22])
     distance = 6.0 * reach
-    position = middle + distance * direction / np.linalg.norm(direction)
-    fov = float(np.degrees(2 * np.arcsin(0.85 * reach / distance)))
-    return Camera.look_at("three_quarter", size, size, position, middle, fov)
+    direction /= np.linalg.norm(direction)
+    half = max(
+        np.arcsin(0.85 * reach / distance), _half_angle(strands, middle, distance, direction)
+    )
+    fov = float(np.degrees(2 * half))
+    return Camera.look_at("three_quarter", size, size, middle + distance * direction, middle, fov)
+
+
+def _half_angle(strands: Strands, middle: Array, distance: float, direction: Array) -> float:
+    """Half of the angle, radians, that `strands` fill seen from so far and high, all around."""
+    x, y, up = (strands.points.astype(float) - middle).T
+    out, level, rise = np.hypot(x, y), float(np.hypot(*direction[:2])), direction[2]
+    # how far to a side, above and below the middle of the picture a point comes as it goes round
+    beside = out / np.sqrt((distance - up * rise) ** 2 - (out * level) ** 2)
+    above = [
+        np.abs(up * level - near * rise) / (distance - up * rise - near * level)
+        for near in (out, -out)
+    ]
+    return float(np.arctan(MARGIN * np.max([beside, *above])))

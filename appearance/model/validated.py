@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -45,8 +46,6 @@ def fit_validated(
     directions = np.array([training.rig.light(name).position for name in names])
     order = far_apart(directions, request.lights + judges)
     used = [names[k] for k in order]
-    model.remove("rejected")
-    model.remove(FIELD_FILE)  # it belonged to other maps
     result = fit_maps(
         training.view(lights=used),
         model,
@@ -96,21 +95,24 @@ def fit_field_validated(
     Of the lights that are not `held_out`, `request.lights` are used: directions far apart. Cameras
     and lights are left out in turn, and the field is rendered later where pictures under new
     lights, of new views, and of both each gain by it, and together more than twice the spread;
-    otherwise it goes to the model's folder "rejected", with a warning in the report. What is kept
-    is fitted to all of the frames. Writes `field.npz` and the stage "field" of the report. Returns
-    `{"validation": {group: {"without", "with", "spread"}} in dB, "gain", "rendered", "ridge",
-    "clamped", "lights"}`, or "left_out" where no field is asked for; that removes an earlier one.
+    otherwise it goes to the model's folder "rejected", with a warning in the report, and an earlier
+    field stays. What is kept is fitted to all of the frames. Writes `field.npz` and the stage
+    "field" of the report. Returns `{"validation": {group: {"without", "with", "spread"}} in dB,
+    "gain" (and its spread, None where nothing could be left out), "rendered", "ridge", "clamped",
+    "lights"}`, or "left_out" where no field is asked for; that removes an earlier one.
     """
     held_out, request = held_out or HeldOut(), request or FieldRequest()
-    model.remove(FIELD_FILE)
+    report = model.report()
     if request.field == "none":
+        model.remove(FIELD_FILE)
+        report.drop("field")
+        model.write_report(report)
         return {"left_out": "no field was asked for"}
     training = held_out.training(capture)
     names = training.olat_lights()
     directions = np.array([training.rig.light(name).position for name in names])
     used = [names[k] for k in far_apart(directions, request.lights)]
-    fitted = FittedModel.load(model, capture)
-    report = model.report()
+    fitted = FittedModel.load(model, capture, with_field=False)
     with report.stage("field") as stage:
         mapped = fitted.mapped()
         base = Rendered(
@@ -121,21 +123,19 @@ def fit_field_validated(
             fitted.maps.beta_m,
         )
         found = fit_field(training, model, base, request, progress, seed)
-        found.field.save(model)
         stage.warnings += found.warnings
         doubts = found.doubts()
-        if doubts:
-            model.rejected().remove(FIELD_FILE)
-            model.reject(FIELD_FILE)
+        found.field.save(model.rejected() if doubts else model)
+        stays = ", the earlier field stays" if doubts and model.has(FIELD_FILE) else ""
         for doubt in doubts:
-            stage.warn(f"{request.field}, {doubt}: it is not rendered")
+            stage.warn(f"{request.field}, {doubt}: it is not rendered{stays}")
         result: dict[str, Any] = {
             "validation": found.validation,
-            "gain": found.gain,
-            "rendered": model.has(FIELD_FILE),
+            "gain": _known(found.gain),
+            "rendered": not doubts,
             "field": found.field.kind,
             "ridge": found.ridge,
-            "ridges": found.tried,
+            "ridges": [_known(tried) for tried in found.tried],
             "clamped": found.clamped,
             "lights": len(used),
         }
@@ -144,6 +144,11 @@ def fit_field_validated(
     shutil.rmtree(model.work("field"), ignore_errors=True)
     progress("field fitted", 1.0)
     return result
+
+
+def _known(values: Sequence[float]) -> list[float | None]:
+    """`values` for JSON: a spread is infinite where nothing could be left out."""
+    return [x if np.isfinite(x) else None for x in values]
 
 
 def far_apart(positions: Array, most: int) -> list[int]:

@@ -145,7 +145,7 @@ def fit(
     known = Fibres(fibres.beta_m, fibres.error, fibres.low, fibres.high, *turns)
     model.forget_appearance()
     FittedAppearance(*made, *variances, held_out, known, (red, green, blue)).save(model)
-    for stale in ("inverse_rendering", "images"):
+    for stale in ("inverse_rendering", "field", "images"):
         report.drop(stale)
     model.write_report(report)
     progress("appearance fitted", 1.0)
@@ -295,8 +295,8 @@ class SunFit:
                 "no light lies near a mirror direction of any hair pixel: the roughness needs more "
                 "lights"
             )
-        mean = sum(o.radiance.mean((0, 1)) for o, _ in views)
-        channel = int(np.argmin(mean))
+        mean: Array = np.sum([o.radiance.mean((0, 1)) for o, _ in views], axis=0)
+        channel = int(np.argmin(np.where(mean > 0, mean, np.inf)))  # a black one tells nothing
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
         first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"))

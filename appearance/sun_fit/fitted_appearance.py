@@ -78,10 +78,14 @@ class FittedAppearance:
 
     @classmethod
     def is_of(cls, model: Model, held_out: HeldOut) -> bool:
-        """Whether the model has an appearance whose fit left out these cameras and lights."""
-        if not model.has("appearance.json"):
+        """Whether the model has an appearance whose fit left out these cameras and lights.
+
+        One that cannot be read, or is of an earlier version, is none: it has to be fitted again.
+        """
+        try:
+            made = cls.load(model).held_out
+        except ModelError:
             return False
-        made = cls.load(model).held_out
         return all(
             set(a) == set(b)
             for a, b in ((made.cameras, held_out.cameras), (made.lights, held_out.lights))

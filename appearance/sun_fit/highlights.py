@@ -145,7 +145,6 @@ class LightPairs:
             np.concatenate([x[angle < EDGES[-1]], y[of_two[2] < EDGES[-1]]])
             for x, y in zip((i, j, angle), of_two, strict=True)
         )
-        shines = [light.intensity_towards(found.middle)[:, channel] for light in observed.lights]
         return cls(
             sample,
             part[pixel] * (len(_DEVIATIONS) - 1) + _bin(deviation[sample], _DEVIATIONS),
@@ -153,7 +152,9 @@ class LightPairs:
             j,
             part[i % count] * (len(EDGES) - 1) + _bin(angle, EDGES),
             own,
-            found.squared / np.maximum(shines, 1e-12) / np.maximum(fibres.share, 1e-12),
+            found.squared
+            / np.maximum(found.shines[..., channel], 1e-12)
+            / np.maximum(fibres.share, 1e-12),
         )
 
     def highlight(self, one: AnyFloats, other: AnyFloats) -> Highlight:

@@ -161,8 +161,9 @@ def match_disorder(
 
     Between the `rendered`, which ascend from 0, a line over the square: 0 where the capture is more
     alike than strands as they are. The error is the jackknife's over parts of the hair, or what the
-    views' answers differ by. None where too few pixels lie `BESIDE` each other, and nothing is
-    rendered then, or where turns make the rendered ones no less alike.
+    views' answers differ by; of an answer at an end it reaches at least to where the square may be.
+    None where too few pixels lie `BESIDE` each other, and nothing is rendered then, or where turns
+    make the rendered ones no less alike.
     """
     if captured.pairs_beside.sum() < FEWEST_PAIRS:
         return None
@@ -174,7 +175,11 @@ def match_disorder(
         return None
     square = (captured.likeness(chosen) - start) / np.where(slope < 0, slope, slope[0])
     answers = np.sqrt(np.clip(square, 0, nodes[-1] ** 2))
-    return Disorder(float(answers[0]), max(_errors(answers, left_out)), float(nodes[-1]))
+    error = max(_errors(answers, left_out))
+    if not 0 < square[0] < nodes[-1] ** 2:  # at an end, where most answers end and none differ
+        beyond = max(float(square[0]) + max(_errors(square, left_out)), 0.0)
+        error = max(error, beyond**0.5 - float(answers[0]))
+    return Disorder(float(answers[0]), error, float(nodes[-1]))
 
 
 def _chosen(pairs: Array) -> tuple[Array, int]:

@@ -17,6 +17,8 @@ WINDOW = np.pi / 6
 """Sun Eq. 9: how far from the mirror direction samples are taken, both ways."""
 BINS = 32
 LEAST_SHARE, MOST_SPREAD = 0.9, 0.06
+LEAST_LIT = 0.1
+"""Of what a light sends to the pixel that it sends most to: less, and other hair lights it."""
 _PAIRS = 96  # directions kept a bin, each with all its pixel's fibres, to average the model over
 
 
@@ -78,12 +80,10 @@ def mirror_samples(
     """
     found = near_mirror(observed, fibres, tilt_deg)
     light, pixel = np.nonzero(found.near)
-    middle = found.middle
-    shines = np.array([light.intensity_towards(middle)[:, channel] for light in observed.lights])
     tangent = fibres.tangent[pixel].astype(float)
-    intensity = np.maximum(shines[light, pixel], 1e-12)
+    intensity = found.shines[light, pixel, channel]
     value = observed.radiance[light, pixel, channel] * found.squared[light, pixel] / intensity
-    to_camera = _unit(observed.camera.center - middle)
+    to_camera = _unit(observed.camera.center - found.middle)
     theta_o = _angle(np.einsum("pi,pki->pk", to_camera, fibres.tangent)) + 2 * np.radians(tilt_deg)
     return MirrorSamples(
         found.deviation[light, pixel],
@@ -139,7 +139,7 @@ class NearMirror:
 
     `deviation (L, P)` is θ_i + θ_o + 2 tilt at the pixel's mean tangent; `middle (P, 3)` the mean
     of the points that its rays met, `towards (L, P, 3)` and `squared (L, P)` the unit direction and
-    the squared distance from there to the light.
+    the squared distance from there to the light, `shines (L, P, 3)` what it sends there, W/sr.
     """
 
     near: Bools
@@ -147,6 +147,7 @@ class NearMirror:
     middle: Array
     towards: Array
     squared: Array
+    shines: Array
 
 
 def usable(fibres: VisibleFibres) -> Bools:
@@ -164,7 +165,7 @@ def near_mirror(
     """Samples with |θ_i + θ_o + 2 tilt| below `window` and |φ_i − φ_o| below π/6.
 
     The fibres run along the mean tangent of each pixel, or `along (P, 3)`. Pixels that are not
-    `usable` are left out.
+    `usable` are left out, and lights where they send under `LEAST_LIT` of their most.
     """
     middle = _middle(fibres)
     mean = fibres.mean_tangent() if along is None else along
@@ -180,8 +181,11 @@ def near_mirror(
     near = (np.abs(deviation) < window) & observed.valid
     near &= (across_i * across_o).sum(-1) > np.cos(WINDOW)
     near &= usable(fibres)
-    near &= np.array([(light.intensity > 0).all() for light in observed.lights])[:, None]
-    return NearMirror(near, deviation, middle, towards, squared)
+    shines = np.array([light.intensity_towards(middle) for light in observed.lights])
+    shines = shines.reshape(*near.shape, 3)
+    least = LEAST_LIT * shines.max(axis=1, keepdims=True, initial=0)
+    near &= ((shines > 0) & (shines >= least)).all(axis=-1)
+    return NearMirror(near, deviation, middle, towards, squared, shines)
 
 
 def _middle(fibres: VisibleFibres) -> Array:

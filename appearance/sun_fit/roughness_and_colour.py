@@ -119,7 +119,7 @@ class Colours:
         """Standard error of log sigma_a `(3,)`: `scatter`, by how the mean colour answers to C.
 
         That is read off all pairs, those `earlier` too. It is infinite where the colour does not
-        answer: black hair is no darker for more absorption.
+        answer, as black hair is no darker for more absorption, and at an end of C's range.
         """
         c, r = (
             np.log(np.maximum(x, 1e-12)) for x in np.array([*earlier, *self.pairs]).swapaxes(0, 1)
@@ -127,8 +127,10 @@ class Colours:
         spread = ((c - c.mean(0)) ** 2).sum(0)
         answers = ((c - c.mean(0)) * (r - r.mean(0))).sum(0)
         gradient = np.where(spread > 1e-4, answers / np.maximum(spread, 1e-4), 1.0)
-        slope = gradient * np.abs(np.log(np.array(self.colour)))
-        return np.where(slope > 0, 2 * self.scatter / np.maximum(slope, 1e-12), np.inf)
+        colour = np.array(self.colour)
+        slope = gradient * np.abs(np.log(colour))
+        known = (slope > 0) & (colour > LEAST_ALBEDO) & (colour < MOST_ALBEDO)
+        return np.where(known, 2 * self.scatter / np.maximum(slope, 1e-12), np.inf)
 
 
 def fit_colour(

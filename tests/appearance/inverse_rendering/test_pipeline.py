@@ -171,6 +171,46 @@ def test_a_fit_that_is_not_taken_leaves_suns_to_be_rendered(made, tmp_path, monk
     assert warning.startswith("original: whole training pictures are not clearly better")
 
 
+def test_a_fit_that_is_stopped_leaves_what_was_rendered_and_one_that_ends_replaces_it(
+    made, tufted, tmp_path, monkeypatch
+):
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    before, after = HairMaps.of(tufted.truth), HairMaps.of(replace(tufted.truth, beta_m=0.35))
+    before.save(other, np.zeros((300, 2)))
+    other.write_json("lights.json", [])
+    other.file("field.npz").write_bytes(b"of the maps before")
+    report = other.report()
+    with report.stage("field"):
+        pass
+    other.write_report(report)
+
+    def found(problem, *args, **more):
+        same = LightDeviations.calibrated(len(problem.lights))
+        return Outcome(after, same, "converged", 1.0, 0.5, 1, [])
+
+    def killed(*args):
+        raise KeyboardInterrupt
+
+    def files():
+        return {k: p.read_bytes() for k, p in other.artifacts().items() if "work" not in k}
+
+    was = files()
+    monkeypatch.setattr(pipeline, "run", found)
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "judge", killed)
+        with pytest.raises(KeyboardInterrupt):
+            fit_maps(capture, other, held_out=HELD_OUT, request=REQUEST)
+    assert files() == was
+    fit_maps(capture, other, held_out=HELD_OUT, request=REQUEST)
+    assert HairMaps.load(other)[0].beta_m == 0.35
+    assert len(other.json("lights.json")) == 6
+    assert not other.has("field.npz")
+    assert "field" not in [stage.name for stage in other.report().stages]
+    assert set(files()) == set(was) - {"field.npz"} | {"inverse_rendering.png"}
+
+
 @pytest.mark.parametrize(
     ("hair", "doubt"),
     [

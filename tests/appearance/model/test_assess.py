@@ -9,6 +9,7 @@ import pytest
 
 from appearance import Exposure, HairAppearance, HeldOut, Sampling, assess, build_scene, render_olat
 from appearance.metrics.pictures import comparison_picture
+from appearance.model import baselines
 from appearance.model.assess import front_lights, judge
 from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
@@ -147,6 +148,49 @@ def test_a_black_frame_is_told_and_not_compared(made, monkeypatch):
     found = assess(capture, model, held_out=HeldOut((), ("l4", "l9")), options=OPTIONS)
     assert np.isfinite(found["held_out_lights"]["ours"]["relative_error"])
     assert "cam_0, l4: the hair is black" in " ".join(model.report()["images"].warnings)
+
+
+def test_where_every_held_out_frame_is_black_the_model_is_relit_and_it_is_said(
+    made, tmp_path, monkeypatch
+):
+    capture, model, _ = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    other.file("comparison.png").write_bytes(b"of an earlier fit")
+    of_light = Capture.light
+
+    def black(self, name, camera):
+        image, saturated = of_light(self, name, camera)
+        return (0 * image if name == "l4" else image), saturated
+
+    monkeypatch.setattr(Capture, "light", black)
+    options = replace(OPTIONS, spp=2)
+    found = assess(capture, other, held_out=HeldOut((), ("l4",)), options=options)
+    assert set(found) == {"lpips"}
+    told = other.report()["images"].warnings
+    assert sum("black or saturated" in w for w in told) == 2
+    assert told[-1] == "held_out_lights: no frame of it shows lit hair: nothing is compared"
+    assert not other.has("comparison.png")
+    assert other.has("relit.png")
+
+
+def test_a_camera_that_meets_no_strand_leaves_out_the_baseline_on_strands(
+    made, tmp_path, monkeypatch
+):
+    capture, model, _ = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    first_hits = baselines._first_hits
+
+    def hits(scene, camera, mask):
+        points, met = first_hits(scene, camera, mask)
+        return points, met & (camera.name != "cam_2")
+
+    monkeypatch.setattr(baselines, "_first_hits", hits)
+    held_out = HeldOut(("cam_1", "cam_2"))
+    found = assess(capture, other, held_out=held_out, options=replace(OPTIONS, spp=2))
+    rows = set(found["held_out_camera"])
+    assert rows == {"ours", "mean_colour", "diffuse", "three_nearest_own_frames"}
 
 
 def test_with_nothing_held_out_the_model_is_relit_and_it_is_said(made, tmp_path):
@@ -408,6 +452,12 @@ def test_relighting_names_and_views():
     pixels, depth = view.project(strands.points)
     assert view.inside(pixels).all()
     assert (depth > 0).all()
+    for shape in ((0.09, 0.09, 0.6), (0.0, 0.0, 0.9), (0.5, 0.5, 0.01)):  # long, one hair, flat
+        around = np.random.default_rng(0).normal(size=(200, 3))
+        around = around / np.linalg.norm(around, axis=1, keepdims=True) * shape
+        for turned in range(0, 360, 45):
+            view = three_quarter_view(Strands.from_list([around]), 64, turned)
+            assert view.inside(view.project(around)[0]).all()
     still = Strands.from_list([np.full((2, 3), 0.1)])
     np.testing.assert_allclose(three_quarter_view(still, 64).project(still.points)[0], 31.5)
     with pytest.raises(ValueError, match="no strands to see"):

@@ -185,6 +185,51 @@ def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
     }
 
 
+def test_an_earlier_field_stays_until_a_better_one_is_known_or_none_is_asked_for(own, monkeypatch):
+    capture, model = own
+    right, found = validated.fit_field, []
+
+    def kept(*args):
+        found.append(right(*args))
+        return found[-1]
+
+    def killed(*args):
+        raise KeyboardInterrupt
+
+    def doubted(*args):
+        scores = {"new lights": {"without": 30.0, "with": 29.5, "spread": 0.1}}
+        return replace(found[0], validation=scores)
+
+    monkeypatch.setattr(validated, "fit_field", kept)
+    assert fit_field_validated(capture, model, request=REQUEST)["rendered"]
+    was, report = model.file("field.npz").read_bytes(), model.report().to_dict()
+    monkeypatch.setattr(validated, "fit_field", killed)
+    with pytest.raises(KeyboardInterrupt):
+        fit_field_validated(capture, model, request=REQUEST)
+    assert model.file("field.npz").read_bytes() == was
+    assert model.report().to_dict() == report
+    monkeypatch.setattr(validated, "fit_field", doubted)
+    assert not fit_field_validated(capture, model, request=REQUEST)["rendered"]
+    assert model.file("field.npz").read_bytes() == was
+    assert model.rejected().has("field.npz")
+    (warning,) = [w for w in model.report()["field"].warnings if "better without" in w]
+    assert warning.endswith("it is not rendered, the earlier field stays")
+    fit_field_validated(capture, model, request=FieldRequest("none"))
+    assert not model.has("field.npz")
+    assert "field" not in [stage.name for stage in model.report().stages]
+
+
+def test_of_one_camera_and_three_lights_none_is_left_out_and_the_field_is_not_rendered(own):
+    capture, model = own
+    few = capture.view(cameras=["c0"], lights=["l0", "l5", "l9"])
+    result = fit_field_validated(few, model, request=REQUEST)
+    assert not result["rendered"]
+    assert result["gain"] == [0.0, None]
+    assert model.rejected().has("field.npz")
+    told = model.report()["field"].warnings
+    assert sum("nothing could be left out" in w for w in told) == 1
+
+
 def test_a_killed_fit_renders_no_view_twice_and_memory_is_refused(own, monkeypatch):
     capture, model = own
 

@@ -5,12 +5,24 @@ import pytest
 
 from appearance import Exposure, FittedModel, HairAppearance, HeldOut, InverseRenderingRequest
 from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering import pipeline
 from appearance.inverse_rendering.found_lights import save_lights
 from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.model import validated
 from appearance.model.validated import far_apart, fit_validated
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import Camera, Capture, CaptureWriter, Light, Model, Report, Rig, Step, Strands
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureWriter,
+    Light,
+    Model,
+    ModelError,
+    Report,
+    Rig,
+    Step,
+    Strands,
+)
 from reconstruction.geometry.lights import dome_positions
 
 SUN = HairAppearance((0.2, 0.2, 0.2), 0.4, 0.3)
@@ -86,6 +98,18 @@ def test_the_better_fit_on_validation_frames_is_rendered(made, monkeypatch, psnr
     (warning,) = warnings
     assert ("20.00 dB against 19.50" in warning) == (rendered == SUN.beta_m)
     assert (warning == "rough") == (rendered != SUN.beta_m), "of what is rendered alone"
+
+
+def test_a_fit_that_is_refused_leaves_the_field_and_what_was_rejected(made, monkeypatch):
+    capture, model = made
+    for place in (model, model.rejected().create()):
+        place.file("field.npz").write_bytes(b"an earlier field")
+    model.write_mask("cam_0", "hair", np.ones((4, 4), bool))
+    monkeypatch.setattr(pipeline, "free_memory", lambda: 1e-4)
+    with pytest.raises(ModelError, match="GB of memory"):
+        fit_validated(capture, model, held_out=HELD_OUT, request=REQUEST)
+    assert model.has("field.npz")
+    assert model.rejected().has("field.npz")
 
 
 def test_directions_far_apart():

@@ -1,6 +1,7 @@
 """The whole fit on a small capture that was rendered with a known appearance."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,9 @@ from reconstruction import (
     Mesh,
     Model,
     ModelError,
+    Report,
     Rig,
+    Stage,
     Step,
     Strands,
     write_strands,
@@ -110,6 +113,20 @@ def test_fit_reports_what_it_did(made, fitted):
     assert made[1].report().to_dict() == report.to_dict()
 
 
+def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path):
+    capture, model = made
+    other = Model(tmp_path / "model")
+    shutil.copytree(model.path, other.path)
+    report = Report([Stage("field", figures={"rendered": True}), Stage("head")])
+    other.write_report(report)
+    other.file("field.npz").write_bytes(b"of an earlier fit")
+    few = replace(OPTIONS, roughness_spp=2, colour_spp=2, iterations=1)
+    fit(capture, other, held_out=HeldOut(("cam_2",)), options=few)
+    assert not other.has("field.npz")
+    names = [stage.name for stage in other.report().stages]
+    assert names == ["head", "samples", "roughness", "colour"]
+
+
 def test_fit_says_how_far_off_it_may_be(fitted):
     appearance, report = fitted
     known = appearance.fibres
@@ -194,6 +211,16 @@ def test_one_view_is_enough(made, tmp_path):
     np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.3)
 
 
+@pytest.mark.slow
+def test_a_channel_that_frames_do_not_have_tells_nothing(made, tmp_path):
+    """As of infrared frames: the next darkest channel has the roughness."""
+    change = (np.array([1, 1, 0], np.float32), np.inf)
+    appearance, report = fit_of(tmp_path, made, change)
+    assert report["roughness"].figures["channel"] == "G"
+    assert covers(appearance, report, TRUTH.beta_m)
+    np.testing.assert_allclose(appearance.hair.sigma_a[:2], TRUTH.sigma_a[:2], rtol=0.2)
+
+
 def test_one_light_is_refused(made, tmp_path):
     with pytest.raises(ValueError, match="needs more lights"):
         fit_of(tmp_path, made, (1.0, np.inf), lights=["l3"])
@@ -263,6 +290,18 @@ def test_appearance_file_reads_back_and_says_what_is_wrong(tmp_path):
     path.unlink()
     with pytest.raises(ModelError, match="hairstage fit"):
         FittedAppearance.load(model)
+
+
+def test_an_appearance_of_an_earlier_version_is_fitted_again(tmp_path):
+    made = (TRUTH, (0.1, 0.2, 0.3), SKIN, Exposure(2.0), 0.1, 0.2, 0.3, LEFT_OUT)
+    model = Model(tmp_path)
+    FittedAppearance(*made).save(model)
+    path = tmp_path / "appearance.json"
+    data = json.loads(path.read_text())
+    del data["fibres"]
+    for damaged in (json.dumps(data), "{"):
+        path.write_text(damaged)
+        assert not FittedAppearance.is_of(model, LEFT_OUT)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,10 @@ from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.sun_fit.highlights import EDGES, SIDE, WINDOW, Highlight, LightPairs, beside
 from appearance.sun_fit.light_correlation import Disorder, match_disorder, match_roughness
-from appearance.sun_fit.mirror_samples import near_mirror
+from appearance.sun_fit.mirror_samples import mirror_samples, near_mirror
 from appearance.sun_fit.visible_fibres import VisibleFibres
 from reconstruction import Camera, Light
+from reconstruction.geometry.light_profiles import LightProfile
 from reconstruction.geometry.lights import dome_positions
 
 BETAS = (0.04, 0.08, 0.12, 0.2, 0.3, 0.45, 0.6, 0.95)
@@ -99,6 +100,25 @@ def test_pixels_beside_each_other_tell_how_far_strands_turn(turn_deg, noise):
     assert abs(found.degrees - turn_deg) <= 3 * found.error
 
 
+@pytest.fixture(scope="module")
+def turned():
+    return [(d, highlight(0.3, d, seed=7 + k)) for k, d in enumerate((0, 8, 16, 24))]
+
+
+def test_a_disorder_that_is_told_as_none_says_how_large_it_may_be(turned):
+    """Turns of 4°, near half of whose 24 draws read 0: with the answers' own scatter 8 were off."""
+    found = [match_disorder(highlight(0.3, 4, 0.5, seed=100 + k), turned) for k in range(24)]
+    assert sum(d.degrees == 0 for d in found) > 8
+    assert sum(abs(d.degrees - 4) > 2 * d.error for d in found) <= 5
+
+
+def test_a_disorder_beyond_what_was_rendered_is_not_told_as_exact(turned):
+    for seed in range(4):
+        found = match_disorder(highlight(0.3, 30, 0.5, seed=seed), turned)
+        assert found.degrees == 24
+        assert 3 < found.error < 12
+
+
 def test_alike_are_pixels_of_one_highlight_and_not_those_of_strangers():
     whole = np.ones((1, VIEWS * SIDE**2))
     assert highlight(0.1).likeness(whole) == pytest.approx(1, abs=0.05)
@@ -181,6 +201,26 @@ def test_renderings_that_turns_do_not_change_tell_of_no_disorder():
     rendered = [(d, highlight(0.3, d, seed=7)) for d in (24, 16, 8, 0)]
     wrong = [(d, h) for (_, h), d in zip(rendered, (0, 8, 16, 24), strict=True)]
     assert match_disorder(highlight(0.3, 10, seed=4), wrong) is None
+
+
+def test_a_light_tells_nothing_of_hair_beside_its_beam():
+    """There other hair lights it a little: any number, over the nothing that the light sends."""
+    camera = Camera.look_at("cam", 101, 1, (0, -1, 0), (0, 0, 0), 12)
+    x = np.linspace(-0.1, 0.1, 101)
+    beam = LightProfile("beam", [0, 360], [0, 3, 4], [[1, 1, 0], [1, 1, 0]])
+    aim = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    light = Light("l", (0, -1, 0), np.ones(3), orientation=aim, profile=beam)
+    point = np.stack([x, 0 * x, 0 * x], axis=1)[:, None]
+    tangent = np.broadcast_to([0.0, 0.0, 1.0], point.shape)
+    fibres = VisibleFibres(point, tangent, np.ones((101, 1), bool))
+    sent = light.intensity_towards(point[:, 0]) / (1 + x**2)[:, None]
+    valid = np.ones((1, 101), bool)
+    seen = Observed(camera, (light,), np.arange(101), 0.2 * sent[None] + 1e-3, valid)
+    found = mirror_samples(seen, fibres, tilt_deg=0.0, channel=0)
+    angle = np.degrees(np.arctan(np.abs(x)))
+    assert len(found.value) == (angle < 3.9).sum()
+    assert found.value.min() >= 0.2
+    assert found.value.max() < 0.2 + 1e-3 / 0.1 * 1.01
 
 
 @pytest.mark.parametrize(("hair_deg", "alike"), [(0, True), (25, False)])

@@ -9,6 +9,7 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import DiffuseHair
+from appearance.sun_fit.fitted_appearance import absorption_warnings
 from appearance.sun_fit.mirror_samples import (
     LobeBins,
     MirrorSamples,
@@ -17,7 +18,10 @@ from appearance.sun_fit.mirror_samples import (
     mirror_samples,
 )
 from appearance.sun_fit.roughness_and_colour import (
+    LEAST_ALBEDO,
+    MOST_ALBEDO,
     SAMPLING,
+    Colours,
     FitPixels,
     fit_colour,
     fit_diffuse,
@@ -174,6 +178,15 @@ def test_colour_of_rendered_hair_is_recovered(wisp):
     np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.12)
     assert found.errors[-1] < 0.06  # of two noisy renderings
     assert found.errors[-1] < found.errors[0]
+
+
+def test_a_colour_at_an_end_of_its_range_has_no_error():
+    """R = C: inside the range log sigma answers by 2 / log C to the log of the mean colour."""
+    hair, most = HairAppearance((1.0, 0.1, 0.0), 0.3, 0.2), (LEAST_ALBEDO, 0.3, MOST_ALBEDO)
+    pairs = [(0.5 * np.array(most), 0.5 * np.array(most)), (np.array(most), np.array(most))]
+    found = Colours(most, hair, (0.3,) * 3, pairs, [0.1], np.full(3, 0.01)).absorption_error()
+    assert found.tolist() == [np.inf, pytest.approx(0.02 / -np.log(0.3)), np.inf]
+    assert len(absorption_warnings(hair.sigma_a, [None, 0.02, None])) == 2
 
 
 def test_diffuse_baseline_recovers_its_own_albedo(wisp):
