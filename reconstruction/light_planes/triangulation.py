@@ -187,8 +187,9 @@ def inside_hull(capture: Capture, points: Array, stage: Stage | None = None) -> 
 def fuse(cloud: PointCloud) -> PointCloud:
     """One point for those of one camera pixel that agree along the ray, weighted by information.
 
-    Two points agree within three joint deviations, or 1 mm. Of a chain only neighbours in depth are
-    joined. The result keeps the best point's projector, row and step.
+    Two points agree within three joint deviations, or 1 mm, and 1 mm across the ray: where the
+    subject moved, a pixel saw other places of it at other steps. Of a chain only neighbours in
+    depth are joined. The result keeps the best point's projector, row and step.
     """
     if len(cloud) < 2:
         return cloud
@@ -196,7 +197,8 @@ def fuse(cloud: PointCloud) -> PointCloud:
     sigma = cloud.deviation_along_view()
     order = np.lexsort((depth, cloud.pixel[:, 0], cloud.pixel[:, 1], cloud.camera))
     key = np.stack([cloud.camera, *cloud.pixel.T], axis=1)[order]
-    same = (key[1:] == key[:-1]).all(axis=1)
+    aside = np.cross(np.diff(cloud.points[order], axis=0), cloud.view[order][1:])
+    same = (key[1:] == key[:-1]).all(axis=1) & (np.linalg.norm(aside, axis=1) <= 1e-3)
     gap = depth[order][1:] - depth[order][:-1]
     joint = np.maximum(3 * np.hypot(sigma[order][1:], sigma[order][:-1]), 1e-3)
     group = np.concatenate([[0], np.cumsum(~(same & (gap <= joint)))])

@@ -184,6 +184,19 @@ def test_points_of_one_pixel_that_agree_become_one(sphere_capture: Capture) -> N
     assert len(fuse(PointCloud.merged([cloud, apart]))) == 2 * len(fuse(cloud))
 
 
+def test_points_that_a_pixel_saw_beside_each_other_of_a_moving_subject_stay_two(
+    sphere_capture: Capture,
+) -> None:
+    """At another step the pixel saw what lies 4 mm beside: as deep, and another place."""
+    cloud = fuse(triangulate(sphere_capture)).subset(np.arange(50))
+    aside = np.cross(cloud.view, [0.0, 0.0, 1.0])
+    aside *= 4e-3 / np.linalg.norm(aside, axis=1, keepdims=True)
+    both = PointCloud.merged([cloud, replace(cloud, points=cloud.points + aside)])
+    fused = fuse(both)
+    assert len(fused) == 100
+    assert np.allclose(np.sort(fused.points, axis=0), np.sort(both.points, axis=0), atol=1e-12)
+
+
 def test_point_clouds_survive_the_disk(sphere_capture: Capture, tmp_path: Path) -> None:
     cloud = triangulate(sphere_capture)
     cloud.save(tmp_path / "points.npz")
