@@ -143,10 +143,12 @@ def usable_masks(
     out = {name: mask for name, mask in mine.items() if mask.subject.any()}
     if blind := [c.name for c in capture.rig.cameras if c.name not in out]:
         stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
-    if all(mask.source == "silhouette" for mask in out.values()):
+    if untold := [name for name, mask in out.items() if mask.source == "silhouette"]:
+        where = "" if len(untold) == len(out) else f" in {', '.join(untold)}"
         stage.warn(
-            "hair could not be told from skin: all of the subject counts as hair, a face too; give "
-            "hair masks (masks/CAMERA.png in the capture, `hair` in import.toml) or head.obj"
+            f"hair could not be told from skin{where}: all of the subject counts as hair, a face "
+            "too; give hair masks (masks/CAMERA.png in the capture, `hair` in import.toml) or "
+            "head.obj"
         )
     if any(mask.source == "geometry alone" for mask in out.values()):
         stage.warn(

@@ -340,6 +340,10 @@ def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Ca
     assert "all of the subject counts as hair, a face too" in said
     masks["left"] = replace(mask, source="user")
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
+    (said,) = stage.warnings
+    assert "not be told from skin in right: all of the subject" in said
+    masks["right"] = replace(masks["right"], source="network")
+    usable_masks(sphere_capture, masks, stage := Stage("masks"))
     assert stage.warnings == []
 
 
