@@ -58,8 +58,8 @@ class HairMask:
 
     `source` says who told hair from skin: "light and lines" by looks alone, "geometry" by looks
     with a head, which has given examples of hair where looks were no two clear classes; with
-    "geometry alone" all of the head looks like one thing. `decided` is the share of the subject
-    that it decided, the rest follows its neighbours.
+    "geometry alone" all of the head looks like one thing, or neither lights nor points say what it
+    is. `decided` is the share of the subject that it decided, the rest follows its neighbours.
     """
 
     subject: Bools
@@ -152,8 +152,8 @@ def usable_masks(
         )
     if any(mask.source == "geometry alone" for mask in out.values()):
         stage.warn(
-            "hair and skin on the head look alike: all of it was taken for one of them: look at "
-            "masks/, and give hair masks where it shows both"
+            "nothing tells hair from skin on the head: all of it was taken for one of them: look "
+            "at masks/, and give hair masks where it shows both"
         )
     if not any(mask.hair.any() for mask in out.values()):
         raise CaptureError(
@@ -266,10 +266,11 @@ class _View:
         """The mask by geometry alone: what has no point follows its neighbours."""
         hair = self.outside | self.standing
         skin = self.lying & ~hair
+        source: Source = "geometry" if (self.standing | self.lying).any() else "geometry alone"
         if not (hair | skin).any():
-            return self.mask(self.subject, "geometry", 0.0)
+            return self.mask(self.subject, source, 0.0)
         decided = float((hair | skin).sum() / self.subject.sum())
-        return self.mask(_fill(self.subject, hair, skin), "geometry", decided)
+        return self.mask(_fill(self.subject, hair, skin), source, decided)
 
 
 def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:

@@ -326,7 +326,19 @@ def test_the_users_mask_wins(shoot: Callable[..., Capture]) -> None:
     masks = hair_masks(capture, None, ball(0.1))
     assert masks["left"].source == "user"
     assert np.array_equal(masks["left"].hair, image > 0)
-    assert masks["right"].source == "geometry"
+    assert masks["right"].source == "geometry alone"
+
+
+def test_a_head_without_lights_or_points_does_not_tell_hair_from_skin(
+    shoot: Callable[..., Capture],
+) -> None:
+    """A head stands a pixel inside the outline: what is beyond it is hair, and all within follows."""
+    capture = shoot(sweep=False)
+    masks = hair_masks(capture, None, ball(0.09))
+    usable_masks(capture, masks, stage := Stage("masks"))
+    assert masks["left"].hair.sum() == masks["left"].subject.sum()
+    (said,) = stage.warnings
+    assert "nothing tells hair from skin on the head" in said
 
 
 def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Capture) -> None:
