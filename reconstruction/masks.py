@@ -110,6 +110,8 @@ def hair_masks(
     geometry, masks, views = _Geometry.of(points, head), {}, []
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
+        if user is None and not any(capture.has(s, camera.name) for s in capture.steps):
+            continue
         try:
             subject = silhouette(capture, camera.name)
         except NoSilhouette:

@@ -376,6 +376,9 @@ def test_a_camera_without_pictures_is_left_out(shoot: Callable[..., Capture]) ->
     assert hair_masks(capture) == {}
     with pytest.raises(NoSilhouette, match="left"):
         silhouette(capture, "left")
+    (capture.path / "subjects").mkdir()
+    cv2.imwrite(str(capture.path / "subjects" / "left.png"), np.full((64, 64), 255, np.uint8))
+    assert hair_masks(capture) == {}  # an outline alone shows no hair
 
 
 def test_distances_to_a_ball() -> None:
