@@ -94,7 +94,8 @@ def triangulate(
     counts["inside_hull"] = len(cloud)
     cloud = fuse(cloud)
     counts["after_fusion"] = len(cloud)
-    cloud = cloud.subset(supported(cloud.points, NEIGHBOURS, ISOLATION))
+    pixel = np.array([np.linalg.norm(c.center) / c.K[0, 0] for c in capture.rig.cameras])
+    cloud = cloud.subset(supported(cloud.points, pixel[cloud.camera], NEIGHBOURS, ISOLATION))
     backing = support(cloud.points, RADIUS)
     cloud = replace(cloud, weight=(cloud.weight * backing).astype(np.float32))
     cloud = flatten(cloud, RADIUS, ROUGHNESS)
@@ -218,18 +219,19 @@ def fuse(cloud: PointCloud) -> PointCloud:
     return replace(kept, points=points / total[:, None], covariance=covariance, weight=weight)
 
 
-def supported(points: Array, neighbours: int, isolation: float) -> Bools:
+def supported(points: Array, pixel: Array, neighbours: int, isolation: float) -> Bools:
     """Which `points (N, 3)` are not outliers `(N,)`.
 
     A point stays whose distance to its neighbour number `neighbours` is at most `isolation` times
-    the median of that distance over all points; with `neighbours` 0 all stay. With too few points
-    to tell, none stays.
+    the median of that distance over all points, both in units of `pixel (N,)`, what a pixel of the
+    point's camera spans: a coarse camera's points lie further apart than a fine one's. With
+    `neighbours` 0 all stay. With too few points to tell, none stays.
     """
     if neighbours < 1:
         return np.ones(len(points), bool)
     if len(points) <= neighbours:
         return np.zeros(len(points), bool)
-    distance = cKDTree(points).query(points, k=[neighbours + 1])[0][:, 0]
+    distance = cKDTree(points).query(points, k=[neighbours + 1])[0][:, 0] / pixel
     return np.asarray(distance <= isolation * np.median(distance))
 
 

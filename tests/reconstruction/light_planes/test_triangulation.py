@@ -157,10 +157,23 @@ def test_known_motion_is_undone(shoot: Shoot) -> None:
 def test_isolated_points_are_outliers() -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.normal(0, 0.01, (500, 3)), [[0.3, 0, 0], [0, 0.3, 0]]])
-    keep = supported(points, 8, 4.0)
+    keep = supported(points, np.ones(len(points)), 8, 4.0)
     assert not keep[-2:].any()
     assert keep[:500].mean() > 0.95
-    assert not supported(points[:5], 8, 4.0).any()
+    assert not supported(points[:5], np.ones(5), 8, 4.0).any()
+
+
+def test_what_a_coarse_camera_alone_sees_is_no_outlier_beside_a_fine_one(
+    shoot: Shoot, stage_camera: Callable[..., Camera], stage_projector: Callable[..., Projector]
+) -> None:
+    """A third as many pixels a side see the ball's back; alone they keep 0.88 of their points."""
+    cameras = [stage_camera("fine", -40, size=192), stage_camera("coarse", 140)]
+    projectors = [stage_projector("front", 0.0), stage_projector("back", 180.0)]
+    kept = []
+    for used in (cameras, cameras[1:]):
+        cloud = triangulate(shoot(cameras=used, projectors=projectors, samples=1))
+        kept.append(len(cloud.of_camera("coarse")))
+    assert kept[0] == pytest.approx(kept[1], rel=0.004)
 
 
 def test_flattening_moves_noise_onto_the_plane_and_never_widens(sphere_capture: Capture) -> None:
