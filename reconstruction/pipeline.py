@@ -394,9 +394,11 @@ class _Stages:
             tracing = Tracing(max_length=o.max_length)
             rooted = grow_from_roots(field, roots, normals, tracing)
             coverage = Coverage(field)
-            for path in [*rooted, *seen]:
+            for path in rooted:
                 coverage.add(path)
             share = coverage.share()
+            for path in seen:
+                coverage.add(path)
             self.progress("filling gaps", 0.4)
             gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
             filled = coverage.share()
