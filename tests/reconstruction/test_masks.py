@@ -332,7 +332,7 @@ def test_the_users_mask_wins(shoot: Callable[..., Capture]) -> None:
 def test_a_head_without_lights_or_points_does_not_tell_hair_from_skin(
     shoot: Callable[..., Capture],
 ) -> None:
-    """A head stands a pixel inside the outline: what is beyond it is hair, and all within follows."""
+    """A head a pixel inside the outline: what is beyond it is hair, and all within follows."""
     capture = shoot(sweep=False)
     masks = hair_masks(capture, None, ball(0.09))
     usable_masks(capture, masks, stage := Stage("masks"))
