@@ -58,8 +58,8 @@ class HairMask:
 
     `source` says who told hair from skin: "light and lines" by looks alone, "geometry" by looks
     with a head, which has given examples of hair where looks were no two clear classes; with
-    "geometry alone" all of the head looks like one thing. `decided` is the share of the subject
-    that it decided, the rest follows its neighbours.
+    "geometry alone" all of the head looks like one thing, or neither lights nor points say what it
+    is. `decided` is the share of the subject that it decided, the rest follows its neighbours.
     """
 
     subject: Bools
@@ -110,6 +110,8 @@ def hair_masks(
     geometry, masks, views = _Geometry.of(points, head), {}, []
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
+        if user is None and not any(capture.has(s, camera.name) for s in capture.steps):
+            continue
         try:
             subject = silhouette(capture, camera.name)
         except NoSilhouette:
@@ -143,15 +145,17 @@ def usable_masks(
     out = {name: mask for name, mask in mine.items() if mask.subject.any()}
     if blind := [c.name for c in capture.rig.cameras if c.name not in out]:
         stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
-    if all(mask.source == "silhouette" for mask in out.values()):
+    if untold := [name for name, mask in out.items() if mask.source == "silhouette"]:
+        where = "" if len(untold) == len(out) else f" in {', '.join(untold)}"
         stage.warn(
-            "hair could not be told from skin: all of the subject counts as hair, a face too; give "
-            "hair masks (masks/CAMERA.png in the capture, `hair` in import.toml) or head.obj"
+            f"hair could not be told from skin{where}: all of the subject counts as hair, a face "
+            "too; give hair masks (masks/CAMERA.png in the capture, `hair` in import.toml) or "
+            "head.obj"
         )
     if any(mask.source == "geometry alone" for mask in out.values()):
         stage.warn(
-            "hair and skin on the head look alike: all of it was taken for one of them: look at "
-            "masks/, and give hair masks where it shows both"
+            "nothing tells hair from skin on the head: all of it was taken for one of them: look "
+            "at masks/, and give hair masks where it shows both"
         )
     if not any(mask.hair.any() for mask in out.values()):
         raise CaptureError(
@@ -264,10 +268,11 @@ class _View:
         """The mask by geometry alone: what has no point follows its neighbours."""
         hair = self.outside | self.standing
         skin = self.lying & ~hair
+        source: Source = "geometry" if (self.standing | self.lying).any() else "geometry alone"
         if not (hair | skin).any():
-            return self.mask(self.subject, "geometry", 0.0)
+            return self.mask(self.subject, source, 0.0)
         decided = float((hair | skin).sum() / self.subject.sum())
-        return self.mask(_fill(self.subject, hair, skin), "geometry", decided)
+        return self.mask(_fill(self.subject, hair, skin), source, decided)
 
 
 def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:

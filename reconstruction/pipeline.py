@@ -245,7 +245,8 @@ class _Stages:
         with self.report.stage("strands") as stage:
             stage.leave_out("roots", why, "the field and the growth")
             lines = Measured(segments.points, segments.directions, segments.confidence)
-            self._unrooted(Strands.from_list(polylines), lines, stage)
+            strands = Strands.from_list(polylines).cut(self.options.max_length)
+            self._unrooted(strands, lines, stage)
 
     def _unrooted(self, strands: Strands, measured: Measured, stage: Stage) -> None:
         """Write strands that have no roots; raises `CaptureError` where there is none."""
@@ -393,9 +394,11 @@ class _Stages:
             tracing = Tracing(max_length=o.max_length)
             rooted = grow_from_roots(field, roots, normals, tracing)
             coverage = Coverage(field)
-            for path in [*rooted, *seen]:
+            for path in rooted:
                 coverage.add(path)
             share = coverage.share()
+            for path in seen:
+                coverage.add(path)
             self.progress("filling gaps", 0.4)
             gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
             filled = coverage.share()

@@ -3,7 +3,8 @@
 Two methods share one linear core. "registered" is the paper's: a 2D rigid registration per camera
 (Eq. 1), then the 3D motion that explains them (Eq. 2), here with the 2D rotation as a third
 equation. "direct" aligns the pictures of all cameras at once by warping the triangulated points:
-it starts from the registered motion and uses every pixel instead of three numbers a camera.
+it starts from the registered motion, or from that of the tracking frame before where pictures are
+more alike in that, and uses every pixel instead of three numbers a camera.
 """
 
 from __future__ import annotations
@@ -133,7 +134,9 @@ def _solve_all(
         pairs += len(found)
         pose, determined, residual = from_registrations(found)
         if options.method == "direct":
-            pose, determined = align(present, images, pose)
+            starts = (pose, poses[-1])  # what moved far is registered no more, but followed
+            start = max(starts, key=lambda p: likeness(present, images, p))
+            pose, determined = align(present, images, start)
         if likeness(present, images, pose) < ALIKE:
             lost.append(step.index)
             continue

@@ -94,7 +94,8 @@ def triangulate(
     counts["inside_hull"] = len(cloud)
     cloud = fuse(cloud)
     counts["after_fusion"] = len(cloud)
-    cloud = cloud.subset(supported(cloud.points, NEIGHBOURS, ISOLATION))
+    pixel = np.array([np.linalg.norm(c.center) / c.K[0, 0] for c in capture.rig.cameras])
+    cloud = cloud.subset(supported(cloud.points, pixel[cloud.camera], NEIGHBOURS, ISOLATION))
     backing = support(cloud.points, RADIUS)
     cloud = replace(cloud, weight=(cloud.weight * backing).astype(np.float32))
     cloud = flatten(cloud, RADIUS, ROUGHNESS)
@@ -187,8 +188,9 @@ def inside_hull(capture: Capture, points: Array, stage: Stage | None = None) -> 
 def fuse(cloud: PointCloud) -> PointCloud:
     """One point for those of one camera pixel that agree along the ray, weighted by information.
 
-    Two points agree within three joint deviations, or 1 mm. Of a chain only neighbours in depth are
-    joined. The result keeps the best point's projector, row and step.
+    Two points agree within three joint deviations, or 1 mm, and 1 mm across the ray: where the
+    subject moved, a pixel saw other places of it at other steps. Of a chain only neighbours in
+    depth are joined. The result keeps the best point's projector, row and step.
     """
     if len(cloud) < 2:
         return cloud
@@ -196,7 +198,8 @@ def fuse(cloud: PointCloud) -> PointCloud:
     sigma = cloud.deviation_along_view()
     order = np.lexsort((depth, cloud.pixel[:, 0], cloud.pixel[:, 1], cloud.camera))
     key = np.stack([cloud.camera, *cloud.pixel.T], axis=1)[order]
-    same = (key[1:] == key[:-1]).all(axis=1)
+    aside = np.cross(np.diff(cloud.points[order], axis=0), cloud.view[order][1:])
+    same = (key[1:] == key[:-1]).all(axis=1) & (np.linalg.norm(aside, axis=1) <= 1e-3)
     gap = depth[order][1:] - depth[order][:-1]
     joint = np.maximum(3 * np.hypot(sigma[order][1:], sigma[order][:-1]), 1e-3)
     group = np.concatenate([[0], np.cumsum(~(same & (gap <= joint)))])
@@ -216,18 +219,19 @@ def fuse(cloud: PointCloud) -> PointCloud:
     return replace(kept, points=points / total[:, None], covariance=covariance, weight=weight)
 
 
-def supported(points: Array, neighbours: int, isolation: float) -> Bools:
+def supported(points: Array, pixel: Array, neighbours: int, isolation: float) -> Bools:
     """Which `points (N, 3)` are not outliers `(N,)`.
 
     A point stays whose distance to its neighbour number `neighbours` is at most `isolation` times
-    the median of that distance over all points; with `neighbours` 0 all stay. With too few points
-    to tell, none stays.
+    the median of that distance over all points, both in units of `pixel (N,)`, what a pixel of the
+    point's camera spans: a coarse camera's points lie further apart than a fine one's. With
+    `neighbours` 0 all stay. With too few points to tell, none stays.
     """
     if neighbours < 1:
         return np.ones(len(points), bool)
     if len(points) <= neighbours:
         return np.zeros(len(points), bool)
-    distance = cKDTree(points).query(points, k=[neighbours + 1])[0][:, 0]
+    distance = cKDTree(points).query(points, k=[neighbours + 1])[0][:, 0] / pixel
     return np.asarray(distance <= isolation * np.median(distance))
 
 

@@ -66,6 +66,7 @@ class SphereStage:
     missing: Sequence[tuple[int, str]] = ()  # (row of the first projector, camera)
     sweep: bool = True
     samples: int = 3
+    albedo: Callable[[NDArray[np.float64]], NDArray[np.float64]] = texture
     extra: Callable[[dict[str, object], Camera], NDArray[np.float64]] | None = None
 
     def shoot(self, path: Path) -> Capture:
@@ -132,7 +133,8 @@ class SphereStage:
             pixels, _ = beam.project(points)
             to = beam.center - points
             cosine = (to * points).sum(axis=-1) / (np.linalg.norm(to, axis=-1) * RADIUS)
-            light = np.where(hit & beam.inside(pixels), np.maximum(cosine, 0) * texture(points), 0)
+            shade = np.maximum(cosine, 0) * self.albedo(points)
+            light = np.where(hit & beam.inside(pixels), shade, 0)
             rows = np.arange(lamp.height)[:, None, None, None]
             frames[lamp.name] = (beam.row_weight(rows, pixels[..., 1]) * light).mean(axis=-1)
         return frames

@@ -326,7 +326,19 @@ def test_the_users_mask_wins(shoot: Callable[..., Capture]) -> None:
     masks = hair_masks(capture, None, ball(0.1))
     assert masks["left"].source == "user"
     assert np.array_equal(masks["left"].hair, image > 0)
-    assert masks["right"].source == "geometry"
+    assert masks["right"].source == "geometry alone"
+
+
+def test_a_head_without_lights_or_points_does_not_tell_hair_from_skin(
+    shoot: Callable[..., Capture],
+) -> None:
+    """A head a pixel inside the outline: what is beyond it is hair, and all within follows."""
+    capture = shoot(sweep=False)
+    masks = hair_masks(capture, None, ball(0.09))
+    usable_masks(capture, masks, stage := Stage("masks"))
+    assert masks["left"].hair.sum() == masks["left"].subject.sum()
+    (said,) = stage.warnings
+    assert "nothing tells hair from skin on the head" in said
 
 
 def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Capture) -> None:
@@ -339,6 +351,10 @@ def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Ca
     (said,) = stage.warnings
     assert "all of the subject counts as hair, a face too" in said
     masks["left"] = replace(mask, source="user")
+    usable_masks(sphere_capture, masks, stage := Stage("masks"))
+    (said,) = stage.warnings
+    assert "not be told from skin in right: all of the subject" in said
+    masks["right"] = replace(masks["right"], source="network")
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
     assert stage.warnings == []
 
@@ -360,6 +376,9 @@ def test_a_camera_without_pictures_is_left_out(shoot: Callable[..., Capture]) ->
     assert hair_masks(capture) == {}
     with pytest.raises(NoSilhouette, match="left"):
         silhouette(capture, "left")
+    (capture.path / "subjects").mkdir()
+    cv2.imwrite(str(capture.path / "subjects" / "left.png"), np.full((64, 64), 255, np.uint8))
+    assert hair_masks(capture) == {}  # an outline alone shows no hair
 
 
 def test_distances_to_a_ball() -> None:

@@ -29,9 +29,14 @@ from reconstruction import (
 )
 from reconstruction.estimate import estimate
 from reconstruction.geometry.lights import dome_positions
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.growth.field import solve_field
+from reconstruction.head.scalp import find_scalp
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import PointCloud
+from reconstruction.pipeline import _Stages
 from reconstruction.reconstruct_options import MeasureOptions
+from reconstruction.report.report import silent
 from reconstruction.tangents.estimate import Measured, light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09
@@ -369,6 +374,35 @@ def test_no_strand_is_longer_than_the_hair(model: tuple[Path, Report]) -> None:
     lengths = read_strands(model[0] / "strands.npz").lengths()
     assert lengths.max() < 0.2 + 1e-4
     assert lengths.max() > 0.19  # a ball of 10 cm has meridians of 31 cm
+
+
+def test_line_stereo_alone_is_no_longer_than_the_hair_either(
+    unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = np.stack([np.zeros(151), np.full(151, -0.1), np.linspace(0.1, -0.2, 151)], axis=1)
+    monkeypatch.setattr(
+        "reconstruction.pipeline.line_strands", lambda *_, **__: ([line], Measured.none())
+    )
+    reconstruct(unswept, Model(tmp_path), method="photometric", options=QUICK)
+    strands = read_strands(tmp_path / "strands.npz")
+    assert strands.lengths() == pytest.approx([0.2], abs=1e-6)
+    assert strands.roots[0] == pytest.approx([0, -0.1, 0.1])
+
+
+def test_what_was_seen_is_not_covered_by_roots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A column of hair on the scalp's top: seen strands fill it, and no root has one."""
+    grid = VoxelGrid(np.array([-4e-3, -4e-3, HEAD]), 4e-3, np.ones((3, 3, 10), bool))
+    upright = np.tile([0, 0, 1.0], (90, 1))
+    field, _ = solve_field(grid, grid.centers(), upright)
+    seen = [p.astype(np.float32) for p in grid.centers().reshape(9, 10, 3)]
+    monkeypatch.setattr("reconstruction.pipeline.grow_from_roots", lambda *_, **__: [])
+    stages = _Stages(Model(tmp_path), QUICK, silent, Report())
+    stages.grown(field, find_scalp(ball(HEAD)), list(seen))
+    figures = stages.report["strands"].figures
+    assert figures["covered"] == 1
+    assert figures["covered_by_roots"] == 0
 
 
 def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(

@@ -118,6 +118,41 @@ def test_drift_is_found_to_a_tenth_of_a_pixel(
     assert stage.figures["largest_translation_mm"] == pytest.approx(2.1, abs=0.4)
 
 
+def fine(points: np.ndarray) -> np.ndarray:
+    """An albedo `(...)` without a period, of detail of about 8 mm."""
+    rng, out = np.random.default_rng(1), np.full(points.shape[:-1], 0.6)
+    for _ in range(6):
+        a = rng.normal(size=3)
+        a *= 2 * np.pi / 8e-3 / np.linalg.norm(a)
+        out += 0.12 * np.sin(points @ a * rng.uniform(0.6, 1.4) + rng.uniform(0, 6))
+    return out
+
+
+def test_a_subject_that_moves_by_more_than_its_detail_is_followed(
+    shoot: Callable[..., Capture],
+    stage_camera: Callable[..., Camera],
+    stage_projector: Callable[..., Projector],
+) -> None:
+    """By 22 pixels in all, some 3 from one tracking frame to the next, with detail of 6."""
+    angles = [(-50, 5), (0, 40), (45, 0)]
+    cameras = [stage_camera(f"c{k}", a, e, size=192) for k, (a, e) in enumerate(angles)]
+    t = np.linspace(0, 1, 8)[:, None]
+    turns = Rotation.from_rotvec(np.radians(t * [0.3, -0.2, 1.0])).as_matrix()
+    shifts = 28e-3 * np.concatenate([0.9 * t, -0.4 * np.sin(2 * t), 0.2 * t**2], axis=1)
+    poses = list(zip(turns, shifts, strict=True))
+    capture = shoot(
+        cameras=cameras,
+        projectors=[stage_projector("p", 25.0)],
+        poses=poses,
+        every=5,
+        samples=1,
+        albedo=fine,
+    )
+    motion = solve_motion(capture, triangulate(capture))
+    pixel = 0.9 / cameras[0].K[0, 0]
+    assert pose_error(motion, poses).max() < 2 * pixel
+
+
 def test_compensation_brings_the_points_back(moving: Capture) -> None:
     first = triangulate(moving)
     motion = solve_motion(moving, first, options=MotionOptions(between="hold"))

@@ -157,10 +157,23 @@ def test_known_motion_is_undone(shoot: Shoot) -> None:
 def test_isolated_points_are_outliers() -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.normal(0, 0.01, (500, 3)), [[0.3, 0, 0], [0, 0.3, 0]]])
-    keep = supported(points, 8, 4.0)
+    keep = supported(points, np.ones(len(points)), 8, 4.0)
     assert not keep[-2:].any()
     assert keep[:500].mean() > 0.95
-    assert not supported(points[:5], 8, 4.0).any()
+    assert not supported(points[:5], np.ones(5), 8, 4.0).any()
+
+
+def test_what_a_coarse_camera_alone_sees_is_no_outlier_beside_a_fine_one(
+    shoot: Shoot, stage_camera: Callable[..., Camera], stage_projector: Callable[..., Projector]
+) -> None:
+    """A third as many pixels a side see the ball's back; alone they keep 0.88 of their points."""
+    cameras = [stage_camera("fine", -40, size=192), stage_camera("coarse", 140)]
+    projectors = [stage_projector("front", 0.0), stage_projector("back", 180.0)]
+    kept = []
+    for used in (cameras, cameras[1:]):
+        cloud = triangulate(shoot(cameras=used, projectors=projectors, samples=1))
+        kept.append(len(cloud.of_camera("coarse")))
+    assert kept[0] == pytest.approx(kept[1], rel=0.004)
 
 
 def test_flattening_moves_noise_onto_the_plane_and_never_widens(sphere_capture: Capture) -> None:
@@ -182,6 +195,19 @@ def test_points_of_one_pixel_that_agree_become_one(sphere_capture: Capture) -> N
     assert (both.deviation_along_view().mean()) < 0.8 * cloud.deviation_along_view().mean()
     apart = replace(cloud, points=cloud.points - 2e-2 * cloud.view)
     assert len(fuse(PointCloud.merged([cloud, apart]))) == 2 * len(fuse(cloud))
+
+
+def test_points_that_a_pixel_saw_beside_each_other_of_a_moving_subject_stay_two(
+    sphere_capture: Capture,
+) -> None:
+    """At another step the pixel saw what lies 4 mm beside: as deep, and another place."""
+    cloud = fuse(triangulate(sphere_capture)).subset(np.arange(50))
+    aside = np.cross(cloud.view, [0.0, 0.0, 1.0])
+    aside *= 4e-3 / np.linalg.norm(aside, axis=1, keepdims=True)
+    both = PointCloud.merged([cloud, replace(cloud, points=cloud.points + aside)])
+    fused = fuse(both)
+    assert len(fused) == 100
+    assert np.allclose(np.sort(fused.points, axis=0), np.sort(both.points, axis=0), atol=1e-12)
 
 
 def test_point_clouds_survive_the_disk(sphere_capture: Capture, tmp_path: Path) -> None:
