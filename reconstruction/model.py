@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -146,6 +146,14 @@ class Model:
             for p in sorted(root.rglob("*"))
             if p.is_file() and not p.name.startswith(PART) and p.resolve().is_relative_to(root)
         }
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of `artifacts` by their names; what a job removes meanwhile is none of them."""
+        sizes = {}
+        for name, path in self.artifacts().items():
+            with suppress(FileNotFoundError):
+                sizes[name] = path.stat().st_size
+        return sizes
 
     def strands(self) -> Strands:
         """The strands. Raises `ModelError` where there are none yet."""

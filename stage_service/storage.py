@@ -12,8 +12,8 @@ import secrets
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -306,15 +306,6 @@ def files_of(folder: Path) -> dict[str, Path]:
     return Model(folder).artifacts()
 
 
-def sizes_of(files: Mapping[str, Path]) -> dict[str, int]:
-    """Their bytes, by name; what a job has removed meanwhile is none of them."""
-    sizes = {}
-    for name, path in files.items():
-        with suppress(FileNotFoundError):
-            sizes[name] = path.stat().st_size
-    return sizes
-
-
 def _listed(folder: Path) -> Folder:
-    sizes = sizes_of(files_of(folder))
+    sizes = Model(folder).sizes()
     return Folder(name=folder.name, files=list(sizes)[:1000], bytes=sum(sizes.values()))

@@ -17,7 +17,6 @@ from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job
 from stage_service.service_models import Artifact, JobRequest
-from stage_service.storage import sizes_of
 
 
 class UnknownArtifact(LookupError):
@@ -107,7 +106,7 @@ class Submitting:
 
     def artifacts(self, job_id: str) -> list[Artifact]:
         """The files in the job's model folder. Raises `NoSuchJob`."""
-        sizes = sizes_of(Model(self.get(job_id).model).artifacts())
+        sizes = Model(self.get(job_id).model).sizes()
         return [Artifact(path=name, bytes=size) for name, size in sizes.items()]
 
     def artifact(self, job_id: str, path: str) -> Path:

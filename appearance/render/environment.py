@@ -77,8 +77,8 @@ def render_environment(
             add_light(film, sky.radiance(ray.d), paths.slot * 3, paths.active & (paths.depth == 0))
 
         follow(gather.surface, camera, some, plan, gather, missed if background else None)
-        radiance = np.array(film).reshape(len(some), 3) / np.float32(plan.spp)
-        image[some] = _with_added(radiance, field, envmap, rotation_deg)
+        image[some] = np.array(film).reshape(len(some), 3) / np.float32(plan.spp)
+        image[some] = _with_added(image[some], field, envmap, rotation_deg)
 
     render_whole(camera, index, image, render, sampling.plan())
     return image.reshape(camera.height, camera.width, 3)

@@ -21,18 +21,23 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
-from appearance.sun_fit.highlights import BESIDE, WINDOW, Highlight, Highlights, beside
-from appearance.sun_fit.light_correlation import (
+from appearance.sun_fit.disorder import (
+    BESIDE,
     Disorder,
-    Roughness,
+    Likeness,
+    PixelPairs,
+    direct_share,
     disordered,
     match_disorder,
-    match_roughness,
 )
+from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
+from appearance.sun_fit.highlights import WINDOW, Highlight, Highlights
+from appearance.sun_fit.light_correlation import Roughness, match_roughness
 from appearance.sun_fit.mirror_samples import (
     MirrorSamples,
+    answers,
     binned,
+    lobes,
     mirror_lights,
     mirror_samples,
     usable,
@@ -62,20 +67,20 @@ ROUGHNESSES = (0.04, 0.12, 0.22, 0.35, 0.55, 0.95)
 """β_M of the renderings of the strands as they are; nothing outside is found."""
 NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
 """Those of disordered strands, as factors on the answer of the first."""
-DISORDERS = (0.0, 8.0, 16.0, 24.0)
-"""Degrees by which rendered strands are turned; by no more than the last."""
+DISORDERS = (0.0, 12.0, 18.0, 24.0)
+"""Degrees by which strands are turned, each in another draw; by no more than the last."""
 DISORDER = 1.6
 """Turn of single strands over the error of a pixel's mean inclination, where nothing tells it.
 
 √2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
-CHANGED = 0.99
-"""Of the β_M to render with, what that of the fibres must fall below for a warning."""
-UNTOLD_DEG = 10.0
-"""Degrees that a disorder and its error must exceed together for the same warning: orderly hair on
-strands as orderly had 6, hair whose fibres came out a quarter too rough 12 to 36."""
+TOLD_DEG = 8.0
+"""Degrees that turns exceed by more than their error where they are taken off: less hardly shows,
+and orderly hair reads 0 to 13 with as large an error."""
 SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
+COMPARED_PIXELS = 1500
+"""Pixels a camera, about, that are compared with others beside them."""
 ROUGHNESS_PIXELS = 350
 """Pixels a camera, at most, whose own highlights are matched."""
 
@@ -115,7 +120,7 @@ def fit(
         options,
         seed,
         progress,
-        lambda angle: build_scene(disordered(strands, angle, seed), head, hair=start),
+        lambda angle, draw: build_scene(disordered(strands, angle, seed + draw), head, hair=start),
     )
     with report.stage("roughness") as stage:
         found = fitting.roughness(stage)
@@ -162,20 +167,23 @@ def _observed(
 ) -> FitPixels:
     rng = np.random.default_rng(seed)
     cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
-    hair, skin, seen = [], [], 0
+    hair, clusters, skin, seen = [], [], [], 0
     has_head = model.head(training) is not None
     for i, name in enumerate(cameras):
         progress("reading hair pixels", 0.3 * i / len(cameras))
         mask = model.mask(name, "hair", training)
         bare = model.mask(name, "skin", training) & ~mask
         seen += int(mask.sum())
-        half = chosen(mask, (options.hair_pixels + 1) // 2, rng)
-        wanted = np.union1d(half, _beside(half, mask))
+        alone = chosen(mask, options.hair_pixels, rng)
+        some = chosen(mask, COMPARED_PIXELS // (1 + len(BESIDE)), rng)
+        compared = np.concatenate([some, _beside(some, mask)])
+        wanted = np.union1d(alone, compared)
         uncovered = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
         both = observe(training, name, lights, np.concatenate([wanted, uncovered]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
         if len(wanted):
-            hair.append(both.where(is_hair))
+            hair.append(both.where(is_hair & np.isin(both.pixels, alone)))
+            clusters.append(both.where(is_hair & np.isin(both.pixels, compared)))
         if len(uncovered) >= 10:
             skin.append(both.where(~is_hair))
         if missing := int((~both.valid.any(axis=1)).sum()):
@@ -195,7 +203,7 @@ def _observed(
             "means and lobes are known to a per cent from the others",
             f"{1 - kept / seen:.0%} of the renderings",
         )
-    return FitPixels(hair, skin)
+    return FitPixels(hair, skin, clusters)
 
 
 def _spread(observed: Observed) -> Ints:
@@ -206,19 +214,18 @@ def _spread(observed: Observed) -> Ints:
 
 def _beside(pixels: Ints, mask: Bools) -> Ints:
     """Those of `mask` that lie `BESIDE` a pixel of `pixels`: right of every second, else below."""
-    width = mask.shape[1]
-    right = pixels[::2][pixels[::2] % width + BESIDE < width] + BESIDE
-    below = pixels[1::2] + BESIDE * width
-    found = np.concatenate([right, below[below < mask.size]])
-    return found[mask.ravel()[found]]
+    width, found = mask.shape[1], []
+    for apart in BESIDE:
+        found.append(pixels[::2][pixels[::2] % width + apart < width] + apart)
+        below = pixels[1::2] + apart * width
+        found.append(below[below < mask.size])
+    either = np.concatenate(found)
+    return either[mask.ravel()[either]]
 
 
-def doubtful(as_are: float, fibres: float, disorder: Disorder) -> bool:
-    """Whether hair may be so much more disordered than strands that the `fibres`' β_M is in doubt.
-
-    `as_are` is the β_M to render the strands with.
-    """
-    return fibres < CHANGED * as_are or disorder.degrees + disorder.error > UNTOLD_DEG
+def told(disorder: Disorder) -> bool:
+    """Whether single hairs surely turn, so that the fibres' β_M is less than the strands' one."""
+    return disorder.degrees - disorder.error > TOLD_DEG
 
 
 def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
@@ -242,7 +249,8 @@ def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: St
     if len(lit) == 0:
         raise ValueError(f"{training.path}: no light reaches a hair pixel")
     stage.figures["lights_that_reach_hair"] = len(lit)
-    return FitPixels([o.under(lit) for o in hair], [o.under(lit) for o in pixels.skin])
+    each = (pixels.hair, pixels.skin, pixels.clusters)
+    return FitPixels(*([o.under(lit) for o in some] for some in each))
 
 
 @dataclass(frozen=True)
@@ -265,8 +273,8 @@ class Roughnesses:
 class SunFit:
     """The observations and the geometry that the two fits share.
 
-    `disordered` makes the scene of strands whose tangents are turned by so many radians RMS, for
-    strands that were reconstructed; without it they are taken to be exact.
+    `disordered` makes the scene of strands whose tangents are turned by so many radians RMS, in a
+    numbered draw, for strands that were reconstructed; without it they are taken to be exact.
     """
 
     scene: HairScene
@@ -274,7 +282,7 @@ class SunFit:
     options: FitOptions
     seed: int
     progress: Progress
-    disordered: Callable[[float], HairScene] | None = None
+    disordered: Callable[[float, int], HairScene] | None = None
 
     def roughness(self, stage: Stage) -> Roughnesses:
         """The roughnesses by matched renderings; raises `ValueError` where no light tells one."""
@@ -300,20 +308,22 @@ class SunFit:
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
         first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"))
-        captured, of_single = self._highlights(views, _spread, channel)
+        captured, highlights = self._highlights(views, channel)
         series = Series("roughness", "standard error of log β_M")
         stage.series.append(series)
         runs = count_from(1)
 
-        def rendered(highlights: Highlights, scene: HairScene, beta: float) -> Highlight:
+        def rendered(scene: HairScene, beta: float, max_depth: int = MAX_DEPTH) -> Highlight:
             number = next(runs)
             self.progress("matching the highlight", 0.5 + number / 80)
             lit = scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
-            return highlights.of([self._halves(lit, o, number) for o, _ in highlights.views])
+            return highlights.of(
+                [self._halves(lit, o, number, max_depth) for o, _ in highlights.views]
+            )
 
         def matched(scene: HairScene, roughnesses: Iterable[float]) -> Roughness:
             each = map(float, roughnesses)
-            family[:] = [(beta, rendered(of_single, scene, beta)) for beta in each]
+            family[:] = [(beta, rendered(scene, beta)) for beta in each]
             found = match_roughness(captured, family)
             series.points.append((time.perf_counter() - start, found.error))
             return found
@@ -329,17 +339,24 @@ class SunFit:
                 as_are.beta_m, float(np.radians(as_are.tangents_deg))
             )
             beta = max(smoother or as_are.beta_m, ROUGHNESSES[0])
-            seen, of_pairs = self._highlights(views, lambda o: np.unique(beside(o)), channel)
-            turned = ((d, self.disordered(float(np.radians(d)))) for d in DISORDERS)
-            disorder = match_disorder(seen, ((d, rendered(of_pairs, x, beta)) for d, x in turned))
-            off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
-            scene = self.disordered(float(np.radians(off)))
-            fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
-            if disorder is not None and doubtful(as_are.beta_m, fibres.beta_m, disorder):
+            share = direct_share(rendered(self.scene, beta, 1), rendered(self.scene, beta))
+            disorder = self._disorder(self.disordered, channel, beta, share)
+            fibres = replace(as_are, disorder=disorder)
+            if disorder is None or told(disorder):
+                off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
+                scene = self.disordered(float(np.radians(off)), 0)
+                fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
+                if disorder is not None:
+                    stage.warn(
+                        f"single hairs turn by {disorder.degrees:.0f} ± {disorder.error:.0f}° more "
+                        "than the strands, by what pixels beside each other tell: the fibres' β_M, "
+                        f"{fibres.beta_m:.2f} ({fibres.low:.2f} to {fibres.high:.2f}), stands on it"
+                    )
+            elif disorder.degrees + disorder.error > disorder.most:
                 stage.warn(
-                    f"single hairs turn by {disorder.degrees:.0f} ± {disorder.error:.0f}° more "
-                    "than the strands, by what pixels beside each other tell, and may turn more "
-                    f"within a pixel: the fibres' β_M, {fibres.beta_m:.2f}, may be too large"
+                    "pixels beside each other do not tell whether single hairs turn more than the "
+                    f"strands ({disorder.degrees:.0f} ± {disorder.error:.0f}°): the fibres' β_M, "
+                    f"{fibres.beta_m:.2f}, may be too large"
                 )
         stage.figures |= {
             "samples": count,
@@ -351,7 +368,6 @@ class SunFit:
             "sun_beta_m_as_printed": float(roughness_of_variance(printed)),
             "lobe_residual": plain.residual,
             "rendered_beta_m": as_are.beta_m,
-            "rendered_misfit": as_are.misfit,
             **asdict(fibres),
             "range": list(fibres.range),
             "views": list(fibres.views),
@@ -431,16 +447,35 @@ class SunFit:
         return o.under(near), fibres
 
     def _highlights(
-        self,
-        views: Sequence[tuple[Observed, VisibleFibres]],
-        places: Callable[[Observed], Ints],
-        channel: int,
+        self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
     ) -> tuple[Highlight, Highlights]:
-        """What the capture shows at `places` of these views, and how renderings there are read."""
-        few = [self._under(o, fibres, places(o)) for o, fibres in views]
+        """What the capture shows in some pixels of these views; how renderings there are read."""
+        few = [self._under(o, fibres, _spread(o)) for o, fibres in views]
         few = [(o, fibres) for o, fibres in few if len(o.lights)]
         highlights = Highlights(few, self._tilt, channel)
         return highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in few]), highlights
+
+    def _disorder(
+        self, turned: Callable[[float, int], HairScene], channel: int, beta: float, share: float
+    ) -> Disorder | None:
+        """By how much single hairs of roughness `beta` turn more than the strands."""
+        self.progress("comparing pixels", 0.6)
+        views = self._views(self.pixels.clusters)
+        pairs = [PixelPairs.of(o, fibres, self._tilt) for o, fibres in views]
+        v = float(variance_of_roughness(beta))
+
+        def computed(number: int, degrees: float) -> Likeness:
+            scene = turned(float(np.radians(degrees)), number) if degrees else self.scene
+            of_views = []
+            for (o, _), p in zip(views, pairs, strict=True):
+                seen = visible_fibres(scene, o.camera, o.pixels, seed=self.seed + 1)
+                of_views.append(p.likeness(*lobes(o, seen, v, self._tilt, p.at)))
+            return Likeness.joined(of_views)
+
+        known = ((p, answers(o, f, channel, p.at)) for (o, f), p in zip(views, pairs, strict=True))
+        captured = Likeness.joined([p.likeness(values, values) for p, values in known])
+        each = ((degrees, computed(k, degrees)) for k, degrees in enumerate(DISORDERS))
+        return match_disorder(captured, each, share)
 
     def _read(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
@@ -449,10 +484,10 @@ class SunFit:
         bins = binned(MirrorSamples.joined(parts))
         return fit_lobe(bins), fit_lobe_as_printed(bins), int(bins.count.sum())
 
-    def _halves(self, scene: HairScene, o: Observed, number: int) -> Floats:
+    def _halves(self, scene: HairScene, o: Observed, number: int, max_depth: int) -> Floats:
         """Two renderings `(2, L, P, 3)` of a view, half the samples and own noise each."""
         spp = max(self.options.roughness_spp // 2, 1)
-        spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 11)))
+        spent = asdict(Sampling(spp, max_depth, self.seed + (number << 11)))
         twice = np.tile(o.pixels, 2)
         images = render_olat(scene, o.camera, o.lights, pixels=twice, **spent)
         return np.stack(np.split(images, 2, axis=1))

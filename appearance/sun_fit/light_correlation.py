@@ -8,30 +8,23 @@ far enough, the profile decides, with the spread of its shifts as an unknown. Re
 roughness are measured in the same way; the roughness is where theirs meet the capture's.
 
 Reconstructed strands may be smoother than hair: a pixel of theirs then mixes fewer directions,
-which the products do see. By how much is told by pixels that lie beside each other: how much less
-the product of their answers falls with the angle than that of one pixel's (`Highlight.likeness`)
-falls with every turn of single strands, whatever the strands' own directions are off, and depends
-little on the roughness: turns are read a tenth too large by strands a quarter too rough. The
-renderings are of strands that are `disordered` until their likeness is the capture's
-(`match_disorder`).
+which the products do see. The renderings for the fibres' own roughness are of strands as disordered
+as the hair is (`disorder`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from appearance.sun_fit.highlights import INNER, SHIFTS, SIDE, Highlight
-from reconstruction import Strands
+from appearance.sun_fit.disorder import Disorder
+from appearance.sun_fit.hair_parts import FEWEST_PAIRS, errors, leaving_out
+from appearance.sun_fit.highlights import INNER, SHIFTS, Highlight
 from reconstruction.arrays import Array
 
-FEWEST_PAIRS = 200
-"""Pairs of lights, over all pixels, without which there is no answer."""
-FEWEST_OF_VIEW = 1000
-"""Pairs of lights that a single view's answer needs to be compared with others."""
 WIDEST = 1.5
 """Ratio of the interval's ends above which a roughness is called uncertain."""
 LARGEST_ERROR = 0.1
@@ -39,25 +32,6 @@ WORST_MISFIT = 3.0
 _FLOOR = 0.02  # what a mean of a bin is off by at least, of the mean over bins
 _BETWEEN_RENDERINGS = 0.015  # error of log β_M by interpolation
 _STEPS = 400
-_WAVE = 0.06  # metres of strand: about the pitch of wavy hair
-
-
-@dataclass(frozen=True)
-class Disorder:
-    """By how much single strands turn beyond those that were rendered.
-
-    `degrees`, root mean square, with its standard error, up to `most`: what was rendered.
-    """
-
-    degrees: float
-    error: float
-    most: float
-
-    @property
-    def trust(self) -> float:
-        """How much of what it changes is believed, 0 to 1: of d² ± δ, the share d⁴ / (d⁴ + δ²)."""
-        square, error = self.degrees**2, 2 * self.degrees * self.error
-        return square**2 / (square**2 + error**2) if square > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -92,7 +66,8 @@ class Roughness:
         What lies between the two answers grows with the square of the disorder. Of it as much is
         taken as the disorder is known, three quarters where that was not measured: the mean of what
         it may be, if none is as likely beforehand as what was measured. Its spread joins the error.
-        The tangents' error is that of `other`.
+        The tangents' error and the misfit are those of `other`: strands that wave by themselves fit
+        a highlight less well than those that stand where the hair is.
         """
         trust = 0.75 if disorder is None else disorder.trust
         change = float(np.log(self.beta_m / other.beta_m))
@@ -107,6 +82,7 @@ class Roughness:
             high=float(min(back * self.high * wider, self.range[1])),
             tangents_deg=other.tangents_deg,
             tangents_error_deg=other.tangents_error_deg,
+            misfit=other.misfit,
             systematic=systematic,
             disorder=disorder,
         )
@@ -138,62 +114,6 @@ class Roughness:
         return said
 
 
-def disordered(strands: Strands, angle: float, seed: int) -> Strands:
-    """`strands` that each wave on their own, so that tangents turn by `angle` (radians RMS)."""
-    rng, strand = np.random.default_rng(seed), strands.strand_of_point
-    points, tangents = strands.points.astype(float), strands.tangents().astype(float)
-    step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
-    arc = np.cumsum(step)
-    turns = 2 * np.pi * (arc - arc[strands.offsets[:-1]][strand]) / _WAVE
-    across = np.cross(tangents, rng.normal(size=3))
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    for direction in (across, np.cross(tangents, across)):
-        phase = rng.uniform(0, 2 * np.pi, len(strands))[strand]
-        wave = np.sin(turns + phase) - np.sin(phase)
-        points += angle * _WAVE / (2 * np.pi) * wave[:, None] * direction
-    return replace(strands, points=points.astype(np.float32))
-
-
-def match_disorder(
-    captured: Highlight, rendered: Iterable[tuple[float, Highlight]]
-) -> Disorder | None:
-    """The disorder, degrees, whose rendered highlights are as alike as the `captured` ones.
-
-    Between the `rendered`, which ascend from 0, a line over the square: 0 where the capture is more
-    alike than strands as they are. The error is the jackknife's over parts of the hair, or what the
-    views' answers differ by; of an answer at an end it reaches at least to where the square may be.
-    None where too few pixels lie `BESIDE` each other, and nothing is rendered then, or where turns
-    make the rendered ones no less alike.
-    """
-    if captured.pairs_beside.sum() < FEWEST_PAIRS:
-        return None
-    chosen, left_out = _chosen(captured.pairs_beside)
-    found = [(degrees, highlight.likeness(chosen)) for degrees, highlight in rendered]
-    nodes = np.array([degrees for degrees, _ in found])
-    slope, start = np.polyfit(nodes**2, np.stack([likeness for _, likeness in found]), 1)
-    if slope[0] >= 0:
-        return None
-    square = (captured.likeness(chosen) - start) / np.where(slope < 0, slope, slope[0])
-    answers = np.sqrt(np.clip(square, 0, nodes[-1] ** 2))
-    error = max(_errors(answers, left_out))
-    if not 0 < square[0] < nodes[-1] ** 2:  # at an end, where most answers end and none differ
-        beyond = max(float(square[0]) + max(_errors(square, left_out)), 0.0)
-        error = max(error, beyond**0.5 - float(answers[0]))
-    return Disorder(float(answers[0]), error, float(nodes[-1]))
-
-
-def _chosen(pairs: Array) -> tuple[Array, int]:
-    """Weights `(M, J)` of parts that have `pairs (J, B)`: of all, of all but one, of single views.
-
-    And how many leave one out.
-    """
-    parts, there = len(pairs), pairs.sum(axis=1)
-    left_out = (1 - np.eye(parts))[there > 0]
-    views = np.kron(np.eye(parts // SIDE**2), np.ones(SIDE**2))
-    views = views[views @ there >= FEWEST_OF_VIEW]
-    return np.concatenate([np.ones((1, parts)), left_out, views]), len(left_out)
-
-
 def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlight]]) -> Roughness:
     """The β_M whose rendered highlights are nearest the `captured` one.
 
@@ -209,7 +129,7 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
         )
     nodes = np.log([beta for beta, _ in rendered])
     x = np.linspace(nodes[0], nodes[-1], _STEPS)
-    chosen, left_out = _chosen(captured.pairs)
+    chosen, left_out = leaving_out(captured.pairs.sum(axis=1))
     jackknife = slice(1, left_out + 1)
 
     def distance(target: Array, family: Array) -> Array:
@@ -233,7 +153,7 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
     profiles = by_profile[chi2.argmin(axis=0), np.arange(len(chosen))]
     shifts = np.array([_lowest(SHIFTS, p) for p in profiles])
     answer, alone = best[0], best[left_out + 1 :]
-    scatter, between = _errors(best, left_out)
+    scatter, between = errors(best, left_out)
     least = chi2[:, 0].min()
     bins = captured.pairs.shape[1] + (INNER.stop - INNER.start) // 2
     misfit = float(least / (bins - 4))
@@ -250,18 +170,8 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
         tuple(np.exp(alone).tolist()),
         misfit,
         float(np.degrees(shifts[0]) / 2),
-        float(np.degrees(max(_errors(shifts, left_out))) / 2),
+        float(np.degrees(max(errors(shifts, left_out))) / 2),
     )
-
-
-def _errors(answers: Array, parts: int) -> tuple[float, float]:
-    """Standard errors of the first of `answers (N,)`: the jackknife's, and between views.
-
-    The next `parts` of them leave out a part of the hair each; the rest are those of single views.
-    """
-    left_out, alone = answers[1 : parts + 1], answers[parts + 1 :]
-    between = alone.std(ddof=1) / np.sqrt(len(alone)) if len(alone) > 1 else 0.0
-    return float(np.sqrt((parts - 1) * left_out.var())), float(between)
 
 
 def _lowest(x: Array, y: Array) -> float:

@@ -94,6 +94,34 @@ def mirror_samples(
     )
 
 
+def answers(observed: Observed, fibres: VisibleFibres, channel: int, at: Ints) -> Array:
+    """Radiance over the light's irradiance across the ray, 1/sr, at the flat `at (N,)` in `(L, P)`.
+
+    Lights shine there.
+    """
+    light, pixel = np.divmod(at, max(observed.valid.shape[1], 1))
+    middle = _middle(fibres)
+    away = _positions(observed)[light] - middle[pixel]
+    shines = [x.intensity_towards(middle)[:, channel] for x in observed.lights]
+    irradiance = np.reshape(shines, observed.valid.shape)[light, pixel] / (away**2).sum(axis=1)
+    return np.asarray(observed.radiance[light, pixel, channel] / irradiance)
+
+
+def lobes(observed: Observed, fibres: VisibleFibres, v: float, tilt_deg: float, at: Ints) -> Array:
+    """Mean lobes of variance `v` over either half of a pixel's rays `(2, N)`.
+
+    `at (N,)` are pairs of a light and a pixel, flat in `(L, P)`.
+    """
+    light, pixel = np.divmod(at, max(observed.valid.shape[1], 1))
+    middle = _middle(fibres)
+    to_camera = _unit(observed.camera.center - middle)
+    theta_o = _angle(np.einsum("pi,pki->pk", to_camera, fibres.tangent)) + 2 * np.radians(tilt_deg)
+    towards = _unit(_positions(observed)[light] - middle[pixel])
+    theta_i = _angle(np.einsum("ni,nki->nk", towards, fibres.tangent[pixel]))
+    each = longitudinal(theta_i, theta_o[pixel], v) * fibres.hair[pixel]
+    return np.stack([each[:, ::2].mean(axis=1), each[:, 1::2].mean(axis=1)])
+
+
 def mirror_lights(
     observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, window: float = WINDOW
 ) -> Ints:
@@ -170,8 +198,7 @@ def near_mirror(
     middle = _middle(fibres)
     mean = fibres.mean_tangent() if along is None else along
     to_camera = _unit(observed.camera.center - middle)
-    positions = np.array([light.position for light in observed.lights])
-    towards = positions[:, None] - middle
+    towards = _positions(observed)[:, None] - middle
     squared = (towards**2).sum(axis=-1)
     towards /= np.sqrt(squared)[..., None]
     sin_o, sin_i = (to_camera * mean).sum(-1), (towards * mean).sum(-1)
@@ -186,6 +213,10 @@ def near_mirror(
     least = LEAST_LIT * shines.max(axis=1, keepdims=True, initial=0)
     near &= ((shines > 0) & (shines >= least)).all(axis=-1)
     return NearMirror(near, deviation, middle, towards, squared, shines)
+
+
+def _positions(observed: Observed) -> Array:
+    return np.array([light.position for light in observed.lights]).reshape(-1, 3)
 
 
 def _middle(fibres: VisibleFibres) -> Array:

@@ -7,10 +7,7 @@ from reconstruction.options import Count, options
 
 @options
 class FitOptions:
-    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering.
-
-    Half of the hair's pixels are drawn; the others lie beside them, where those are hair.
-    """
+    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
 
     hair_pixels: Count = 1000
     roughness_cameras: Count = 4

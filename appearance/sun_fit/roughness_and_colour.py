@@ -25,7 +25,7 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import HairScene
-from appearance.sun_fit.highlights import SIDE, parts_of
+from appearance.sun_fit.hair_parts import SIDE, parts_of
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 
@@ -93,10 +93,14 @@ def _minimum(error: Callable[[float], float]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FitPixels:
-    """What the cameras observed: hair, and skin where they see some."""
+    """What the cameras observed: hair, skin where they see some, and hair in `clusters`.
+
+    Pixels of a cluster lie `BESIDE` each other.
+    """
 
     hair: Sequence[Observed]
     skin: Sequence[Observed] = ()
+    clusters: Sequence[Observed] = ()
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
-from appearance.sun_fit.fit import doubtful
+from appearance.sun_fit.disorder import Disorder
+from appearance.sun_fit.fit import told
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
-from appearance.sun_fit.light_correlation import Disorder
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
     Camera,
@@ -305,30 +305,28 @@ def test_an_appearance_of_an_earlier_version_is_fitted_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("as_are", "fibres", "degrees", "error", "told"),
+    ("degrees", "error", "sure"),
     [
-        (0.303, 0.297, 4.5, 1.4, True),  # changed by 2 %
-        (0.300, 0.299, 4.5, 1.4, False),
-        (0.349, 0.349, 2.9, 16.3, True),  # of true 0.28: nothing was found, and nothing is known
-        (0.350, 0.349, 0.0, 9.0, False),
+        (19.9, 1.3, True),  # wavy hair, which strands stand for that are too orderly
+        (18.4, 7.9, True),
+        (10.1, 10.1, False),  # Sintel's and a ponytail's, orderly
+        (11.2, 5.4, False),
+        (0.0, 14.5, False),
     ],
 )
-def test_a_disorder_that_may_be_large_puts_the_roughness_in_doubt(
-    as_are, fibres, degrees, error, told
-):
-    assert doubtful(as_are, fibres, Disorder(degrees, error, 24.0)) is told
+def test_turns_are_taken_off_where_they_are_told(degrees, error, sure):
+    assert told(Disorder(degrees, error, 24.0)) is sure
 
 
 def test_hair_pixels_that_lie_apart_tell_of_no_disorder(made, tmp_path):
-    """Every second of a row, and rows two apart: none is three beside another."""
+    """Every third diagonal: no two are two or four apart in a row or a column."""
     capture, model = made
     lone = Model(tmp_path / "model").create()
     lone.write_strands(model.strands())
     for name in ("cam_0", "cam_1"):
         mask = model.mask(name, "hair", capture)
-        apart = np.zeros_like(mask)
-        apart[::2, ::2] = mask[::2, ::2]
-        lone.write_mask(name, "hair", apart)
+        diagonals = np.indices(mask.shape).sum(axis=0) % 3 == 0
+        lone.write_mask(name, "hair", mask & diagonals)
     left_out = HeldOut(("cam_2",))
     fit(capture, lone, held_out=left_out, options=replace(OPTIONS, roughness_spp=12))
     found = FittedAppearance.load(lone)
