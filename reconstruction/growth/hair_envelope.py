@@ -73,7 +73,7 @@ def build_envelope(
     for camera in cameras:
         depth = depths[camera.name]
         unknown = masks[camera.name].hair & (depth == 0)
-        depths[camera.name] = np.where(unknown, _entered(camera, envelope), depth)
+        depths[camera.name] = np.where(unknown, depth_map_first(camera, envelope), depth)
     litres = 1e3 * grid**3
     stage.figures.update(
         hull_litres=float(hull.inside.sum() * litres),
@@ -123,7 +123,7 @@ def build_hull(
     )
     stage.warn("no head: what lies under the hair counts as hair, and no strand has a root")
     depths = {
-        c.name: np.where(masked.masks[c.name].hair, _entered(c, envelope), 0.0)
+        c.name: np.where(masked.masks[c.name].hair, depth_map_first(c, envelope), 0.0)
         for c in masked.cameras
     }
     return envelope, hull.inside & ~envelope.inside, depths
@@ -157,10 +157,12 @@ def _holding(grid: VoxelGrid, points: Array) -> Bools:
     return np.asarray(counts.reshape(grid.inside.shape) >= 2)
 
 
-def _entered(camera: Camera, envelope: VoxelGrid) -> Array:
-    """Depth `(H, W)` at which each pixel's ray enters the envelope, 0 where it does not."""
-    first = first_depth(camera, envelope)
-    return np.where(np.isfinite(first), first, 0.0)
+def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
+    """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
+    seen, x, y, depth = camera.pixels_of(envelope.centers())
+    out = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(out, (y[seen], x[seen]), depth[seen])
+    return np.where(np.isfinite(out), out, 0.0)
 
 
 def _bounds(masked: MaskedCapture, cloud: PointCloud, head: Mesh, longest: float) -> Array:
