@@ -46,6 +46,9 @@ As far as a lens's blur and a filter do not mix them; twice, for what changes wi
 """
 DARK = 0.1
 """Of the mean answer of all pixels, what a pixel's counts as at least."""
+TOLD_DEG = 8.0
+"""Degrees, with the error off, from which on turns are told: smaller ones hardly show, and orderly
+hair reads 0 to 13 with about as large an error."""
 LEAST_OFF = 0.005
 """What a likeness is off by at least: as much as draws of turned strands differ by."""
 _APART = (0, *BESIDE)
@@ -56,17 +59,24 @@ _WAVE = 0.06  # metres of strand: about the pitch of wavy hair
 class Disorder:
     """By how much single strands turn beyond those that are there.
 
-    `degrees`, root mean square, with its standard error, up to `most`: what was tried.
+    `degrees`, root mean square, with its standard error, `least` less that, up to `most`: what was
+    tried.
     """
 
     degrees: float
     error: float
+    least: float
     most: float
 
     @property
+    def told(self) -> bool:
+        """Whether single hairs surely turn: the fibres' β_M is less than the one to render with."""
+        return self.least > TOLD_DEG
+
+    @property
     def trust(self) -> float:
-        """How much of what it changes is believed, 0 to 1: of d² ± δ, the share d⁴ / (d⁴ + δ²)."""
-        square, error = self.degrees**2, 2 * self.degrees * self.error
+        """How much of what it changes is believed, 0 to 1: of d² - δ, the share d⁴ / (d⁴ + δ²)."""
+        square, error = self.degrees**2, self.degrees**2 - self.least**2
         return square**2 / (square**2 + error**2) if square > 0 else 0.0
 
 
@@ -222,8 +232,8 @@ def match_disorder(
     square = degrees_of(alike) ** 2
     off = max(errors(seen - [np.interp(square, squares, curve) for curve in falling.T], left_out))
     low, high = (degrees_of(alike + sign * max(off, LEAST_OFF)) for sign in (1, -1))
-    answer = min(square, most) ** 0.5
-    return Disorder(float(answer), float(max(high - answer, answer - low)), float(most**0.5))
+    answer, least = (float(min(degrees, most**0.5)) for degrees in (square**0.5, low))
+    return Disorder(answer, max(high - answer, answer - least), least, float(most**0.5))
 
 
 def beside(observed: Observed, apart: int) -> Ints:

@@ -16,13 +16,12 @@ from appearance.bsdf.longitudinal import (
     variance_of_roughness,
 )
 from appearance.metrics.scores import Exposure
-from appearance.observations import HeldOut, Observed, chosen, observe
+from appearance.observations import HeldOut, Observed
 from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.disorder import (
-    BESIDE,
     Disorder,
     Likeness,
     PixelPairs,
@@ -30,6 +29,7 @@ from appearance.sun_fit.disorder import (
     disordered,
     match_disorder,
 )
+from appearance.sun_fit.fit_pixels import FitPixels, observed_pixels, reached
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
 from appearance.sun_fit.highlights import WINDOW, Highlight, Highlights
 from appearance.sun_fit.light_correlation import Roughness, match_roughness
@@ -49,7 +49,6 @@ from appearance.sun_fit.roughness_and_colour import (
     MOST_ALBEDO,
     MOST_SKIN,
     Colours,
-    FitPixels,
     Lobe,
     fit_colour,
     fit_lobe,
@@ -74,13 +73,6 @@ DISORDER = 1.6
 
 √2 for the two ways across, and more, as a pixel's mean is one of several strands.
 """
-TOLD_DEG = 8.0
-"""Degrees that turns exceed by more than their error where they are taken off: less hardly shows,
-and orderly hair reads 0 to 13 with as large an error."""
-SKIN_PIXELS = 200
-"""Pixels a camera that tell the skin's colour."""
-COMPARED_PIXELS = 1500
-"""Pixels a camera, about, that are compared with others beside them."""
 ROUGHNESS_PIXELS = 350
 """Pixels a camera, at most, whose own highlights are matched."""
 
@@ -108,9 +100,9 @@ def fit(
     report = model.report()
     with report.stage("samples") as stage:
         progress("reading hair pixels", 0.0)
-        pixels = _observed(training, model, options, stage, progress, seed)
+        pixels = observed_pixels(training, model, options, stage, progress, seed)
         exposure = Exposure.of([o.radiance[o.valid] for o in pixels.hair])
-        pixels = _reached(training, pixels, exposure, stage)
+        pixels = reached(training, pixels, exposure, stage)
     start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
     head = model.head(capture)
     scene = build_scene(strands, head, hair=start)
@@ -157,100 +149,10 @@ def fit(
     return report
 
 
-def _observed(
-    training: Capture,
-    model: Model,
-    options: FitOptions,
-    stage: Stage,
-    progress: Progress,
-    seed: int,
-) -> FitPixels:
-    rng = np.random.default_rng(seed)
-    cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
-    hair, clusters, skin, seen = [], [], [], 0
-    has_head = model.head(training) is not None
-    for i, name in enumerate(cameras):
-        progress("reading hair pixels", 0.3 * i / len(cameras))
-        mask = model.mask(name, "hair", training)
-        bare = model.mask(name, "skin", training) & ~mask
-        seen += int(mask.sum())
-        alone = chosen(mask, options.hair_pixels, rng)
-        some = chosen(mask, COMPARED_PIXELS // (1 + len(BESIDE)), rng)
-        compared = np.concatenate([some, _beside(some, mask)])
-        wanted = np.union1d(alone, compared)
-        uncovered = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
-        both = observe(training, name, lights, np.concatenate([wanted, uncovered]))
-        is_hair = np.arange(len(both.pixels)) < len(wanted)
-        if len(wanted):
-            hair.append(both.where(is_hair & np.isin(both.pixels, alone)))
-            clusters.append(both.where(is_hair & np.isin(both.pixels, compared)))
-        if len(uncovered) >= 10:
-            skin.append(both.where(~is_hair))
-        if missing := int((~both.valid.any(axis=1)).sum()):
-            stage.warn(f"{name}: {missing} of {len(lights)} lights have no usable frame")
-    if not hair:
-        raise ValueError(f"{model}: the hair masks of the cameras {cameras} are all empty")
-    if not any((o.radiance[o.valid] > 0).any() for o in hair):
-        raise ValueError(
-            f"{training.path}: every hair pixel of every frame is dark, saturated or missing: "
-            "check the exposure"
-        )
-    kept = sum(len(o.pixels) for o in hair)
-    stage.figures |= {"cameras": len(cameras), "lights": len(lights), "hair_pixels": kept}
-    if kept < seen:
-        stage.leave_out(
-            f"{seen - kept} of {seen} hair pixels",
-            "means and lobes are known to a per cent from the others",
-            f"{1 - kept / seen:.0%} of the renderings",
-        )
-    return FitPixels(hair, skin, clusters)
-
-
 def _spread(observed: Observed) -> Ints:
     """Places of `ROUGHNESS_PIXELS` of the pixels, evenly."""
     count = len(observed.pixels)
     return np.linspace(0, count - 1, min(count, ROUGHNESS_PIXELS)).astype(int)
-
-
-def _beside(pixels: Ints, mask: Bools) -> Ints:
-    """Those of `mask` that lie `BESIDE` a pixel of `pixels`: right of every second, else below."""
-    width, found = mask.shape[1], []
-    for apart in BESIDE:
-        found.append(pixels[::2][pixels[::2] % width + apart < width] + apart)
-        below = pixels[1::2] + apart * width
-        found.append(below[below < mask.size])
-    either = np.concatenate(found)
-    return either[mask.ravel()[either]]
-
-
-def told(disorder: Disorder) -> bool:
-    """Whether single hairs surely turn, so that the fibres' β_M is less than the strands' one."""
-    return disorder.degrees - disorder.error > TOLD_DEG
-
-
-def _reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
-    """Leave out the lights that reach no hair pixel of any camera."""
-    hair, noise = pixels.hair, 0.0
-    for o in hair[:1]:
-        for step in training.of_kind("dark"):
-            if training.has(step, o.camera.name):
-                frame = training.frame(step, o.camera.name).reshape(-1, 3)[o.pixels]
-                noise = max(noise, float(frame.std()))
-    threshold = max(5 * noise, 1e-3 / exposure.scale)
-    peak = np.max([np.where(o.valid[..., None], o.radiance, 0).max((1, 2)) for o in hair], axis=0)
-    lit = np.flatnonzero(peak > threshold)
-    if len(lit) < len(peak):
-        names = [hair[0].lights[i].name for i in np.flatnonzero(peak <= threshold)]
-        stage.leave_out(
-            f"{len(names)} of {len(peak)} lights: {', '.join(names[:5])} …",
-            "they reach no hair pixel",
-            f"{len(names) / len(peak):.0%} of the shadow rays",
-        )
-    if len(lit) == 0:
-        raise ValueError(f"{training.path}: no light reaches a hair pixel")
-    stage.figures["lights_that_reach_hair"] = len(lit)
-    each = (pixels.hair, pixels.skin, pixels.clusters)
-    return FitPixels(*([o.under(lit) for o in some] for some in each))
 
 
 @dataclass(frozen=True)
@@ -341,23 +243,16 @@ class SunFit:
             beta = max(smoother or as_are.beta_m, ROUGHNESSES[0])
             share = direct_share(rendered(self.scene, beta, 1), rendered(self.scene, beta))
             disorder = self._disorder(self.disordered, channel, beta, share)
-            fibres = replace(as_are, disorder=disorder)
-            if disorder is None or told(disorder):
-                off = DISORDER * as_are.tangents_deg if disorder is None else disorder.degrees
-                scene = self.disordered(float(np.radians(off)), 0)
-                fibres = matched(scene, np.unique(nearer)).after(as_are, disorder)
-                if disorder is not None:
-                    stage.warn(
-                        f"single hairs turn by {disorder.degrees:.0f} ± {disorder.error:.0f}° more "
-                        "than the strands, by what pixels beside each other tell: the fibres' β_M, "
-                        f"{fibres.beta_m:.2f} ({fibres.low:.2f} to {fibres.high:.2f}), stands on it"
-                    )
-            elif disorder.degrees + disorder.error > disorder.most:
-                stage.warn(
-                    "pixels beside each other do not tell whether single hairs turn more than the "
-                    f"strands ({disorder.degrees:.0f} ± {disorder.error:.0f}°): the fibres' β_M, "
-                    f"{fibres.beta_m:.2f}, may be too large"
-                )
+            if disorder is None:
+                off = DISORDER * as_are.tangents_deg
+            else:
+                most = min(disorder.degrees + disorder.error, disorder.most)
+                off = disorder.degrees if disorder.told else most
+            turned = matched(self.disordered(float(np.radians(off)), 0), np.unique(nearer))
+            if disorder is None or disorder.told:
+                fibres = turned.after(as_are, disorder)
+            else:
+                fibres = as_are.or_less(turned, disorder)
         stage.figures |= {
             "samples": count,
             "pairs_of_lights": int(captured.pairs.sum()),

@@ -27,6 +27,8 @@ from reconstruction.arrays import Array
 
 WIDEST = 1.5
 """Ratio of the interval's ends above which a roughness is called uncertain."""
+SURE = 0.87
+"""Of a roughness, how low it may be for turns that do not show without a warning."""
 LARGEST_ERROR = 0.1
 WORST_MISFIT = 3.0
 _FLOOR = 0.02  # what a mean of a bin is off by at least, of the mean over bins
@@ -87,6 +89,16 @@ class Roughness:
             disorder=disorder,
         )
 
+    def or_less(self, turned: Roughness, disorder: Disorder) -> Roughness:
+        """This one, of strands as they are, where hair may be more disordered, which is not told.
+
+        `turned` is the answer of strands as disordered as the hair may be: how low this one may be.
+        """
+        low = min(self.low, turned.beta_m)
+        error = max(self.error, 0.5 * float(np.log(self.beta_m / low)))
+        systematic = float(np.sqrt(error**2 - self.error**2))
+        return replace(self, low=low, error=error, systematic=systematic, disorder=disorder)
+
     def warnings(self) -> list[str]:
         """What a user has to know before believing it, a sentence each."""
         said, either = [], f"{self.low:.2g} to {self.high:.2g}"
@@ -101,10 +113,23 @@ class Roughness:
         if np.sqrt(self.error**2 - self.systematic**2) > max(2 * self.parts, LARGEST_ERROR):
             views = ", ".join(f"{beta:.2g}" for beta in self.views)
             said.append(f"views disagree about β_M by more than their noise: {views}")
-        if self.disorder is not None and self.disorder.degrees >= self.disorder.most:
+        d = self.disorder
+        if d is not None and d.told:
+            said.append(
+                f"single hairs turn by {d.degrees:.0f}° (at least {d.least:.0f}°) more than the "
+                "strands, by what pixels beside each other tell: the fibres' β_M, "
+                f"{self.beta_m:.2g} ({either}), stands on that"
+            )
+        elif d is not None and self.low < SURE * self.beta_m:
+            said.append(
+                f"pixels beside each other do not tell whether single hairs turn by up to "
+                f"{min(d.degrees + d.error, d.most):.0f}° more than the strands: the fibres' β_M, "
+                f"{self.beta_m:.2g}, may be as low as {self.low:.2g}"
+            )
+        if d is not None and d.degrees >= d.most:
             said.append(
                 "pixels beside each other differ by more than strands turned by "
-                f"{self.disorder.most:g}° do: β_M {self.beta_m:.2g} may be too large"
+                f"{d.most:g}° do: β_M {self.beta_m:.2g} may be too large"
             )
         if self.misfit > WORST_MISFIT:
             said.append(

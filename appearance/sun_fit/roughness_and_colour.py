@@ -25,6 +25,7 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import HairScene
+from appearance.sun_fit.fit_pixels import FitPixels
 from appearance.sun_fit.hair_parts import SIDE, parts_of
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
@@ -89,18 +90,6 @@ def _minimum(error: Callable[[float], float]) -> float:
     best = int(np.argmin([error(float(x)) for x in grid]))
     low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     return float(minimize_scalar(error, bounds=(low, high), method="bounded").x)
-
-
-@dataclass(frozen=True, eq=False)
-class FitPixels:
-    """What the cameras observed: hair, skin where they see some, and hair in `clusters`.
-
-    Pixels of a cluster lie `BESIDE` each other.
-    """
-
-    hair: Sequence[Observed]
-    skin: Sequence[Observed] = ()
-    clusters: Sequence[Observed] = ()
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
-from appearance.sun_fit.disorder import Disorder
-from appearance.sun_fit.fit import told
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
@@ -302,20 +300,6 @@ def test_an_appearance_of_an_earlier_version_is_fitted_again(tmp_path):
     for damaged in (json.dumps(data), "{"):
         path.write_text(damaged)
         assert not FittedAppearance.is_of(model, LEFT_OUT)
-
-
-@pytest.mark.parametrize(
-    ("degrees", "error", "sure"),
-    [
-        (19.9, 1.3, True),  # wavy hair, which strands stand for that are too orderly
-        (18.4, 7.9, True),
-        (10.1, 10.1, False),  # Sintel's and a ponytail's, orderly
-        (11.2, 5.4, False),
-        (0.0, 14.5, False),
-    ],
-)
-def test_turns_are_taken_off_where_they_are_told(degrees, error, sure):
-    assert told(Disorder(degrees, error, 24.0)) is sure
 
 
 def test_hair_pixels_that_lie_apart_tell_of_no_disorder(made, tmp_path):

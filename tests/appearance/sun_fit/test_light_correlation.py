@@ -131,20 +131,33 @@ def test_too_few_pairs_are_an_error_that_says_what_to_do(family):
 
 
 def test_a_disorder_that_is_hardly_known_changes_the_roughness_half_way(family):
-    """5 ± 2.5°: its square, 25 ± 25, is as uncertain as it is large."""
+    """5 ± 5°: its square, 25 less 25, is as uncertain as it is large."""
     smooth, rough = (match_roughness(highlight(beta), family) for beta in (0.2, 0.3))
-    found = smooth.after(rough, Disorder(5, 2.5, 24))
+    found = smooth.after(rough, Disorder(5, 5, 0, 24))
     assert found.beta_m == pytest.approx((smooth.beta_m * rough.beta_m) ** 0.5)
     assert found.low < 0.2 < found.beta_m < 0.3 < found.high
-    sure = smooth.after(rough, Disorder(5, 0.0, 24))
+    sure = smooth.after(rough, Disorder(5, 0.0, 5, 24))
     assert (sure.beta_m, sure.error) == pytest.approx((smooth.beta_m, smooth.error))
-    assert smooth.after(rough, Disorder(0, 1.0, 24)).beta_m == pytest.approx(rough.beta_m)
+    assert smooth.after(rough, Disorder(0, 1.0, 0, 24)).beta_m == pytest.approx(rough.beta_m)
 
 
 def test_more_disorder_than_was_tried_is_a_warning(family):
     about = match_roughness(highlight(0.3, 20, seed=4), family)
-    found = about.after(about, Disorder(24, 5, 24))
+    found = about.after(about, Disorder(24, 5, 22, 24))
     assert any("turned by 24°" in w for w in found.warnings())
+
+
+def test_turns_that_may_be_there_and_do_not_show_are_in_the_interval(family):
+    smooth, rough = (match_roughness(highlight(beta), family) for beta in (0.2, 0.3))
+    found = rough.or_less(smooth, Disorder(10, 10, 0, 24))
+    assert found.beta_m == rough.beta_m
+    assert (found.low, found.high) == (pytest.approx(smooth.beta_m), rough.high)
+    assert found.error == pytest.approx(0.5 * np.log(rough.beta_m / smooth.beta_m))
+    assert any("up to 20°" in w and "as low as 0.2" in w for w in found.warnings())
+    same = rough.or_less(rough, Disorder(0, 3, 0, 24))
+    assert (same.low, same.high) == (rough.low, rough.high)
+    assert same.error == pytest.approx(rough.error)
+    assert same.warnings() == rough.warnings()
 
 
 def test_a_light_tells_nothing_of_hair_beside_its_beam():

@@ -9,6 +9,7 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import DiffuseHair
+from appearance.sun_fit.fit_pixels import FitPixels
 from appearance.sun_fit.fitted_appearance import absorption_warnings
 from appearance.sun_fit.mirror_samples import (
     LobeBins,
@@ -22,7 +23,6 @@ from appearance.sun_fit.roughness_and_colour import (
     MOST_ALBEDO,
     SAMPLING,
     Colours,
-    FitPixels,
     fit_colour,
     fit_diffuse,
     fit_lobe,

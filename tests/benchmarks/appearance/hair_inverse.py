@@ -9,8 +9,8 @@ import numpy as np
 from appearance import HairAppearance, HairScene
 from appearance.observations import Observed
 from appearance.sun_fit.fit import BETA_N, SunFit
+from appearance.sun_fit.fit_pixels import FitPixels
 from appearance.sun_fit.options import FitOptions
-from appearance.sun_fit.roughness_and_colour import FitPixels
 from reconstruction import Progress, Stage, silent
 from reconstruction.arrays import Array
 

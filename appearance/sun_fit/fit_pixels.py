@@ -1,0 +1,121 @@
+"""Which pixels of a capture a fit reads: hair, skin, and hair beside other hair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from appearance.metrics.scores import Exposure
+from appearance.observations import Observed, chosen, observe
+from appearance.sun_fit.disorder import BESIDE
+from appearance.sun_fit.options import FitOptions
+from reconstruction import Capture, Model, Progress, Stage
+from reconstruction.arrays import Bools, Ints
+
+SKIN_PIXELS = 200
+"""Pixels a camera that tell the skin's colour."""
+COMPARED_PIXELS = 1500
+"""Pixels a camera, about, that are compared with others beside them."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitPixels:
+    """What the cameras observed: hair, skin where they see some, and hair in `clusters`.
+
+    Pixels of a cluster lie `BESIDE` each other.
+    """
+
+    hair: Sequence[Observed]
+    skin: Sequence[Observed] = ()
+    clusters: Sequence[Observed] = ()
+
+
+def observed_pixels(
+    training: Capture,
+    model: Model,
+    options: FitOptions,
+    stage: Stage,
+    progress: Progress,
+    seed: int,
+) -> FitPixels:
+    """Read hair and skin of all cameras; raises `ValueError` where there is no hair, or it is dark.
+
+    How much was read, and left out, goes into `stage`.
+    """
+    rng = np.random.default_rng(seed)
+    cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
+    hair, clusters, skin, seen = [], [], [], 0
+    has_head = model.head(training) is not None
+    for i, name in enumerate(cameras):
+        progress("reading hair pixels", 0.3 * i / len(cameras))
+        mask = model.mask(name, "hair", training)
+        bare = model.mask(name, "skin", training) & ~mask
+        seen += int(mask.sum())
+        alone = chosen(mask, options.hair_pixels, rng)
+        some = chosen(mask, COMPARED_PIXELS // (1 + len(BESIDE)), rng)
+        compared = np.concatenate([some, _beside(some, mask)])
+        wanted = np.union1d(alone, compared)
+        uncovered = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
+        both = observe(training, name, lights, np.concatenate([wanted, uncovered]))
+        is_hair = np.arange(len(both.pixels)) < len(wanted)
+        if len(wanted):
+            hair.append(both.where(is_hair & np.isin(both.pixels, alone)))
+            clusters.append(both.where(is_hair & np.isin(both.pixels, compared)))
+        if len(uncovered) >= 10:
+            skin.append(both.where(~is_hair))
+        if missing := int((~both.valid.any(axis=1)).sum()):
+            stage.warn(f"{name}: {missing} of {len(lights)} lights have no usable frame")
+    if not hair:
+        raise ValueError(f"{model}: the hair masks of the cameras {cameras} are all empty")
+    if not any((o.radiance[o.valid] > 0).any() for o in hair):
+        raise ValueError(
+            f"{training.path}: every hair pixel of every frame is dark, saturated or missing: "
+            "check the exposure"
+        )
+    kept = sum(len(o.pixels) for o in hair)
+    stage.figures |= {"cameras": len(cameras), "lights": len(lights), "hair_pixels": kept}
+    if kept < seen:
+        stage.leave_out(
+            f"{seen - kept} of {seen} hair pixels",
+            "means and lobes are known to a per cent from the others",
+            f"{1 - kept / seen:.0%} of the renderings",
+        )
+    return FitPixels(hair, skin, clusters)
+
+
+def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
+    """Leave out the lights that reach no hair pixel of any camera."""
+    hair, noise = pixels.hair, 0.0
+    for o in hair[:1]:
+        for step in training.of_kind("dark"):
+            if training.has(step, o.camera.name):
+                frame = training.frame(step, o.camera.name).reshape(-1, 3)[o.pixels]
+                noise = max(noise, float(frame.std()))
+    threshold = max(5 * noise, 1e-3 / exposure.scale)
+    peak = np.max([np.where(o.valid[..., None], o.radiance, 0).max((1, 2)) for o in hair], axis=0)
+    lit = np.flatnonzero(peak > threshold)
+    if len(lit) < len(peak):
+        names = [hair[0].lights[i].name for i in np.flatnonzero(peak <= threshold)]
+        stage.leave_out(
+            f"{len(names)} of {len(peak)} lights: {', '.join(names[:5])} …",
+            "they reach no hair pixel",
+            f"{len(names) / len(peak):.0%} of the shadow rays",
+        )
+    if len(lit) == 0:
+        raise ValueError(f"{training.path}: no light reaches a hair pixel")
+    stage.figures["lights_that_reach_hair"] = len(lit)
+    each = (pixels.hair, pixels.skin, pixels.clusters)
+    return FitPixels(*([o.under(lit) for o in some] for some in each))
+
+
+def _beside(pixels: Ints, mask: Bools) -> Ints:
+    """Those of `mask` that lie `BESIDE` a pixel of `pixels`: right of every second, else below."""
+    width, found = mask.shape[1], []
+    for apart in BESIDE:
+        found.append(pixels[::2][pixels[::2] % width + apart < width] + apart)
+        below = pixels[1::2] + apart * width
+        found.append(below[below < mask.size])
+    either = np.concatenate(found)
+    return either[mask.ravel()[either]]
