@@ -94,8 +94,10 @@ def triangulate(
     counts["inside_hull"] = len(cloud)
     cloud = fuse(cloud)
     counts["after_fusion"] = len(cloud)
-    pixel = np.array([np.linalg.norm(c.center) / c.K[0, 0] for c in capture.rig.cameras])
-    cloud = cloud.subset(supported(cloud.points, pixel[cloud.camera], NEIGHBOURS, ISOLATION))
+    centers, focal = zip(*((c.center, c.K[0, 0]) for c in capture.rig.cameras), strict=True)
+    away = np.linalg.norm(np.array(centers)[cloud.camera] - cloud.points, axis=1)
+    pixel = away / np.array(focal)[cloud.camera]
+    cloud = cloud.subset(supported(cloud.points, pixel, NEIGHBOURS, ISOLATION))
     backing = support(cloud.points, RADIUS)
     cloud = replace(cloud, weight=(cloud.weight * backing).astype(np.float32))
     cloud = flatten(cloud, RADIUS, ROUGHNESS)

@@ -173,7 +173,22 @@ def test_what_a_coarse_camera_alone_sees_is_no_outlier_beside_a_fine_one(
     for used in (cameras, cameras[1:]):
         cloud = triangulate(shoot(cameras=used, projectors=projectors, samples=1))
         kept.append(len(cloud.of_camera("coarse")))
-    assert kept[0] == pytest.approx(kept[1], rel=0.004)
+    assert kept[0] == pytest.approx(kept[1], rel=0.02)
+
+
+def test_points_do_not_depend_on_where_the_origin_is(sphere_capture: Capture) -> None:
+    """A tracker's or the room's may lie anywhere, at a camera too."""
+    capture = Capture(sphere_capture.path)
+    here, rig = triangulate(capture), capture.rig
+    origin = rig.cameras[0].center
+    capture.rig = replace(
+        rig,
+        cameras=tuple(c.moved(np.eye(3), origin) for c in rig.cameras),
+        projectors=tuple(p.moved(np.eye(3), origin) for p in rig.projectors),
+    )
+    there = triangulate(capture)
+    assert len(there) == len(here)
+    assert there.points == pytest.approx(here.points - origin, abs=1e-9)
 
 
 def test_flattening_moves_noise_onto_the_plane_and_never_widens(sphere_capture: Capture) -> None:
