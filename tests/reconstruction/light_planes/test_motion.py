@@ -206,9 +206,9 @@ def test_one_camera_determines_a_part_and_says_so(
     stage = Stage("motion")
     assert solve_motion(capture, triangulate(capture), stage=stage).determined == 6
     assert stage.figures["weakest_strength"] < 0.1
-    words = stage.figures["weakest_direction"]
-    assert words.startswith("shift along (")
-    axis = np.array([float(x) for x in words[13:-1].split(", ")])
+    # with a turn or without one
+    shift = stage.figures["weakest_direction"].split("shift along (")[1]
+    axis = np.array([float(x) for x in shift[:-1].split(", ")])
     assert abs(axis @ capture.rig.cameras[0].R[2]) > 0.9
     assert np.isfinite(motion.translations).all()
     # what the camera sees is explained all the same
