@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from appearance.fields.interpolation import Interpolation, Source, turned, weighted
+from appearance.fields.interpolation import Interpolation, Source, irradiance, turned, weighted
 from appearance.fields.kajiya_kay import KajiyaKay
 from reconstruction import Light, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
@@ -167,8 +167,9 @@ def refined(interpolation: Interpolation, progress: Progress = silent) -> Interp
     """Every camera's strands turned to what its samples agree with best (Photobooth §4.2).
 
     Each pixel is tried with its tangents turned towards `CANDIDATES` directions within
-    `WITHIN_DEG`: the turn counts whose model is most like the samples over `_LIGHTS` lights, by the
-    cosine of the angle between the two as vectors. Raises `ValueError` without a model.
+    `WITHIN_DEG`: the turn counts whose model is most like the samples over irradiance, of `_LIGHTS`
+    lights, by the cosine of the angle between the two as vectors.
+    Raises `ValueError` without a model.
     """
     if interpolation.model is None:
         raise ValueError("turning strands needs a model to compare with the samples")
@@ -198,7 +199,9 @@ def _best_turns(source: Source, model: KajiyaKay, lights: Sequence[Light], pixel
     toward = np.stack([lights[k].position for k in few])[:, None] - point
     toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
     sample = source.view.table[few][:, pixels].astype(np.float32).mean(axis=-1)
-    sample = np.where(np.isfinite(sample), sample, 0)
+    given = np.stack([irradiance(lights[k], point).mean(axis=-1) for k in few])
+    known = np.isfinite(sample) & (given > 0)
+    sample = np.divide(sample, given, out=np.zeros_like(sample), where=known)
     found, best = np.zeros((len(pixels), 3), np.float32), np.full(len(pixels), -np.inf)
     for turn in _candidates(tangent):
         guide = model(turned(turn, tangent), away.astype(np.float32), toward.astype(np.float32))
