@@ -168,7 +168,7 @@ def refined(interpolation: Interpolation, progress: Progress = silent) -> Interp
 
     Each pixel is tried with its tangents turned towards `CANDIDATES` directions within
     `WITHIN_DEG`: the turn counts whose model is most like the samples over irradiance, of `_LIGHTS`
-    lights, by the cosine of the angle between the two as vectors.
+    lights, by the cosine of the angle between the two as vectors, over the samples that are known.
     Raises `ValueError` without a model.
     """
     if interpolation.model is None:
@@ -205,6 +205,7 @@ def _best_turns(source: Source, model: KajiyaKay, lights: Sequence[Light], pixel
     found, best = np.zeros((len(pixels), 3), np.float32), np.full(len(pixels), -np.inf)
     for turn in _candidates(tangent):
         guide = model(turned(turn, tangent), away.astype(np.float32), toward.astype(np.float32))
+        guide = np.where(known, guide, 0)
         like = (sample * guide).sum(axis=0) / np.maximum(np.linalg.norm(guide, axis=0), 1e-12)
         better = like > best
         found[better], best[better] = turn[better], like[better]

@@ -167,16 +167,16 @@ def test_search_and_pictures_are_of_one_mind(planted):
     assert found.errors[0, 2, 5] == pytest.approx(expected, rel=0.02)
 
 
-def turn_errors(planted, lights):
+def turn_errors(planted, lights, broken=lambda table: table):
     """Mean angles to tangents that are off by 8 degrees, before and after refining, in degrees.
 
-    Frames under `lights` in the places of the planted ones.
+    Frames under `lights` in the places of the planted ones; `broken` takes samples away.
     """
     source = planted.sources[1]
     hits, axis = source.hits, np.array([0.0, 1.0, 0.0], np.float32)
     off = replace(hits, table=hits.table.copy())
     off.table["tangent"] = turned(np.radians(8) * axis, hits.column("tangent"))
-    table = np.stack([kajiya_kay_picture(off, x) for x in lights]).astype(np.float16)
+    table = broken(np.stack([kajiya_kay_picture(off, x) for x in lights]).astype(np.float16))
     source = replace(source, view=replace(source.view, table=table))
     field = replace(planted.field, lights=lights)
     before = replace(planted, field=field, sources=(source,), model=TRUE)
@@ -204,6 +204,17 @@ def test_how_bright_lights_are_does_not_turn_strands(planted):
     )
     before, after = turn_errors(planted, lights)
     assert after < 0.6 * before
+
+
+def test_saturated_highlights_do_not_turn_strands(planted):
+    """A sample that is not known is not black."""
+
+    def saturated(table):
+        bright = table.astype(float).mean(axis=-1)
+        return np.where((bright > np.quantile(bright, 0.85, axis=0))[..., None], np.nan, table)
+
+    before, after = turn_errors(planted, planted.field.lights, saturated)
+    assert after < 0.7 * before
 
 
 def test_a_place_that_no_camera_sees_is_told(planted, tuft):
