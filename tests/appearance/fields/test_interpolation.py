@@ -246,6 +246,21 @@ def test_missing_and_saturated_samples_weigh_nothing(planted):
     assert error(made[0][rest], truth[rest]) < 5e-3
 
 
+def test_under_all_lights_half_of_the_light_is_not_all_of_it(planted):
+    """A pixel that is saturated under one of two lights is not known, or its highlight is black."""
+    source, two = planted.sources[1], [planted.field.lights[k] for k in (9, 40)]
+    table = source.view.table.copy()
+    near, other = planted.neighbours(two)[0]
+    assert not set(near) & set(other)
+    table[near, 5] = np.nan
+    some = replace(planted, sources=(replace(source, view=replace(source.view, table=table)),))
+    whole, known = some.seen_by(source.hits).under_all(two)
+    assert known[5] == 0
+    truth = sum(kajiya_kay_picture(source.hits, x) for x in two)
+    assert error(whole[known > 0], truth[known > 0]) < 5e-3
+    assert (np.delete(known, 5) > 0).all()
+
+
 def test_black_frames_and_dark_lights(planted):
     source = planted.sources[1]
     black = replace(source.view, table=np.zeros_like(source.view.table))
