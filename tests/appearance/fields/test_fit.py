@@ -15,7 +15,7 @@ from appearance.fields.grams import Gram, Samples
 from appearance.fields.options import FieldOptions
 from appearance.fields.pipeline import better
 from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conjugate_gradients
-from appearance.fields.validation import GROUPS, Folds
+from appearance.fields.validation import GROUPS, Folds, _elsewhere
 from appearance.render.harmonics import harmonics
 from reconstruction import BadOptions, Light, parse_options
 
@@ -253,6 +253,24 @@ def test_the_noise_of_rendered_pictures_does_not_pull_a_field_to_zero():
         factors.append(1 + harmonics((0, 0, 1.0), 0)[0] * gram.right.sum() / gram.packed.sum())
     assert factors[0] == pytest.approx(1.5, rel=0.02)
     assert factors[1] == pytest.approx(1.2, rel=0.02), "one half twice"
+
+
+def test_a_picture_has_no_part_in_the_ridge_at_which_it_is_judged():
+    """Errors of two ridges: the weaker halves all of them, but for one picture that it spoils.
+
+    That picture, of view 0 under light 0, is judged in several folds. What the other pictures say
+    of the fold that leaves both out is the weaker ridge.
+    """
+    folds = Folds((0, 1, 2), (0, 1, 2))
+    without = np.zeros((9, 3, 3, 3))
+    for fold, view, light in np.ndindex(9, 3, 3):
+        group = folds.group(fold, view, light)
+        if group is not None:
+            without[fold, view, light, group] = 1 + 0.1 * view + 0.1 * light
+    strong, weak = 0.9 * without, 0.5 * without
+    weak[:, 0, 0] = 200 * without[:, 0, 0]
+    judged = _elsewhere(np.stack([strong, weak]), without, folds, 0)
+    np.testing.assert_array_equal(judged, weak[0])
 
 
 def per_view(planted, seed, noise=0.05):
