@@ -354,6 +354,35 @@ def test_a_fit_that_was_killed_goes_on_behind_the_ridges_it_had_done(planted, tm
     np.testing.assert_array_equal(found.field.values, whole.field.values)
 
 
+def shifted(view, by):
+    """The view in a world whose origin is elsewhere; its first three pixels are off the hair."""
+    table = view.hits.table.copy()
+    table[:3] = np.zeros(1, table.dtype)
+    table["strand"][:3] = -1
+    table["point"][3:] += by.astype(np.float32)
+    hits = replace(view.hits, camera=view.hits.camera.moved(np.eye(3), -by), table=table)
+    lights = tuple(replace(x, position=x.position + by) for x in view.lights)
+    return replace(view, hits=hits, lights=lights)
+
+
+@pytest.mark.parametrize("kind", ["modulation", "additive"])
+def test_a_field_does_not_depend_on_where_the_origin_is(planted, kind):
+    """A light is there: pixels off the hair are not, for that."""
+    views = planted.views(planted.truth(kind), 8)[:2]
+    options = replace(ROUGH, kind=kind, ridges=(0.1,))
+    here, there = np.zeros(3), -views[0].lights[2].position
+    one, other = (fitted(planted, [shifted(v, by) for v in views], options) for by in (here, there))
+    largest = np.abs(one.field.values).max()
+    np.testing.assert_allclose(other.field.values, one.field.values, atol=2e-3 * largest)
+    for group, scores in one.validation.items():
+        assert other.validation[group] == pytest.approx(scores, rel=1e-2)
+    lit, moved = (
+        f.field.at(v.hits).lit(v.halves[0], v.lights)
+        for f, v in ((one, shifted(views[0], here)), (other, shifted(views[0], there)))
+    )
+    np.testing.assert_allclose(moved, lit, rtol=1e-3, atol=1e-3 * lit.max())
+
+
 def test_places_of_edited_strands():
     grid, places = (
         Grid.of((3, 2, 2), 4),
