@@ -85,16 +85,20 @@ def searched(
     """Try all of the grid: each of `lights` is left out and made of the others (Photobooth §4.2).
 
     The error is the greatest L2 over blocks of `BLOCK`² pixels: highlights cover few. In at most
-    `cameras` views, spread over those there are. Raises `ValueError` without lights to leave out.
+    `cameras` views, spread over those whose frame of the light shows something; a light without
+    such a frame is not left out. Raises `ValueError` without lights to leave out.
     """
     if not lights or len(interpolation.field.lights) < len(lights) + 2:
         raise ValueError(f"a search leaves lights out and needs others, got {list(lights)}")
-    count = len(interpolation.sources)
-    used = sorted({int((i + 0.5) * count / cameras) for i in range(cameras)})
+    judging = {light: _judging(interpolation, light, cameras) for light in lights}
+    lights = [light for light in lights if judging[light]]
+    if not lights:
+        raise ValueError(f"a search needs frames of the lights it leaves out, {list(judging)}")
     rest = interpolation.without(lights=lights)
     errors = np.zeros((len(lights), len(DIFFUSE), len(EXPONENT)))
     standard = np.zeros(len(lights))
     for i, light in enumerate(lights):
+        used = judging[light]
         for k, number in enumerate(used):
             judge = _Judge(interpolation, rest, number, light)
             standard[i] += judge.standard() / len(used)
@@ -103,6 +107,17 @@ def searched(
                 progress("searching the guide's parameters", done)
                 errors[i, :, j] += np.array(judge.errors(exponent)) / len(used)
     return Search(tuple(lights), errors, standard)
+
+
+def _judging(interpolation: Interpolation, light: str, most: int) -> list[int]:
+    """At most so many of the sources in which a light shows something, by their numbers."""
+    number = np.array([[x.name for x in interpolation.field.lights].index(light)])
+    there = [
+        k
+        for k, source in enumerate(interpolation.sources)
+        if np.nanmax(source.view.under(number), initial=0) > 0
+    ]
+    return sorted({there[int((i + 0.5) * len(there) / most)] for i in range(most) if there})
 
 
 class _Judge:

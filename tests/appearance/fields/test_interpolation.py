@@ -154,6 +154,25 @@ def test_search_warns_where_standard_interpolation_is_as_good(planted):
     assert any("standard interpolation" in w for w in stage.warnings)
 
 
+def test_search_is_judged_by_frames_that_are_there(planted):
+    """A frame that did not come is no picture without an error: other cameras' frames say."""
+    whole = replace(planted, sources=planted.sources[:2])
+    source = whole.sources[1]
+    table = source.view.table.copy()
+    table[9] = np.nan
+    lost = replace(source, view=replace(source.view, table=table))
+    found = searched(replace(whole, sources=(whole.sources[0], lost)), ["l9", "l20"])
+    alone = searched(replace(whole, sources=whole.sources[:1]), ["l9", "l20"])
+    both = searched(whole, ["l9", "l20"])
+    np.testing.assert_allclose(found.errors[0], alone.errors[0])
+    np.testing.assert_allclose(found.errors[1], both.errors[1])
+    assert found.standard[0] == pytest.approx(alone.standard[0])
+    nowhere = replace(whole, sources=(lost,))
+    assert searched(nowhere, ["l9", "l20"]).lights == ("l20",)
+    with pytest.raises(ValueError, match="l9"):
+        searched(nowhere, ["l9"])
+
+
 def test_search_and_pictures_are_of_one_mind(planted):
     """The search's fast sums against the pictures themselves."""
     one = replace(planted, sources=planted.sources[:1])
