@@ -19,6 +19,7 @@ from appearance.metrics.scores import srgb
 from appearance.render.pixel_field import PixelField
 from reconstruction import Progress
 from reconstruction.arrays import Array, Floats
+from reconstruction.files.durable import writing
 
 GROUPS = ("new lights", "new views", "both new")
 _LEAST_LIGHTS = 4
@@ -322,10 +323,9 @@ class _State:
         if path is None:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.npz")
         latest: dict[str, Any] = {f"block_{k}": x for k, x in enumerate(self.latest)}
-        np.savez(part, fingerprint=np.array(fingerprint), squares=self.squares, **latest)
-        part.replace(path)
+        with writing(path) as part:
+            np.savez(part, fingerprint=np.array(fingerprint), squares=self.squares, **latest)
 
     @classmethod
     def load(cls, path: Path | None, fingerprint: str, none: Array) -> _State:

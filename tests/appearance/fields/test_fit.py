@@ -18,6 +18,7 @@ from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conj
 from appearance.fields.validation import GROUPS, Folds, _elsewhere
 from appearance.render.harmonics import harmonics
 from reconstruction import BadOptions, Light, parse_options
+from reconstruction.files import durable
 
 LEVELS = ((2, 3, 3), (4, 6, 6))
 EXACT = FieldOptions(
@@ -381,6 +382,30 @@ def test_a_field_does_not_depend_on_where_the_origin_is(planted, kind):
         for f, v in ((one, shifted(views[0], here)), (other, shifted(views[0], there)))
     )
     np.testing.assert_allclose(moved, lit, rtol=1e-3, atol=1e-3 * lit.max())
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_replaces_the_one_before_it(
+    planted, tmp_path, monkeypatch
+):
+    views, done = planted.views(planted.truth()), []
+    options = replace(ROUGH, ridges=(1e-3, 0.1, 10.0))
+    folder = tmp_path / "work"
+
+    def full(path):
+        if done:
+            raise OSError(28, "No space left on device")
+        done.append(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(durable, "flush", full)
+        with pytest.raises(OSError, match="No space left"):
+            fitted(planted, views, options, Monitor(checkpoint=folder / "field.npz"))
+    assert [f.name for f in folder.iterdir()] == ["field.npz"]
+    again = []
+    told = Monitor(lambda w, s: again.append(w), folder / "field.npz")
+    fitted(planted, views, options, told)
+    ridges = {w.split(":")[0] for w in again if w.startswith("ridge") and "left-out" in w}
+    assert ridges == {"ridge 0.1", "ridge 0.001"}, "the first was kept"
 
 
 def test_places_of_edited_strands():
