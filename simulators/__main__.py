@@ -41,9 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.state is None and args.truth_only is None:
         parser.error("--state FOLDER is required (or --truth-only FOLDER)")
-    for option in ("spp", "processes"):
-        if getattr(args, option) < 1:
-            parser.error(f"--{option} must be at least 1, got {getattr(args, option)}")
+    for option, least in (("spp", 1), ("processes", 1), ("seed", 0)):
+        if getattr(args, option) < least:
+            parser.error(f"--{option} must be at least {least}, got {getattr(args, option)}")
     try:
         rig_file = load_rig_file(args.rig)
         cameras = [c.name for c in rig_file.rig.cameras]

@@ -82,11 +82,19 @@ class Hits:
         return _unit(self.camera.center - self.column("point"))
 
     def middle(self) -> Floats:
-        """The mean point of each pixel's hits on hair `(P, 3)`, metres; 0 where there are none."""
+        """The mean point of each pixel's hits on hair `(P, 3)`, metres.
+
+        That of all pixels where there are none, a metre ahead of the camera where no pixel has any:
+        a light may be at 0.
+        """
         weight = self.column("weight")
         total = np.einsum("pk,pki->pi", weight, self.column("point"))
         share = weight.sum(axis=1, keepdims=True)
-        return np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+        out = np.empty_like(total)
+        out[:] = self.camera.center + self.camera.R[2]
+        if share.any():
+            out[:] = total.sum(axis=0) / share.sum()
+        return np.divide(total, share, out=out, where=share > 0)
 
 
 def find_hits(

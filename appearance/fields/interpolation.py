@@ -240,14 +240,15 @@ class Relit:
         return lit, known
 
     def under_all(self, lights: Sequence[Light]) -> tuple[Floats, Floats]:
-        """`under` of all lights together: `(P, 3)`, and the largest part known `(P,)`."""
+        """`under` of all lights together: `(P, 3)`, and the least part known under any `(P,)`."""
         radiance = np.zeros((len(self.hits.pixels), 3), np.float32)
         known, start = np.zeros(len(radiance), np.float32), 0
         for part in self._parts():
             end = start + len(part.hits.pixels)
             lit, share = part._lit(lights)
             radiance[start:end] = lit.sum(axis=0)
-            known[start:end] = share.max(axis=0, initial=0)
+            # a light that is not known is missing from the sum
+            known[start:end] = share.min(axis=0) if len(lights) else 0
             start = end
         return radiance, known
 

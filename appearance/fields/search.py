@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from appearance.fields.interpolation import Interpolation, Source, turned, weighted
+from appearance.fields.interpolation import Interpolation, Source, irradiance, turned, weighted
 from appearance.fields.kajiya_kay import KajiyaKay
 from reconstruction import Light, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
@@ -85,16 +85,20 @@ def searched(
     """Try all of the grid: each of `lights` is left out and made of the others (Photobooth §4.2).
 
     The error is the greatest L2 over blocks of `BLOCK`² pixels: highlights cover few. In at most
-    `cameras` views, spread over those there are. Raises `ValueError` without lights to leave out.
+    `cameras` views, spread over those whose frame of the light shows something; a light without
+    such a frame is not left out. Raises `ValueError` without lights to leave out.
     """
     if not lights or len(interpolation.field.lights) < len(lights) + 2:
         raise ValueError(f"a search leaves lights out and needs others, got {list(lights)}")
-    count = len(interpolation.sources)
-    used = sorted({int((i + 0.5) * count / cameras) for i in range(cameras)})
+    judging = {light: _judging(interpolation, light, cameras) for light in lights}
+    lights = [light for light in lights if judging[light]]
+    if not lights:
+        raise ValueError(f"a search needs frames of the lights it leaves out, {list(judging)}")
     rest = interpolation.without(lights=lights)
     errors = np.zeros((len(lights), len(DIFFUSE), len(EXPONENT)))
     standard = np.zeros(len(lights))
     for i, light in enumerate(lights):
+        used = judging[light]
         for k, number in enumerate(used):
             judge = _Judge(interpolation, rest, number, light)
             standard[i] += judge.standard() / len(used)
@@ -103,6 +107,17 @@ def searched(
                 progress("searching the guide's parameters", done)
                 errors[i, :, j] += np.array(judge.errors(exponent)) / len(used)
     return Search(tuple(lights), errors, standard)
+
+
+def _judging(interpolation: Interpolation, light: str, most: int) -> list[int]:
+    """At most so many of the sources in which a light shows something, by their numbers."""
+    number = np.array([[x.name for x in interpolation.field.lights].index(light)])
+    there = [
+        k
+        for k, source in enumerate(interpolation.sources)
+        if np.nanmax(source.view.under(number), initial=0) > 0
+    ]
+    return sorted({there[int((i + 0.5) * len(there) / most)] for i in range(most) if there})
 
 
 class _Judge:
@@ -167,8 +182,9 @@ def refined(interpolation: Interpolation, progress: Progress = silent) -> Interp
     """Every camera's strands turned to what its samples agree with best (Photobooth §4.2).
 
     Each pixel is tried with its tangents turned towards `CANDIDATES` directions within
-    `WITHIN_DEG`: the turn counts whose model is most like the samples over `_LIGHTS` lights, by the
-    cosine of the angle between the two as vectors. Raises `ValueError` without a model.
+    `WITHIN_DEG`: the turn counts whose model is most like the samples over irradiance, of `_LIGHTS`
+    lights, by the cosine of the angle between the two as vectors, over the samples that are known.
+    Raises `ValueError` without a model.
     """
     if interpolation.model is None:
         raise ValueError("turning strands needs a model to compare with the samples")
@@ -198,10 +214,13 @@ def _best_turns(source: Source, model: KajiyaKay, lights: Sequence[Light], pixel
     toward = np.stack([lights[k].position for k in few])[:, None] - point
     toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
     sample = source.view.table[few][:, pixels].astype(np.float32).mean(axis=-1)
-    sample = np.where(np.isfinite(sample), sample, 0)
+    given = np.stack([irradiance(lights[k], point).mean(axis=-1) for k in few])
+    known = np.isfinite(sample) & (given > 0)
+    sample = np.divide(sample, given, out=np.zeros_like(sample), where=known)
     found, best = np.zeros((len(pixels), 3), np.float32), np.full(len(pixels), -np.inf)
     for turn in _candidates(tangent):
         guide = model(turned(turn, tangent), away.astype(np.float32), toward.astype(np.float32))
+        guide = np.where(known, guide, 0)
         like = (sample * guide).sum(axis=0) / np.maximum(np.linalg.norm(guide, axis=0), 1e-12)
         better = like > best
         found[better], best[better] = turn[better], like[better]

@@ -19,6 +19,7 @@ from appearance.metrics.scores import srgb
 from appearance.render.pixel_field import PixelField
 from reconstruction import Progress
 from reconstruction.arrays import Array, Floats
+from reconstruction.files.durable import writing
 
 GROUPS = ("new lights", "new views", "both new")
 _LEAST_LIGHTS = 4
@@ -166,8 +167,9 @@ def cross_validated(
 ) -> Verdict:
     """Fit to what each fold leaves, at ridges from the strongest on; judge by what it leaves out.
 
-    A fold's pictures are judged at the ridge that the other folds prefer, so that no picture has a
-    part in the field that it judges. Killed, it goes on behind the ridges that `checkpoint` has.
+    A fold's pictures are judged at the ridge that other pictures of the other folds prefer, so that
+    no picture has a part in the field that it judges. Killed, it goes on behind the ridges that
+    `checkpoint` has.
     """
     ridges = sorted(data.options.ridges, reverse=True)
     blocks = data.blocks(folds)
@@ -198,7 +200,7 @@ def cross_validated(
         state = _State(np.concatenate([state.squares, squares[None]]), found)
         state.save(checkpoint, data.fingerprint())
     best = _chosen(state.squares)
-    judged = np.stack([_elsewhere(state.squares, without, f) for f in range(folds.count)])
+    judged = np.stack([_elsewhere(state.squares, without, folds, f) for f in range(folds.count)])
     near = [x.reshape(len(x), -1, len(b)).sum(2) for x, b in zip(state.latest, blocks, strict=True)]
     start = np.asarray(sum(near) / folds.count, np.float32)
     tried = [(r, *_mean_gain(x, without)) for r, x in zip(ridges, state.squares, strict=False)]
@@ -282,13 +284,17 @@ def _chosen(candidates: Array) -> int:
     return best
 
 
-def _elsewhere(squares: Array, without: Array, fold: int) -> Array:
-    """A fold's errors `(V, L, G)` at the ridge that the others choose, which may be no field."""
-    others = np.arange(len(without)) != fold
-    if not others.any():
-        others[:] = True
+def _elsewhere(squares: Array, without: Array, folds: Folds, fold: int) -> Array:
+    """A fold's errors `(V, L, G)` at the ridge that the others choose, which may be no field.
+
+    They choose by pictures of views and lights that this fold does not leave out.
+    """
+    view, light = folds.parts(fold)
+    others = np.arange(folds.count) != fold
+    views, lights = np.array(folds.views) != view, np.array(folds.lights) != light
     candidates = np.concatenate([without[None], squares])
-    return np.asarray(candidates[_chosen(candidates[:, others])][fold])
+    elsewhere = candidates[:, others][:, :, views][:, :, :, lights]
+    return np.asarray(candidates[_chosen(elsewhere)][fold])
 
 
 def _validation(
@@ -317,10 +323,9 @@ class _State:
         if path is None:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.npz")
         latest: dict[str, Any] = {f"block_{k}": x for k, x in enumerate(self.latest)}
-        np.savez(part, fingerprint=np.array(fingerprint), squares=self.squares, **latest)
-        part.replace(path)
+        with writing(path) as part:
+            np.savez(part, fingerprint=np.array(fingerprint), squares=self.squares, **latest)
 
     @classmethod
     def load(cls, path: Path | None, fingerprint: str, none: Array) -> _State:

@@ -77,13 +77,13 @@ def solve_global_parameters(
 ) -> Solved:
     """`raw` and `gain (L,)` with the numbers called `names` solved for.
 
-    "sigma_a" moves all cells' logits alike in each channel; "gain" is the lights' intensities,
-    their mean kept at 1. What no pixel of the pairs depends on stays where it is: every estimate
-    has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Roughness is found
-    within `FOUND`; a narrower beta_n ends at up to 0.3. Hair that begins too bright in all channels
-    is darkened before anything else moves: a wide lobe would explain its picture as well. (Black
-    hair from a grey start: beta_m within 10 %, its index off by up to 0.15; with the index held,
-    beta_m 0.31 to 0.40 for 0.25.)
+    "sigma_a" moves all cells' logits alike in each channel; "gain" is the intensities of the pairs'
+    lights, their mean kept at 1. What no pixel of the pairs depends on stays where it is: every
+    estimate has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Roughness
+    is found within `FOUND`; a narrower beta_n ends at up to 0.3. Hair that begins too bright in all
+    channels is darkened before anything else moves: a wide lobe would explain its picture as well.
+    (Black hair from a grey start: beta_m within 10 %, its index off by up to 0.15; with the index
+    held, beta_m 0.31 to 0.40 for 0.25.)
     Takes the time of five to sixteen pictures of twice `effort.spp` paths a pixel. Where a picture
     is not finite, it gives back what it got.
     """
@@ -109,7 +109,8 @@ def solve_global_parameters(
             return Solved(*given, system.left_open())
         for number, d in zip(numbers, step * system.wide, strict=True):
             raw, gain = _moved(raw, gain, number, d)
-        gain = gain / np.exp(np.log(gain).mean())
+        if "gain" in names:
+            gain[lights] /= np.exp(np.log(gain[lights]).mean())
         away += step
         if np.abs(away[system.bends]).max(initial=0) >= 1:
             away, estimates = np.zeros(len(numbers)), []

@@ -283,8 +283,8 @@ class FitProblem:
     def spread(self, pairs: Pairs, views: int, images: int) -> list[Batch]:
         """Some views and lights, spread evenly over what is used."""
         usable = np.flatnonzero(pairs.used.any(axis=1))
-        out = []
-        for view in usable[:: max(1, len(usable) // views)][:views]:
+        count, out = min(views, len(usable)), []
+        for view in usable[[int((i + 0.5) * len(usable) / count) for i in range(count)]]:
             lights = np.flatnonzero(pairs.used[view])
             lights = lights[:: max(1, -(-len(lights) // images))]
             out.append(Batch(int(view), lights, np.ones(len(lights))))

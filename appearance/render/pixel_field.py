@@ -27,9 +27,9 @@ class PixelField:
     - `additive`: the contribution plus a times the light's irradiance at the pixel's point; where
       `alone`, that without the path tracer's
 
-    `points (P, 3)` in metres are what near lights are seen from. Pixels whose points are 0 are off
-    the hair, and have coefficients of 0. Coefficients `(P, n, 3 · F)` are those of F fields, each
-    channel's side by side; `lit` shows all of them.
+    `points (P, 3)` in metres are what near lights are seen from. Pixels off the hair have
+    coefficients of 0. Coefficients `(P, n, 3 · F)` are those of F fields, each channel's side by
+    side; `lit` shows all of them.
     """
 
     coefficients: Floats

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from reconstruction import Rig
 from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.files.durable import replace_durably
 from simulators.frames.responses import Responder, Response
 from simulators.peers.projector_controller import Show
 
@@ -200,7 +201,7 @@ def _store(file: Path, response: Response) -> None:
     temporary = file.with_name(f"{file.stem}.{os.getpid()}.part")
     with temporary.open("wb") as out:
         np.savez(out, pixels=response.pixels, images=response.images)
-    temporary.replace(file)
+    replace_durably(temporary, file)
 
 
 def _kept(store: OrderedDict[Any, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:

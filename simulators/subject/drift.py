@@ -21,8 +21,10 @@ class Drift:
     """
 
     def __init__(self, poses: int, reach: float, seed: int) -> None:
-        if poses < 1 or reach < 0:
-            raise ValueError(f"drift needs poses >= 1 and reach >= 0, got {poses} and {reach}")
+        if poses < 1 or not 0 <= reach < np.inf:
+            raise ValueError(
+                f"drift needs poses >= 1 and a finite reach >= 0 m, got {poses} and {reach}"
+            )
         rng = np.random.default_rng([seed, 0xD21F7])
         steps = rng.normal(size=(max(poses, 2), 6))
         walk = gaussian_filter1d(np.cumsum(steps, axis=0), 1.0, axis=0)

@@ -62,6 +62,9 @@ def test_the_command_says_when_it_is_ready_and_ends_on_sigterm(rig_file, tmp_pat
     [
         (["--subject", "afro", "--state", "s"], "no subject 'afro'"),
         (["--state", "s", "--faults", "none.json"], "none.json"),
+        (["--state", "x", "--seed", "-1"], "--seed must be at least 0, got -1"),
+        (["--truth-only", "x", "--drift-mm", "nan"], "got 1 and nan"),
+        (["--truth-only", "x", "--drift-mm", "inf"], "got 1 and inf"),
         ([], "--state FOLDER is required"),
     ],
 )

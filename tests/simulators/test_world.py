@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
+from reconstruction.files import durable
 from simulators.frames.frames import FrameMaker, Sensor, Snapshot, renderer_digest
 from simulators.frames.responses import Response
 from simulators.peers.faults import Faults
@@ -147,6 +148,17 @@ def test_responses_are_rendered_once_and_old_poses_go(frames):
         ("sweep", 2),
         ("sweep", 0),
     ]
+
+
+def test_the_cache_is_on_the_disk_before_it_counts(tiny_rig, tmp_path, monkeypatch):
+    def full(path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(durable, "flush", full)
+    frames = FrameMaker(tiny_rig, Counting(), Sensor(), 0, tmp_path / "cache", "one")
+    with pytest.raises(OSError, match="No space left"):
+        value(frames, shot((0, 1, 0, 0, 0)))
+    assert list((tmp_path / "cache").glob("*.npz")) == []
 
 
 def test_the_cache_on_disk_depends_on_its_key(tiny_rig, tmp_path):

@@ -154,6 +154,25 @@ def test_search_warns_where_standard_interpolation_is_as_good(planted):
     assert any("standard interpolation" in w for w in stage.warnings)
 
 
+def test_search_is_judged_by_frames_that_are_there(planted):
+    """A frame that did not come is no picture without an error: other cameras' frames say."""
+    whole = replace(planted, sources=planted.sources[:2])
+    source = whole.sources[1]
+    table = source.view.table.copy()
+    table[9] = np.nan
+    lost = replace(source, view=replace(source.view, table=table))
+    found = searched(replace(whole, sources=(whole.sources[0], lost)), ["l9", "l20"])
+    alone = searched(replace(whole, sources=whole.sources[:1]), ["l9", "l20"])
+    both = searched(whole, ["l9", "l20"])
+    np.testing.assert_allclose(found.errors[0], alone.errors[0])
+    np.testing.assert_allclose(found.errors[1], both.errors[1])
+    assert found.standard[0] == pytest.approx(alone.standard[0])
+    nowhere = replace(whole, sources=(lost,))
+    assert searched(nowhere, ["l9", "l20"]).lights == ("l20",)
+    with pytest.raises(ValueError, match="l9"):
+        searched(nowhere, ["l9"])
+
+
 def test_search_and_pictures_are_of_one_mind(planted):
     """The search's fast sums against the pictures themselves."""
     one = replace(planted, sources=planted.sources[:1])
@@ -167,23 +186,54 @@ def test_search_and_pictures_are_of_one_mind(planted):
     assert found.errors[0, 2, 5] == pytest.approx(expected, rel=0.02)
 
 
-def test_turned_strands_are_turned_back(planted):
-    """Frames of tangents that are off by 8 degrees: refining finds much of the way to them."""
-    source, lights = planted.sources[1], planted.field.lights
+def turn_errors(planted, lights, broken=lambda table: table):
+    """Mean angles to tangents that are off by 8 degrees, before and after refining, in degrees.
+
+    Frames under `lights` in the places of the planted ones; `broken` takes samples away.
+    """
+    source = planted.sources[1]
     hits, axis = source.hits, np.array([0.0, 1.0, 0.0], np.float32)
     off = replace(hits, table=hits.table.copy())
     off.table["tangent"] = turned(np.radians(8) * axis, hits.column("tangent"))
-    table = np.stack([kajiya_kay_picture(off, x) for x in lights]).astype(np.float16)
+    table = broken(np.stack([kajiya_kay_picture(off, x) for x in lights]).astype(np.float16))
     source = replace(source, view=replace(source.view, table=table))
-    before = replace(planted, sources=(source,), model=TRUE)
-    after = refined(before)
+    field = replace(planted.field, lights=lights)
+    before = replace(planted, field=field, sources=(source,), model=TRUE)
     angles = []
-    for one in (before, after):
+    for one in (before, refined(before)):
         mine = turned(one.sources[0].turn[:, None], hits.column("tangent"))
         cosine = np.abs((mine * off.column("tangent")).sum(-1))[hits.column("weight") > 0]
         angles.append(np.degrees(np.arccos(np.clip(cosine, 0, 1))).mean())
-    assert angles[0] > 6
-    assert angles[1] < 0.6 * angles[0]
+    return angles
+
+
+def test_turned_strands_are_turned_back(planted):
+    """Refining finds much of the way to them."""
+    before, after = turn_errors(planted, planted.field.lights)
+    assert before > 6
+    assert after < 0.6 * before
+
+
+def test_how_bright_lights_are_does_not_turn_strands(planted):
+    """What a fibre reflects of a light says where it points, not what the light brings."""
+    rng = np.random.default_rng(0)
+    lights = tuple(
+        replace(x, intensity=x.intensity * np.exp(rng.normal(scale=1.2)))
+        for x in planted.field.lights
+    )
+    before, after = turn_errors(planted, lights)
+    assert after < 0.6 * before
+
+
+def test_saturated_highlights_do_not_turn_strands(planted):
+    """A sample that is not known is not black."""
+
+    def saturated(table):
+        bright = table.astype(float).mean(axis=-1)
+        return np.where((bright > np.quantile(bright, 0.85, axis=0))[..., None], np.nan, table)
+
+    before, after = turn_errors(planted, planted.field.lights, saturated)
+    assert after < 0.7 * before
 
 
 def test_a_place_that_no_camera_sees_is_told(planted, tuft):
@@ -213,6 +263,21 @@ def test_missing_and_saturated_samples_weigh_nothing(planted):
     assert (made[0, 5] == 0).all()
     rest = np.arange(len(truth)) != 5
     assert error(made[0][rest], truth[rest]) < 5e-3
+
+
+def test_under_all_lights_half_of_the_light_is_not_all_of_it(planted):
+    """A pixel that is saturated under one of two lights is not known, or its highlight is black."""
+    source, two = planted.sources[1], [planted.field.lights[k] for k in (9, 40)]
+    table = source.view.table.copy()
+    near, other = planted.neighbours(two)[0]
+    assert not set(near) & set(other)
+    table[near, 5] = np.nan
+    some = replace(planted, sources=(replace(source, view=replace(source.view, table=table)),))
+    whole, known = some.seen_by(source.hits).under_all(two)
+    assert known[5] == 0
+    truth = sum(kajiya_kay_picture(source.hits, x) for x in two)
+    assert error(whole[known > 0], truth[known > 0]) < 5e-3
+    assert (np.delete(known, 5) > 0).all()
 
 
 def test_black_frames_and_dark_lights(planted):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from appearance.inverse_rendering.batches import Batch, Comparison, Pairs
+from appearance.inverse_rendering.problem import FitProblem
 from appearance.observations import Observed
 from reconstruction import Camera, Light
 
@@ -64,3 +65,15 @@ def test_pairs_with_larger_errors_are_drawn_more_often_and_noise_counts_for_noth
     even = Pairs([view([1] * 4)], scale=1.0, weighted=False)
     even.squared_error = pairs.squared_error
     np.testing.assert_allclose(even.chance(), 0.25)
+
+
+@pytest.mark.parametrize(("cameras", "wanted"), [(5, 3), (4, 3), (8, 3), (7, 2), (2, 3)])
+def test_views_that_decide_are_spread_over_all_cameras(cameras, wanted):
+    """Cameras stand in order around the head: no gap between those taken is twice an even one."""
+    views = [view([1, 1]) for _ in range(cameras)]
+    pairs, problem = Pairs(views, 1.0), FitProblem(None, views, 1.0, np.ones(3))
+    taken = [b.view for b in problem.spread(pairs, wanted, 2)]
+    assert len(set(taken)) == len(taken) == min(wanted, cameras)
+    gaps = np.diff([*taken, taken[0] + cameras])
+    assert gaps.max() < 2 * cameras / len(taken)
+    assert gaps.max() - gaps.min() <= 1

@@ -9,7 +9,7 @@ import pytest
 
 from appearance import HairAppearance
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.batches import Pairs
+from appearance.inverse_rendering.batches import Batch, Pairs
 from appearance.inverse_rendering.global_parameters import Evidence, solve_global_parameters
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
@@ -97,6 +97,22 @@ def test_intensities_are_found_and_their_mean_is_kept(tufted):
     _, _, _, gain, _ = solve(problem, tufted.truth, (*COLOUR, "gain"), many)
     assert np.log(gain).mean() == pytest.approx(0, abs=1e-9)
     assert np.std(np.log(gain * off)) < 0.5 * np.std(np.log(off))
+
+
+def test_lights_that_no_picture_is_of_stay_calibrated(plain, tufted):
+    """Half of the lights are in the pairs, one of them 20 % stronger than its calibration."""
+    stronger = [replace(o, radiance=o.radiance.copy()) for o in plain.views]
+    for o in stronger:
+        o.radiance[0] *= 1.2
+    problem = FitProblem(plain.mapped, stronger, plain.scale, plain.skin)
+    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
+    pairs = [Batch(view, np.array([0, 2, 4, 6]), np.ones(4)) for view in (0, 1)]
+    _, gain, _ = solve_global_parameters(
+        problem, raw, np.ones(8), ("gain",), Evidence(pairs, replace(EFFORT, spp=16))
+    )
+    assert gain[0] > 1
+    assert (gain[1::2] == 1).all()
+    assert np.log(gain).mean() == pytest.approx(0, abs=1e-9)
 
 
 def test_only_what_is_named_moves(plain, tufted):
