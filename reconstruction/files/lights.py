@@ -165,9 +165,10 @@ def _named_row(row: dict[str, str], path: Path) -> dict[str, Any]:
     return out
 
 
-def _fraction(word: str) -> bool:
+def _no_name(word: str) -> bool:
+    """Whether a word is a number that nobody would call a light by: a fraction, or below 0."""
     try:
-        return not float(word).is_integer()
+        return not float(word).is_integer() or word.startswith("-")
     except (ValueError, OverflowError):
         return False
 
@@ -176,7 +177,7 @@ def _row(words: list[str], path: Path, line: int) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if len(words) in (4, 7):
         name = words[0].strip()
-        if len(words) == 4 and _fraction(name):
+        if len(words) == 4 and _no_name(name):
             raise LightFileError(
                 f"{path}: row {line} begins with {name}: a light's name, or x before an intensity? "
                 "Name the columns in a first line: x, y, z, intensity"
