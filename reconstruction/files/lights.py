@@ -65,7 +65,14 @@ def read_lights(path: str | Path) -> LightFile:
     names = [light.name for light in lights]
     if twice := {n for n in names if names.count(n) > 1}:
         raise LightFileError(f"{path}: two lights are called {sorted(twice)[0]!r}")
-    if not any("intensity" in entry for entry in entries):
+    told = ["intensity" in entry for entry in entries]
+    if any(told) and not all(told):
+        i = told.index(False)
+        raise LightFileError(
+            f"{path}: light {i + 1} ({lights[i].name}) has no intensity, others have: give all of "
+            "them one, or none"
+        )
+    if not any(told):
         notes.append(
             "nothing is known of the lights' intensities: all are 1, radiance is in relative units"
         )
