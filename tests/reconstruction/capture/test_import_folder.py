@@ -118,6 +118,16 @@ def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
             lambda d: d["cameras"][0].update(center=[0, 0, 1]),
             r"cameras\[0\]\.center: .* is not -Rᵀt",
         ),
+        (  # MATLAB's IntrinsicMatrix
+            "cameras.json",
+            lambda d: d["cameras"][0].update(K=[[50, 0, 0], [0, 50, 0], [3.5, 2.5, 1]]),
+            r"cameras\[0\]: cam_00: K must be .* is it transposed",
+        ),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(K=[[100, 0, 7], [0, 100, 5], [0, 0, 2]]),
+            r"cameras\[0\]: cam_00: K must be .* or scaled",
+        ),
         ("cameras.json", lambda d: d["cameras"][1].update(id=0), r"cameras\[1\]\.id: 0 is there"),
         (
             "cameras.json",
