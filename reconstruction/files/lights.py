@@ -94,8 +94,12 @@ def _light(entry: dict[str, Any], i: int, where: str) -> Light:
     position = _three(entry.get("position"), f"{where} ({name}): position")
     intensity = _three(entry.get("intensity", 1.0), f"{where} ({name}): intensity", spread=True)
     beside = entry.get("colocated_camera")
+    if not isinstance(beside, str | None):
+        raise LightFileError(
+            f"{where} ({name}): colocated_camera: expected a camera's name, got {beside!r}"
+        )
     try:
-        return Light(name, position, intensity, beside if isinstance(beside, str) else None)
+        return Light(name, position, intensity, beside)
     except ValueError as error:
         raise LightFileError(f"{where}: {error}") from error
 

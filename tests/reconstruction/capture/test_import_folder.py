@@ -258,6 +258,24 @@ def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
     assert capture.olat("left")[0][:, 0, 0, 0].tolist() == [10, 11]
 
 
+@pytest.mark.parametrize(
+    ("beside", "says"),
+    [("left", ""), ("rihgt", "no camera 'rihgt'; there are cam_00, left"), (1, "name, got 1")],
+)
+def test_the_camera_that_a_light_of_others_is_beside(folder: Path, beside, says: str) -> None:
+    cameras, lights = folder / "stage.json", folder / "lamps.json"
+    lens = {"K": [[50, 0, 3.5], [0, 50, 2.5], [0, 0, 1]], "width": 8, "height": 6, "T": [0, 0, 1]}
+    turned = {**lens, "R": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]}
+    cameras.write_text(json.dumps({"cam_00": {**lens, "R": np.eye(3).tolist()}, "left": turned}))
+    lights.write_text(json.dumps([{"position": [0, -1, 0], "colocated_camera": beside}]))
+    files = GeometryFiles(cameras=cameras, lights=lights, placement=PlacementOptions(up="-y"))
+    if not says:
+        assert [light.beside for light in read_geometry(files).lights] == ["left"]
+        return
+    with pytest.raises(ValueError, match=rf"lamps\.json: .*light_000.*colocated_camera.*{says}"):
+        read_geometry(files)
+
+
 def test_never_writes_over_something(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="new or empty"):
         import_folder(folder, tmp_path)
