@@ -29,7 +29,8 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
     By camera: `reprojection_px`, mean and largest over a head-sized ball of points; `centre_mm`;
     `turn_deg`. By projector: the rows' error over the same points, `plane_mm` what that is where
     they are, `axis_mm` and `along_axis_mm` of its centre across and along its x axis, `turn_deg`.
-    By light: `position` over its distance from the origin, `direction_deg`, `intensity` relative.
+    By light: `position` over its distance from the origin, `direction_deg`, `intensity`, the
+    channel that is furthest off, over the brightest of the true light.
     Devices are matched by name; raises `KeyError` for one that `truth` lacks.
     """
     ball, found = _ball(), aligned(found, truth)
@@ -48,11 +49,11 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
         place, real = light.position, truth.light(light.name)
         distance = float(np.linalg.norm(real.position))
         cosine = place @ real.position / (np.linalg.norm(place) * distance)
-        strength = light.intensity.mean() / max(float(real.intensity.mean()), 1e-300)
+        strength = np.abs(light.intensity - real.intensity) / max(real.intensity.max(), 1e-300)
         lights[light.name] = {
             "position": float(np.linalg.norm(place - real.position) / distance),
             "direction_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-            "intensity": float(abs(strength - 1)),
+            "intensity": float(strength.max()),
         }
     return {"cameras": cameras, "projectors": projectors, "lights": lights}
 

@@ -112,6 +112,13 @@ def _lights(
     files: GeometryFiles, directions: bool, lights: list[Light], cameras: list[Camera]
 ) -> tuple[list[Light], list[str]]:
     where = files.placement
+    names = [c.name for c in cameras]
+    for light in lights:
+        if light.beside is not None and light.beside not in names:
+            raise PlacementError(
+                f"{files.lights}: {light.name}: colocated_camera: there is no camera "
+                f"{light.beside!r}; there are {', '.join(names)}"
+            )
     if files.light_distance is not None:
         if not directions:
             raise PlacementError(

@@ -65,7 +65,14 @@ def read_lights(path: str | Path) -> LightFile:
     names = [light.name for light in lights]
     if twice := {n for n in names if names.count(n) > 1}:
         raise LightFileError(f"{path}: two lights are called {sorted(twice)[0]!r}")
-    if not any("intensity" in entry for entry in entries):
+    told = ["intensity" in entry for entry in entries]
+    if any(told) and not all(told):
+        i = told.index(False)
+        raise LightFileError(
+            f"{path}: light {i + 1} ({lights[i].name}) has no intensity, others have: give all of "
+            "them one, or none"
+        )
+    if not any(told):
         notes.append(
             "nothing is known of the lights' intensities: all are 1, radiance is in relative units"
         )
@@ -87,8 +94,12 @@ def _light(entry: dict[str, Any], i: int, where: str) -> Light:
     position = _three(entry.get("position"), f"{where} ({name}): position")
     intensity = _three(entry.get("intensity", 1.0), f"{where} ({name}): intensity", spread=True)
     beside = entry.get("colocated_camera")
+    if not isinstance(beside, str | None):
+        raise LightFileError(
+            f"{where} ({name}): colocated_camera: expected a camera's name, got {beside!r}"
+        )
     try:
-        return Light(name, position, intensity, beside if isinstance(beside, str) else None)
+        return Light(name, position, intensity, beside)
     except ValueError as error:
         raise LightFileError(f"{where}: {error}") from error
 
@@ -165,9 +176,10 @@ def _named_row(row: dict[str, str], path: Path) -> dict[str, Any]:
     return out
 
 
-def _fraction(word: str) -> bool:
+def _no_name(word: str) -> bool:
+    """Whether a word is a number that nobody would call a light by: a fraction, or below 0."""
     try:
-        return not float(word).is_integer()
+        return not float(word).is_integer() or word.startswith("-")
     except (ValueError, OverflowError):
         return False
 
@@ -176,7 +188,7 @@ def _row(words: list[str], path: Path, line: int) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if len(words) in (4, 7):
         name = words[0].strip()
-        if len(words) == 4 and _fraction(name):
+        if len(words) == 4 and _no_name(name):
             raise LightFileError(
                 f"{path}: row {line} begins with {name}: a light's name, or x before an intensity? "
                 "Name the columns in a first line: x, y, z, intensity"

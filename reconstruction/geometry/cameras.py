@@ -54,6 +54,11 @@ class Pinhole:
             raise ValueError(f"{self.name}: size must be positive, got {self.width}x{self.height}")
         if not np.allclose(self.R @ self.R.T, np.eye(3), atol=1e-6) or np.linalg.det(self.R) < 0:
             raise ValueError(f"{self.name}: R is not a rotation")
+        if self.K[1, 0] or self.K[2, :2].any() or self.K[2, 2] != 1:
+            raise ValueError(
+                f"{self.name}: K must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], got "
+                f"{self.K.tolist()}: is it transposed, as MATLAB's is, or scaled?"
+            )
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise ValueError(f"{self.name}: focal lengths must be positive, got {self.K}")
 

@@ -56,8 +56,11 @@ class Light:
             object.__setattr__(self, "size", size)
         if self.orientation is not None:
             R = np.array(self.orientation, dtype=np.float64)
-            if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6):
-                raise ValueError(f"{self.name}: orientation must be a rotation (3, 3), got {R}")
+            turns = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+            if not turns or np.linalg.det(R) < 0:
+                raise ValueError(
+                    f"{self.name}: orientation must be a rotation (3, 3), no mirror, got {R}"
+                )
             object.__setattr__(self, "orientation", R)
         elif self.profile is not None or self.size is not None:
             raise ValueError(f"{self.name}: a light with a profile or a size needs an aim")

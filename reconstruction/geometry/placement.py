@@ -123,12 +123,15 @@ class Sight:
     `point (3,)` is nearest to all lines through the pictures' centres, `distance (N,)` how far it
     is from each camera, `seen (N,)` whether it is in front of that and on its picture, or at most
     half a picture beside it. `diversity` is 0 where all look the same way, 1 from all around.
+    `astray` is the median angle by which cameras look past the point, over that between a camera's
+    way to look and their mean: small where they turn to one point, about 1 where by chance.
     """
 
     point: Array
     distance: Array
     seen: Bools
     diversity: float
+    astray: float
 
     @property
     def whole(self) -> bool:
@@ -155,7 +158,11 @@ class Sight:
             beside = np.abs(pixel / (camera.width, camera.height) - 0.5)
             seen.append(bool(depth > 0 and (beside < 1).all()))
         distance = np.linalg.norm(centers - point, axis=1)
-        return cls(point, distance, np.array(seen), 1 - float(np.linalg.norm(axes.mean(axis=0))))
+        along = np.einsum("ni,ni->n", axes, point - centers)
+        past = np.median(np.abs(np.arctan2(np.sqrt(np.maximum(distance**2 - along**2, 0)), along)))
+        diversity = 1 - float(np.linalg.norm(axes.mean(axis=0)))
+        astray = float(past) / max(float(np.arccos(1 - diversity)), 1e-12)
+        return cls(point, distance, np.array(seen), diversity, astray)
 
 
 def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: str) -> list[str]:
@@ -169,11 +176,10 @@ def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: st
     sight = Sight.of(cameras)
     for told, reading in _misreadings(cameras, options.camera_axes or axes).items():
         other = _sight(reading)
-        if (
-            other is not None
-            and other.whole
-            and (not sight.whole or sight.diversity < 0.5 * other.diversity)
-        ):
+        if other is None or not other.whole:
+            continue
+        closer = sight.diversity < 0.5 * other.diversity and other.astray < sight.astray
+        if closer or not sight.whole:
             raise PlacementError(f"the cameras do not look at anything together, but do {told}")
     if not sight.whole:
         raise PlacementError(_elsewhere(cameras, sight))
@@ -252,7 +258,8 @@ def _misreadings(cameras: Sequence[Camera], read: str) -> dict[str, list[Camera]
     """How the cameras would stand had their file been read in another way, by what to do then.
 
     Read the other way round, cameras that look at one point end up in one place and look the same
-    way: the reading in which they look from the most sides is the right one.
+    way: the reading in which they look from the most sides is the right one, if they look at one
+    point there at all. Where the origin is elsewhere, a wrong reading may show all kinds of ways.
     """
     other = "opencv" if read == "opengl" else "opengl"
     inverse = "the file gives camera-to-world where world-to-camera is asked for (or the reverse)"

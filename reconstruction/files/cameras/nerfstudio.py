@@ -1,7 +1,8 @@
 """`transforms.json` as nerfstudio, Instant NGP and Blender's NeRF scenes write it.
 
 `transform_matrix` takes the camera to the world, x right, y up, z backwards; the corner of the
-top-left pixel is at (0, 0) (docs.nerf.studio, "Data conventions", and its ray generator).
+top-left pixel is at (0, 0) (docs.nerf.studio, "Data conventions", its ray generator and
+`camera_utils._compute_residual_and_jacobian`).
 """
 
 from __future__ import annotations
@@ -129,12 +130,20 @@ def _camera(
     K = pinhole_K(
         fx, fy, _number(fields, "cx", where, width / 2), _number(fields, "cy", where, height / 2)
     )
-    order = (
-        ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    )
-    lens = LensModel(
-        "fisheye" if fisheye else "opencv",
-        np.array([_number(fields, k, where, 0.0) for k in order]),
-    )
+    lens = _lens(fields, fisheye, where)
     R = _TO_OPENCV @ matrix[:, :3].T
     return camera_of(where, name, size, K, (R, -R @ matrix[:, 3]), lens)
+
+
+def _lens(fields: dict[str, Any], fisheye: bool, where: str) -> LensModel:
+    """nerfstudio's k4 goes with r⁸, as Metashape's does, whose p1 and p2 are exchanged; beside k5
+    or k6 it is OpenCV's, as of COLMAP's FULL_OPENCV."""
+
+    def numbers(*names: str) -> Array:
+        return np.array([_number(fields, k, where, 0.0) for k in names])
+
+    if fisheye:
+        return LensModel("fisheye", numbers(*_FISHEYE))
+    if numbers("k5", "k6").any():
+        return LensModel("opencv", numbers(*_OPENCV, "k4", "k5", "k6"))
+    return LensModel("metashape", numbers("k1", "k2", "k3", "k4", "p2", "p1"))

@@ -124,6 +124,15 @@ def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None
         compare_rigs(true_rig, part)
 
 
+def test_a_light_of_another_colour_is_off_by_its_channels(true_rig: Rig) -> None:
+    """Red a fifth too bright, blue as much too dim: to the mean it is as bright as the true one."""
+    first, *others = true_rig.lights
+    tinted = replace(first, intensity=[9.6, 9.0, 5.4])  # of 8, 9, 7
+    errors = compare_rigs(replace(true_rig, lights=(tinted, *others)), true_rig)["lights"]
+    assert errors.pop(first.name)["intensity"] == pytest.approx(1.6 / 9)
+    assert max(x["intensity"] for x in errors.values()) == 0
+
+
 def test_a_device_that_the_truth_lacks_is_told_before_the_work(
     tmp_path: Path,
     true_rig: Rig,

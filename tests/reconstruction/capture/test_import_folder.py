@@ -118,6 +118,16 @@ def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
             lambda d: d["cameras"][0].update(center=[0, 0, 1]),
             r"cameras\[0\]\.center: .* is not -Rᵀt",
         ),
+        (  # MATLAB's IntrinsicMatrix
+            "cameras.json",
+            lambda d: d["cameras"][0].update(K=[[50, 0, 0], [0, 50, 0], [3.5, 2.5, 1]]),
+            r"cameras\[0\]: cam_00: K must be .* is it transposed",
+        ),
+        (
+            "cameras.json",
+            lambda d: d["cameras"][0].update(K=[[100, 0, 7], [0, 100, 5], [0, 0, 2]]),
+            r"cameras\[0\]: cam_00: K must be .* or scaled",
+        ),
         ("cameras.json", lambda d: d["cameras"][1].update(id=0), r"cameras\[1\]\.id: 0 is there"),
         (
             "cameras.json",
@@ -246,6 +256,24 @@ def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
     assert np.linalg.norm(point) < 0.02
     assert above.intensity.tolist() == [1, 1, 1]
     assert capture.olat("left")[0][:, 0, 0, 0].tolist() == [10, 11]
+
+
+@pytest.mark.parametrize(
+    ("beside", "says"),
+    [("left", ""), ("rihgt", "no camera 'rihgt'; there are cam_00, left"), (1, "name, got 1")],
+)
+def test_the_camera_that_a_light_of_others_is_beside(folder: Path, beside, says: str) -> None:
+    cameras, lights = folder / "stage.json", folder / "lamps.json"
+    lens = {"K": [[50, 0, 3.5], [0, 50, 2.5], [0, 0, 1]], "width": 8, "height": 6, "T": [0, 0, 1]}
+    turned = {**lens, "R": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]}
+    cameras.write_text(json.dumps({"cam_00": {**lens, "R": np.eye(3).tolist()}, "left": turned}))
+    lights.write_text(json.dumps([{"position": [0, -1, 0], "colocated_camera": beside}]))
+    files = GeometryFiles(cameras=cameras, lights=lights, placement=PlacementOptions(up="-y"))
+    if not says:
+        assert [light.beside for light in read_geometry(files).lights] == ["left"]
+        return
+    with pytest.raises(ValueError, match=rf"lamps\.json: .*light_000.*colocated_camera.*{says}"):
+        read_geometry(files)
 
 
 def test_never_writes_over_something(folder: Path, tmp_path: Path) -> None:

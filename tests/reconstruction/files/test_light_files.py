@@ -36,3 +36,20 @@ def test_four_numbers_are_a_name_and_a_place_only_where_the_first_may_be_a_name(
     path.write_text("0.5 1.0 1.2 300\n")
     with pytest.raises(LightFileError, match=r"row 1 begins with 0.5: .*x, y, z, intensity"):
         read_lights(path)
+    path.write_text("-812 1500 300 2\n-500 1400 200 2\n")  # whole millimetres
+    with pytest.raises(LightFileError, match=r"row 1 begins with -812: .*x, y, z, intensity"):
+        read_lights(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("lights.csv", "name,x,y,z,intensity\nkey,1,0,1,7\nfill,0,1,1,\n"),
+        ("lights.json", '{"key": {"position": [1, 0, 1], "intensity": 7}, "fill": [0, 1, 1]}'),
+    ],
+)
+def test_a_light_without_an_intensity_beside_others_with_one_is_named(tmp_path, name, text) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(LightFileError, match=r"light 2 \(fill\) has no intensity, others have"):
+        read_lights(path)

@@ -75,6 +75,20 @@ def test_a_wrong_unit_is_named(unit: float, name: str, far: str) -> None:
     assert check(in_world(stage(), np.eye(3), 0.3), unit=0.3)
 
 
+@pytest.mark.parametrize("height", [-1.5, -1.2, 0.0, 1.0])
+def test_a_good_stage_passes_wherever_its_origin_is(height: float) -> None:
+    """Eight cameras before a face, two upright and two on their side by turns. With the origin on
+    the floor they were taken for camera-to-world poses."""
+    head, cameras = np.array([0, 0, -height]), []
+    for i, azimuth in enumerate(np.radians(np.linspace(-40, 40, 8))):
+        rise, roll = np.radians(20 * (i % 2)), 90 * (i // 2 % 2)
+        level = np.cos(rise) * np.array([np.sin(azimuth), -np.cos(azimuth)])
+        place = head + np.append(level, np.sin(rise))
+        cameras.append(Camera.look_at(f"cam_{i}", 1400, 1000, place, head, 25, roll))
+    (note,) = check(cameras, up="z")
+    assert note.startswith("cameras stand 1.00 m")
+
+
 def test_a_world_with_y_up_is_named() -> None:
     others = in_world(stage(), Y_UP, 1.0)
     with pytest.raises(PlacementError, match=r"upright to the axis y .* give --up y "):

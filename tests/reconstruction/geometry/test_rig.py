@@ -183,6 +183,14 @@ def test_errors_name_file_table_and_field(tmp_path, old, new, names):
     assert names in str(error.value)
 
 
+def test_a_light_whose_rows_are_right_up_forward_is_refused():
+    """Its profile would shine upside down: rows are right, down, forward, as of cameras."""
+    right, down, forward = np.eye(3)
+    Light("spot", (0, 0, 1), (1, 1, 1), orientation=np.array([right, down, forward]))
+    with pytest.raises(ValueError, match=r"spot: orientation must be a rotation .* no mirror"):
+        Light("spot", (0, 0, 1), (1, 1, 1), orientation=np.array([right, -down, forward]))
+
+
 def test_a_rig_without_cameras_is_refused(tmp_path):
     path = tmp_path / "rig.json"
     path.write_text("{}")
