@@ -18,8 +18,9 @@ from reconstruction.files.durable import writing
 class State:
     """Where a fit stands. `average` is the running mean of `raw` that is validated and returned.
 
-    `first` is what the steps began with. `tables` are the pairs' estimated
-    `squared_error (V, L)` and the lights' `gain (L,)`.
+    `first` is what the steps began with, behind so many `pieces` that need no gradient, which left
+    numbers `left_open`. `tables` are the pairs' estimated `squared_error (V, L)` and the lights'
+    `gain (L,)`.
     """
 
     raw: Raw
@@ -27,6 +28,8 @@ class State:
     first: Raw
     descent: Adam = field(default_factory=Adam)
     convergence: Convergence = field(default_factory=Convergence)
+    pieces: int = 0
+    left_open: dict[str, float] = field(default_factory=dict)
     step: int = 0
     level_began: int = 0
     history: list[list[float]] = field(default_factory=list)
@@ -48,6 +51,8 @@ class State:
             "fingerprint": fingerprint,
             "count": self.descent.count,
             "convergence": asdict(self.convergence),
+            "pieces": self.pieces,
+            "left_open": self.left_open,
             "step": self.step,
             "level_began": self.level_began,
             "history": self.history,
@@ -69,8 +74,8 @@ class State:
                 kind, _, name = key.partition("/")
                 if name:
                     state._tables()[kind][name] = data[key]
-        state.step, state.level_began = numbers["step"], numbers["level_began"]
-        state.history = numbers["history"]
+        for name in ("pieces", "left_open", "step", "level_began", "history"):
+            setattr(state, name, numbers[name])
         return state
 
     def _tables(self) -> dict[str, Raw]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ class Outcome:
     of the hair in which the best of what was found is better than the start (bootstrap): below
     `SURE`, maps and lights are the start's, and `refused` is what was found. `history` holds
     (seconds, step, validation error). `left_open`: see `global_parameters.Solved`; empty where no
-    number was solved for, or the fit went on from a checkpoint.
+    number was solved for.
     """
 
     maps: HairMaps
@@ -87,9 +87,10 @@ class Outcome:
 class Monitor:
     """Who follows a fit, and where it saves itself.
 
-    With a `checkpoint` file, a fit that was killed goes on where it last saved; a file of other
-    data or options is replaced. The file stays: whoever starts the fit removes it. `snapshot`
-    gets the CPU seconds so far, without validation, and the maps: as they come, and in the end.
+    With a `checkpoint` file, a fit that was killed goes on where it last saved: behind cells,
+    global parameters or correctives, then every few steps; a file of other data or options is
+    replaced. The file stays: whoever starts the fit removes it. `snapshot` gets the CPU seconds so
+    far, without validation, and the maps: as they come, and in the end.
     """
 
     progress: Progress = silent
@@ -115,6 +116,10 @@ def run(
     return _Fit(problem, maps, lights, options, monitor or Monitor(), seed).run()
 
 
+_Piece = Callable[[State, Progress], tuple[Raw, Array]]
+"""What comes of a state: unknowns, and factors on the lights' intensities."""
+
+
 class _Fit:
     def __init__(
         self,
@@ -138,7 +143,6 @@ class _Fit:
         self.pairs = Pairs(problem.views, problem.scale, weighted=options.residual_weighted)
         self.spread = problem.spread(self.pairs, options.validation_views, options.images)
         self.series: list[tuple[float, int, float]] = []
-        self.left_open: dict[str, float] = {}
 
     def run(self) -> Outcome:
         self.begun, self.worked = time.perf_counter(), time.process_time()
@@ -150,8 +154,7 @@ class _Fit:
         ended = "all steps taken" if self.free else "converged"
         while self.free and state.step < self.options.steps:
             if state.step % self.options.check_every == 0:
-                state.history = [list(p) for p in self.series]
-                state.save(self.monitor.checkpoint, self._fingerprint)
+                self._save(state)
                 share = 0.5 + 0.5 * state.step / self.options.steps
                 what = f"step {state.step}"
                 error = self._record(state.average, state.gain, what, share, state.step)
@@ -176,61 +179,89 @@ class _Fit:
         return error
 
     def _begun(self) -> State:
+        """The state with which steps begin; what a fit that was killed had done is in it."""
         state = State.load(self.monitor.checkpoint, self._fingerprint)
-        if state is not None:
+        if state is None:
+            raw = self._raw(self.start.resized(self._shape(self._level(0))))
+            state = State(raw, _copied(raw), _copied(raw))
+            state.tables = {"squared_error": self.pairs.squared_error, "gain": self.lights.gain}
+            state.convergence.halvings = self.options.halvings
+            if self._pieces:
+                self._record(raw, state.gain, "start", 0.0)
+        else:
             self.series = [(s, int(k), e) for s, k, e in state.history]
             self.begun -= self.series[-1][0] if self.series else 0.0
-            return state
-        raw, gain = self._first()
-        state = State(raw, _copied(raw), _copied(raw))
-        state.tables = {"squared_error": self.pairs.squared_error, "gain": gain}
-        state.convergence.halvings = self.options.halvings
+        for k in range(state.pieces, len(self._pieces)):
+            self._add_piece(state, k)
+            self._save(state)
         return state
 
-    def _first(self) -> tuple[Raw, Array]:
-        """What needs no gradient: cells, global parameters, and each again."""
+    def _save(self, state: State) -> None:
+        state.history = [list(point) for point in self.series]
+        state.save(self.monitor.checkpoint, self._fingerprint)
+
+    @cached_property
+    def _pieces(self) -> list[tuple[str, _Piece]]:
+        """What needs no gradient: cells, global parameters, and each again; correctives."""
         one_colour = self.start.shape == (1, 1, 1)
         cells = self.spatial and self.options.cell_start and one_colour
         # maps that differ from cell to cell come from a fit that has solved for all but the gains
         solves = self.solves if one_colour or "gain" in self.solves else []
-        gain = self.lights.gain
-        raw = self._raw(self.start.resized(self._shape(self._level(0))))
-        if cells or solves:
-            self._record(raw, gain, "start", 0.0)
+        out: list[tuple[str, _Piece]] = []
         if cells:
-            raw = self._coloured(raw, gain, 12, 0)
-        rounds = (_ALTERNATIONS if cells else 1) if solves else 0
-        for k in range(rounds):
+            out.append(("cells", partial(self._coloured, 12, 0)))
+        for k in range((_ALTERNATIONS if cells else 1) if solves else 0):
+            out.append(("global parameters", partial(self._solved, solves, k)))
             if cells:
-                self._record(raw, gain, "cells", 0.5 * k / rounds)
-
-            def progress(what: str, share: float, begun: int = k) -> None:
-                self.monitor.progress(what, 0.5 * (begun + share) / rounds)
-
-            evidence = Evidence(self.spread, self.options.effort, (self.seed << 4) + k)
-            raw, gain, self.left_open = solve_global_parameters(
-                self.problem, raw, gain, solves, evidence, progress
-            )
-            self._record(raw, gain, "global parameters", 0.5 * (k + 1) / rounds)
-            if cells:
-                raw = self._coloured(raw, gain, _MORE_ROUNDS, 1 + k)
+                out.append(("cells", partial(self._coloured, _MORE_ROUNDS, 1 + k)))
         if self.turns and not self.start.rotation.any():
-            effort, seed = self.options.effort, (self.seed << 4) + 15
-            before = self._record(raw, gain, "cells", 0.5)
-            turned = solve_correctives(self.problem, raw, gain, effort, seed=seed).raw
-            if self._record(turned, gain, "correctives", 0.5) < before:
-                raw = turned
+            out.append(("correctives", self._turned))
+        return out
+
+    def _add_piece(self, state: State, number: int) -> None:
+        what, piece = self._pieces[number]
+        count, before = len(self._pieces), self.series[-1][2]
+
+        def progress(what: str, share: float) -> None:
+            self.monitor.progress(what, 0.5 * (number + share) / count)
+
+        raw, gain = piece(state, progress)
+        error = self._record(raw, gain, what, 0.5 * (number + 1) / count)
+        if what != "correctives" or error < before:
+            state.raw, state.average, state.first = raw, _copied(raw), _copied(raw)
+            state.tables["gain"] = gain
+        state.pieces = number + 1
+
+    def _coloured(
+        self, rounds: int, number: int, state: State, progress: Progress
+    ) -> tuple[Raw, Array]:
+        effort, seed = self.options.effort, (self.seed << 4) + number
+        maps = absorption_of_cells(
+            self.problem, state.raw, state.gain, effort, rounds=rounds, seed=seed
+        )
+        return self._raw(maps), state.gain
+
+    def _solved(
+        self, names: Sequence[str], number: int, state: State, progress: Progress
+    ) -> tuple[Raw, Array]:
+        evidence = Evidence(self.spread, self.options.effort, (self.seed << 4) + number)
+        raw, gain, state.left_open = solve_global_parameters(
+            self.problem, state.raw, state.gain, names, evidence, progress
+        )
         return raw, gain
 
-    def _coloured(self, raw: Raw, gain: Array, rounds: int, number: int) -> Raw:
-        effort, seed = self.options.effort, (self.seed << 4) + number
-        maps = absorption_of_cells(self.problem, raw, gain, effort, rounds=rounds, seed=seed)
-        return self._raw(maps)
+    def _turned(self, state: State, progress: Progress) -> tuple[Raw, Array]:
+        effort, seed = self.options.effort, (self.seed << 4) + 15
+        return solve_correctives(
+            self.problem, state.raw, state.gain, effort, seed=seed
+        ).raw, state.gain
 
     @cached_property
     def _fingerprint(self) -> str:
         """Of everything that the course of a fit depends on."""
-        total = hashlib.sha256(repr((self.options, self.seed, self.problem.scale)).encode())
+        pieces = [what for what, _ in self._pieces]
+        course = (self.options, self.seed, self.problem.scale, pieces)
+        total = hashlib.sha256(repr(course).encode())
         arrays: list[NDArray[Any]] = [
             *self._raw(self.start).values(),
             self.lights.gain,
@@ -345,7 +376,7 @@ class _Fit:
         # in cells, though all alike: the next variant need not tell them apart again
         as_begun = self.start.resized(start["sigma_a"].shape[:3])
         told = Outcome(as_begun, self.lights, kept, begun, begun, state.step, self.series, sure)
-        told = replace(told, left_open=self.left_open)
+        told = replace(told, left_open=state.left_open)
         if sure < SURE:
             return replace(told, refused=Refused(maps, lights, errors[best]))
         return replace(told, maps=maps, lights=lights, ended=how, error=errors[best])

@@ -12,7 +12,7 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import loop
 from appearance.inverse_rendering.loop import Monitor, run
 from appearance.inverse_rendering.unknowns import LightDeviations
-from reconstruction import BadOptions, parse_options
+from reconstruction import BadOptions, parse_options, silent
 
 START = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.35))
 
@@ -91,6 +91,29 @@ def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_pa
         plain, START, options=replace(options, steps=1), seed=2, monitor=Monitor(checkpoint=file)
     )
     assert other.steps == 1
+
+
+@pytest.mark.parametrize(("variant", "left"), [("original", 0), ("correctives", 1)])
+def test_an_interrupted_fit_does_not_begin_again(plain, original, tmp_path, variant, left):
+    """Nearly all of its time goes into what comes before the first step, if there is one at all."""
+    options = replace(original, gauss_newton=True, variant=variant, shape=(2, 2, 2))
+    whole = run(plain, START, options=options, seed=1)
+    file, guesses, again = tmp_path / "fit.npz", [], []
+
+    def killed(seconds, maps):
+        guesses.append(maps)
+        if len(guesses) == len(whole.history) + 1 - left:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(plain, START, options=options, seed=1, monitor=Monitor(silent, file, killed))
+    monitor = Monitor(silent, file, lambda seconds, maps: again.append(maps))
+    resumed = run(plain, START, options=options, seed=1, monitor=monitor)
+    assert len(again) == left + 1
+    assert resumed.maps.sigma_a == pytest.approx(whole.maps.sigma_a, rel=1e-3)
+    assert resumed.maps.rotation == pytest.approx(whole.maps.rotation, abs=1e-3)
+    assert resumed.left_open == pytest.approx(whole.left_open, rel=1e-3)
+    assert len(resumed.history) == len(whole.history)
 
 
 def test_a_fit_from_the_truth_does_not_leave_it_for_noise(plain, tufted, original):
