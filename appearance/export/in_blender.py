@@ -103,8 +103,7 @@ def make_head(groom):
     mesh = bpy.data.meshes.new("head")
     mesh.from_pydata(groom["head_vertices"].tolist(), [], groom["head_faces"].tolist())
     if "head_uv" in groom:
-        corners = groom["head_uv"][groom["head_faces"].ravel()]
-        mesh.uv_layers.new(name="scalp").data.foreach_set("uv", corners.ravel())
+        mesh.uv_layers.new(name="scalp").data.foreach_set("uv", groom["head_uv"].ravel())
     material = bpy.data.materials.new("skin")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links

@@ -338,6 +338,23 @@ def test_blender_gets_arrays_and_a_script_that_python_reads(mapped, tmp_path):
     np.testing.assert_allclose(held["head_vertices"], mapped.head.vertices, atol=1e-7)
 
 
+def test_blender_finds_every_root_in_one_face_of_the_head(fitted, tmp_path):
+    """Its ReverseUVSampler takes none where triangles of several faces hold a place on the map."""
+    head, radius = fitted.head, np.ptp(fitted.head.vertices[:, 0]) / 2
+    x, y, z = (head.vertices - head.vertices.mean(axis=0)).T / radius
+    uv = np.where(z[:, None] > 0.2, 0.5 + 0.5 * np.stack([x, y], axis=-1), np.nan)
+    middles = uv[head.faces].mean(axis=1)
+    roots = middles[np.isfinite(middles).all(axis=1) & (head.face_areas() > 1e-9)]
+    assert 20 < len(roots) < len(head.faces) / 2
+    groom = replace(Groom.of(fitted, ExportOptions()), head_uv=uv)
+    _, arrays = export_blender(groom, tmp_path / "b")
+    corners = np.load(arrays)["head_uv"].reshape(len(head.faces), 3, 2).astype(float)
+    for place in roots * (1, -1) + (0, 1):  # v upwards there
+        edges, away = np.roll(corners, -1, axis=1) - corners, place - corners
+        side = edges[..., 0] * away[..., 1] - edges[..., 1] * away[..., 0]
+        assert ((side > 1e-9).all(axis=1) | (side < -1e-9).all(axis=1)).sum() == 1
+
+
 def test_options_that_cannot_be_are_refused():
     """5,000 cards, 64 a row of 256 pixels, are 20,224 pixels: graphics cards take 16,384."""
     several = {"strands": 0}, {"guides": -1}, {"cards": 0}, {"cards": 5000}, {"seed": -1}
