@@ -153,8 +153,9 @@ def _write(
     from appearance.export.mitsuba import View, export_mitsuba, off_by
     from appearance.model.relight import environment_map, three_quarter_view
 
-    camera = three_quarter_view(groom.strands, SIZE)
-    if capture is not None and args.camera is not None:
+    if capture is None or args.camera is None:
+        camera = three_quarter_view(groom.strands, SIZE)
+    else:
         camera = capture.rig.camera(args.camera)
         if (off := off_by(camera)) > OFF:
             output.note(

@@ -356,6 +356,17 @@ def test_a_scene_for_mitsuba_tells_of_the_lens_that_it_leaves_out(made, capsys, 
             assert (f"{name} has a lens" in told, off in told) == (off != "", True)
 
 
+def test_a_head_without_hair_is_a_scene_for_mitsuba_where_a_camera_is_given(made, capsys, tmp_path):
+    """A view that shows all strands there is not: its error asks for what is given here."""
+    bald = Model(tmp_path / "bald").create()
+    bald.write_strands(Strands.from_list([]))
+    words = ("export", bald, "--to", "mitsuba", "--out", tmp_path / "scene")
+    code, found = run(capsys, *words)
+    assert (code, "give a camera of the capture's rig" in found["error"]["detail"]) == (3, True)
+    code, found = run(capsys, *words, "--capture", made.capture, "--camera", "cam_1")
+    assert (code, found.get("files")) == (0, [str(tmp_path / "scene" / "scene.xml")])
+
+
 @pytest.mark.usefixtures("fitted")
 def test_exports_make_their_folders_and_take_no_place_of_a_models_files(made, capsys, tmp_path):
     deep = tmp_path / "new" / "folder" / "h.hair"
