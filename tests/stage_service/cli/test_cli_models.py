@@ -367,6 +367,13 @@ def test_a_head_without_hair_is_a_scene_for_mitsuba_where_a_camera_is_given(made
     assert (code, found.get("files")) == (0, [str(tmp_path / "scene" / "scene.xml")])
 
 
+def test_a_file_is_printed_by_the_name_that_it_has(made, capsys, tmp_path):
+    out = tmp_path / "a:x:b" / "[i] h:100:.hair"
+    assert main(["export", str(made.model), "--to", "hair", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out.rstrip("\n")
+    assert (printed, Path(printed).is_file()) == (str(out), True)
+
+
 @pytest.mark.usefixtures("fitted")
 def test_exports_make_their_folders_and_take_no_place_of_a_models_files(made, capsys, tmp_path):
     deep = tmp_path / "new" / "folder" / "h.hair"
