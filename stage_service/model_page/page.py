@@ -100,7 +100,7 @@ def _result(model: Model) -> Html:
     """What to take away: strands and material, with the files that hold them."""
     if not model.has("strands.npz"):
         return element("p", "There are no strands yet: the reconstruction has not come to its end.")
-    strands, name = model.strands(), shlex.quote(model.path.name)
+    strands, name = model.strands(), shlex.quote(model.path.resolve().name)
     lengths = strands.lengths()
     facts = [
         ("strands", [element("b", f"{len(strands):,}"), f" of {len(strands.points):,} points"])
