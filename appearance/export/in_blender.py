@@ -38,7 +38,8 @@ def make_curves(name, groom, which, head):
     points = np.repeat(inside, counts)
     assert ends[-1] == len(points) if len(ends) else True
     curves = bpy.data.hair_curves.new(name)
-    curves.add_curves(counts[inside].tolist())
+    if inside.any():  # to add none ends Blender 4.5
+        curves.add_curves(counts[inside].tolist())
     fill(curves.attributes["position"], "vector", groom["points"][points])
     add(curves, "radius", "FLOAT", "POINT", groom["radius"][points])
     add(curves, "surface_uv_coordinate", "FLOAT2", "CURVE", groom["root_uv"][inside])

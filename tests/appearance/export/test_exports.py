@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import struct
 import subprocess
 import sys
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import cv2
 import mitsuba as mi
@@ -353,6 +355,19 @@ def test_blender_finds_every_root_in_one_face_of_the_head(fitted, tmp_path):
         edges, away = np.roll(corners, -1, axis=1) - corners, place - corners
         side = edges[..., 0] * away[..., 1] - edges[..., 1] * away[..., 0]
         assert ((side > 1e-9).all(axis=1) | (side < -1e-9).all(axis=1)).sum() == 1
+
+
+def test_blender_is_not_asked_to_add_no_curves(fitted, tmp_path, monkeypatch):
+    """`add_curves([])` ends Blender 4.5 by a segmentation fault."""
+    bpy = MagicMock()
+    added = bpy.data.hair_curves.new.return_value.add_curves
+    monkeypatch.setitem(sys.modules, "bpy", bpy)
+    for strands, expected in ((Strands.from_list([]), []), (fitted.strands, [[[8] * 60]])):
+        groom = Groom.of(replace(fitted, strands=strands), ExportOptions())
+        script, arrays = export_blender(groom, tmp_path)
+        with np.load(arrays) as held:
+            runpy.run_path(str(script))["build"](dict(held))
+        assert [list(call.args) for call in added.call_args_list] == expected
 
 
 def test_options_that_cannot_be_are_refused():
