@@ -103,6 +103,15 @@ def test_commands_name_the_model_also_where_the_page_is_made_in_it(model, monkey
     assert "hairstage export 'a <b> & c' --to blender" in text
 
 
+def test_a_file_that_a_fit_removes_meanwhile_is_not_on_the_page(model, monkeypatch):
+    there = model.artifacts()
+    gone = model.checkpoint("spatial")
+    monkeypatch.setattr(Model, "artifacts", lambda _: {**there, gone.name: gone})
+    text = Page(model_page(model)).text
+    assert gone.name not in text
+    assert "strands.hair" in text
+
+
 def test_a_head_that_nobody_measured_is_called_what_it_is(model):
     report = model.report()
     with report.stage("head") as stage:
