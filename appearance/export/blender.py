@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from appearance.export.groom import Groom
 from appearance.export.maps import SCALARS
+from reconstruction.arrays import Floats, Ints
 from reconstruction.files.durable import write_whole, writing
 
 SCRIPT = "open_in_blender.py"
@@ -46,9 +47,20 @@ def export_blender(groom: Groom, folder: Path) -> list[Path]:
         arrays["head_vertices"] = groom.head.vertices.astype(np.float32)
         arrays["head_faces"] = groom.head.faces.astype(np.int32)
         if groom.head_st is not None:
-            arrays["head_uv"] = groom.head_st
+            arrays["head_uv"] = _corners(groom.head_st, groom.head.faces)
     with writing(folder / "groom.npz") as part:
         np.savez(part, allow_pickle=False, **arrays)
     script = Path(__file__).with_name("in_blender.py").read_bytes()
     write_whole(folder / SCRIPT, script)
     return [folder / SCRIPT, folder / "groom.npz"]
+
+
+def _corners(head_st: Floats, faces: Ints) -> Floats:
+    """The scalp's map at the corners of the faces `(F, 3, 2)`, (-1, -1) at all of those off it.
+
+    Blender finds a root on the head by the one face whose triangle on the map it lies in: faces
+    that reach over the scalp's edge would lie across the whole map.
+    """
+    corners = head_st[faces]
+    corners[(corners < 0).any(axis=(1, 2))] = -1
+    return corners

@@ -38,7 +38,8 @@ def make_curves(name, groom, which, head):
     points = np.repeat(inside, counts)
     assert ends[-1] == len(points) if len(ends) else True
     curves = bpy.data.hair_curves.new(name)
-    curves.add_curves(counts[inside].tolist())
+    if inside.any():  # to add none ends Blender 4.5
+        curves.add_curves(counts[inside].tolist())
     fill(curves.attributes["position"], "vector", groom["points"][points])
     add(curves, "radius", "FLOAT", "POINT", groom["radius"][points])
     add(curves, "surface_uv_coordinate", "FLOAT2", "CURVE", groom["root_uv"][inside])
@@ -103,8 +104,7 @@ def make_head(groom):
     mesh = bpy.data.meshes.new("head")
     mesh.from_pydata(groom["head_vertices"].tolist(), [], groom["head_faces"].tolist())
     if "head_uv" in groom:
-        corners = groom["head_uv"][groom["head_faces"].ravel()]
-        mesh.uv_layers.new(name="scalp").data.foreach_set("uv", corners.ravel())
+        mesh.uv_layers.new(name="scalp").data.foreach_set("uv", groom["head_uv"].ravel())
     material = bpy.data.materials.new("skin")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links

@@ -7,7 +7,7 @@ are differences within a shape and the correctives.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ class View:
 def export_mitsuba(groom: Groom, folder: Path, view: View) -> Path:
     """Write `scene.xml`, its curves, the head and the environment; returns the scene's path.
 
-    Units are centimetres; radiance is ours. A pinhole of square pixels.
+    Units are centimetres; radiance is ours. A pinhole of square pixels: see `off_by`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shapes = []
@@ -70,6 +70,19 @@ def export_mitsuba(groom: Groom, folder: Path, view: View) -> Path:
     )
     write_whole(path, text.encode())
     return path
+
+
+def off_by(camera: Camera) -> float:
+    """Pixels that a scene's picture is off from one by `camera`, at most.
+
+    Stock Mitsuba has no lens, no skew, and one focal length: the horizontal one.
+    """
+    x, y = (np.linspace(0, n - 1, 17) for n in (camera.width, camera.height))
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    f, K = camera.K[0, 0], camera.K
+    square = replace(camera.pinhole(), K=np.array([[f, 0, K[0, 2]], [0, f, K[1, 2]], [0, 0, 1]]))
+    seen, _ = square.project(camera.center + camera.rays(pixels))
+    return float(np.linalg.norm(seen - pixels, axis=-1).max())
 
 
 def _shapes(groom: Groom) -> tuple[Array, Ints]:

@@ -119,7 +119,10 @@ class Strands:
         return replace(self, points=moved.astype(np.float32))
 
     def cut(self, length: float) -> Strands:
-        """Strands that end after at most `length` metres, > 0, the last point interpolated."""
+        """Strands that end after at most `length` metres, > 0.
+
+        The last point is interpolated, with its radius and its confidence.
+        """
         points, first = self.points.astype(float), self.offsets[:-1]
         step = np.zeros(len(points))
         starts = self.segment_starts
@@ -132,9 +135,15 @@ class Strands:
         share = ((length - arc[beyond - 1]) / step[beyond])[:, None]
         points[beyond] = points[beyond - 1] * (1 - share) + points[beyond] * share
         counts = np.bincount(self.strand_of_point[keep], minlength=len(self))
-        radius = self.radius[keep] if isinstance(self.radius, np.ndarray) else self.radius
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        confidence = None if self.confidence is None else self.confidence[keep]
+
+        def ended(values: Floats) -> Floats:
+            there = values.copy()
+            there[beyond] += (values[beyond - 1] - values[beyond]) * (1 - share[:, 0])
+            return there[keep]
+
+        radius = ended(self.radius) if isinstance(self.radius, np.ndarray) else self.radius
+        confidence = None if self.confidence is None else ended(self.confidence).clip(0, 1)
         return Strands(points[keep].astype(np.float32), offsets, radius, confidence)
 
     def resampled(self, step: float) -> Strands:

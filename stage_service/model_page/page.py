@@ -100,7 +100,7 @@ def _result(model: Model) -> Html:
     """What to take away: strands and material, with the files that hold them."""
     if not model.has("strands.npz"):
         return element("p", "There are no strands yet: the reconstruction has not come to its end.")
-    strands, name = model.strands(), shlex.quote(model.path.name)
+    strands, name = model.strands(), shlex.quote(model.path.resolve().name)
     lengths = strands.lengths()
     facts = [
         ("strands", [element("b", f"{len(strands):,}"), f" of {len(strands.points):,} points"])
@@ -387,14 +387,14 @@ def _figures(report: Report) -> Html:
 
 def _files(model: Model) -> Html:
     """Every file by the name under which `FILES` knows it; those of folders one by one."""
-    found = model.artifacts()
+    found = model.sizes()
     found.pop(PAGE, None)
     rows: list[list[str]] = []
     for name, what in FILES.items():
-        inside = {p: f for p, f in found.items() if p == name or p.startswith(f"{name}/")}
+        inside = {p: n for p, n in found.items() if p == name or p.startswith(f"{name}/")}
         if not inside:
             continue
-        total = size(sum(f.stat().st_size for f in inside.values()))
+        total = size(sum(inside.values()))
         if name in inside:
             rows.append([link(name), what, total])
             continue
@@ -403,5 +403,5 @@ def _files(model: Model) -> Html:
         rows.append([element("details", summary, element("ul", *each)), what, total])
     known = tuple(FILES)
     others = [p for p in found if p.split("/")[0] not in known]
-    rows += [[link(p), "", size(found[p].stat().st_size)] for p in others]
+    rows += [[link(p), "", size(found[p])] for p in others]
     return table(["file", "what it is", "size"], rows, "files")

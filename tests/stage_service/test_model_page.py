@@ -94,6 +94,24 @@ def test_everything_that_is_known_stands_on_the_page(model):
     assert text.count("<img src=x onerror=alert(1)>") >= 5  # as text
 
 
+def test_commands_name_the_model_also_where_the_page_is_made_in_it(model, monkeypatch, capsys):
+    monkeypatch.chdir(model.path)
+    assert main(["page", "."]) == 0
+    capsys.readouterr()
+    text = Page(model.file("index.html").read_text(encoding="utf-8")).text
+    assert "hairstage view 'a <b> & c'" in text
+    assert "hairstage export 'a <b> & c' --to blender" in text
+
+
+def test_a_file_that_a_fit_removes_meanwhile_is_not_on_the_page(model, monkeypatch):
+    there = model.artifacts()
+    gone = model.checkpoint("spatial")
+    monkeypatch.setattr(Model, "artifacts", lambda _: {**there, gone.name: gone})
+    text = Page(model_page(model)).text
+    assert gone.name not in text
+    assert "strands.hair" in text
+
+
 def test_a_head_that_nobody_measured_is_called_what_it_is(model):
     report = model.report()
     with report.stage("head") as stage:

@@ -39,7 +39,8 @@ def _read(stage: Any) -> Strands:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
     cache = UsdGeom.XformCache(_START)
-    curves = (UsdGeom.BasisCurves(prim) for prim in stage.Traverse())
+    prims = stage.Traverse(Usd.TraverseInstanceProxies())  # what instances share is hair, too
+    curves = (UsdGeom.BasisCurves(prim) for prim in prims)
     hair = (c.GetPrim() for c in curves if c and c.ComputePurpose() != UsdGeom.Tokens.guide)
     found = [_curves(prim, cache, turn) for prim in hair]
     if not found:

@@ -30,6 +30,9 @@ STRANDS = ("abc", "hair")
 SIZE = 640
 """Pixels across of a Mitsuba scene's camera, where no camera of a rig says: relit.png's."""
 
+OFF = 0.5
+"""Pixels that a picture of Mitsuba's may be off without a word."""
+
 
 def add(commands: Commands) -> None:
     """Add the command."""
@@ -111,12 +114,16 @@ def run(args: argparse.Namespace, output: Output) -> None:
             output.note(f"warning: {model} renders with a field, of which exports know nothing")
         if groom.head is None:
             output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
-        files = _write(args, groom, capture, options)
+        files = _write(args, output, groom, capture, options)
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
 
 
 def _write(
-    args: argparse.Namespace, groom: Groom, capture: Capture | None, options: ExportOptions
+    args: argparse.Namespace,
+    output: Output,
+    groom: Groom,
+    capture: Capture | None,
+    options: ExportOptions,
 ) -> list[Path]:
     """Write the file or folder; returns what was written."""
     out: Path = args.out
@@ -143,10 +150,16 @@ def _write(
         from appearance.export.maps import export_maps
 
         return export_maps(groom.maps, out)
-    from appearance.export.mitsuba import View, export_mitsuba
+    from appearance.export.mitsuba import View, export_mitsuba, off_by
     from appearance.model.relight import environment_map, three_quarter_view
 
-    camera = three_quarter_view(groom.strands, SIZE)
-    if capture is not None and args.camera is not None:
+    if capture is None or args.camera is None:
+        camera = three_quarter_view(groom.strands, SIZE)
+    else:
         camera = capture.rig.camera(args.camera)
+        if (off := off_by(camera)) > OFF:
+            output.note(
+                f"warning: {camera.name} has a lens, or pixels that are not square: Mitsuba's "
+                f"camera has neither, and its pictures are off by up to {off:.1f} pixels"
+            )
     return [export_mitsuba(groom, out, View(camera, environment_map(args.environment or "studio")))]

@@ -54,7 +54,8 @@ class Output:
         shown = json.dumps(data, indent=1, allow_nan=False) if text is None else text
         # A table in a file or a log has no window to fit.
         width = None if self._stdout.isatty() else 120
-        console = Console(width=width, highlight=False, file=self._stdout)
+        # names are printed as they are: ":x:" is part of one, and no picture
+        console = Console(width=width, highlight=False, emoji=False, file=self._stdout)
         console.print(shown, markup=False, soft_wrap=True)
 
     def error(self, kind: str, detail: str, **more: Any) -> None:

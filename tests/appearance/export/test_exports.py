@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import struct
 import subprocess
 import sys
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import cv2
 import mitsuba as mi
@@ -336,6 +338,36 @@ def test_blender_gets_arrays_and_a_script_that_python_reads(mapped, tmp_path):
     np.testing.assert_allclose(held["radius"], 4e-4)
     assert held["sigma_a"].shape == (480, 3)
     np.testing.assert_allclose(held["head_vertices"], mapped.head.vertices, atol=1e-7)
+
+
+def test_blender_finds_every_root_in_one_face_of_the_head(fitted, tmp_path):
+    """Its ReverseUVSampler takes none where triangles of several faces hold a place on the map."""
+    head, radius = fitted.head, np.ptp(fitted.head.vertices[:, 0]) / 2
+    x, y, z = (head.vertices - head.vertices.mean(axis=0)).T / radius
+    uv = np.where(z[:, None] > 0.2, 0.5 + 0.5 * np.stack([x, y], axis=-1), np.nan)
+    middles = uv[head.faces].mean(axis=1)
+    roots = middles[np.isfinite(middles).all(axis=1) & (head.face_areas() > 1e-9)]
+    assert 20 < len(roots) < len(head.faces) / 2
+    groom = replace(Groom.of(fitted, ExportOptions()), head_uv=uv)
+    _, arrays = export_blender(groom, tmp_path / "b")
+    corners = np.load(arrays)["head_uv"].reshape(len(head.faces), 3, 2).astype(float)
+    for place in roots * (1, -1) + (0, 1):  # v upwards there
+        edges, away = np.roll(corners, -1, axis=1) - corners, place - corners
+        side = edges[..., 0] * away[..., 1] - edges[..., 1] * away[..., 0]
+        assert ((side > 1e-9).all(axis=1) | (side < -1e-9).all(axis=1)).sum() == 1
+
+
+def test_blender_is_not_asked_to_add_no_curves(fitted, tmp_path, monkeypatch):
+    """`add_curves([])` ends Blender 4.5 by a segmentation fault."""
+    bpy = MagicMock()
+    added = bpy.data.hair_curves.new.return_value.add_curves
+    monkeypatch.setitem(sys.modules, "bpy", bpy)
+    for strands, expected in ((Strands.from_list([]), []), (fitted.strands, [[[8] * 60]])):
+        groom = Groom.of(replace(fitted, strands=strands), ExportOptions())
+        script, arrays = export_blender(groom, tmp_path)
+        with np.load(arrays) as held:
+            runpy.run_path(str(script))["build"](dict(held))
+        assert [list(call.args) for call in added.call_args_list] == expected
 
 
 def test_options_that_cannot_be_are_refused():

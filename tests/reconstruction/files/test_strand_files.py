@@ -428,6 +428,28 @@ def test_usd_axes_units_and_transforms(tmp_path: Path) -> None:
     assert strands.radius == pytest.approx(1e-4)
 
 
+def test_usd_instances_are_read_where_each_of_them_is(tmp_path: Path) -> None:
+    """Assemblies reference a groom as "instanceable": its curves are in a prototype then."""
+    (tmp_path / "groom.usda").write_text(USDA.format(type="linear", widths="[0.02]"))
+    placed = """
+def "{name}" (
+    instanceable = true
+    references = @./groom.usda@</head>
+) {{
+    double3 xformOp:translate = ({x}, 0, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}
+"""
+    text = '#usda 1.0\n(\nmetersPerUnit = 0.01\nupAxis = "Y"\n)\n'
+    text += placed.format(name="left", x=0) + placed.format(name="right", x=100)
+    (tmp_path / "two.usda").write_text(text)
+    strands = read_strands(tmp_path / "two.usda")
+    one = np.array([[0.01, -0.03, 0.02], [0.04, -0.06, 0.05]])
+    both = np.concatenate([one, one + np.array([1, 0, 0])])
+    np.testing.assert_allclose(strands.points, both, atol=1e-7)
+    assert (len(strands), strands.radius) == (2, pytest.approx(1e-4))
+
+
 def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
     """Animations hold the values of frames alone, and none by default."""
     path = tmp_path / "x.usda"

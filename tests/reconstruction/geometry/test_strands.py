@@ -101,6 +101,16 @@ def test_bookkeeping() -> None:
     assert strands.resampled(0.1).offsets.tolist() == [0, 2, 4]
 
 
+def test_a_cone_is_as_thick_where_it_is_cut_as_it_was_there() -> None:
+    """50 µm at the root and 10 µm at the tip, 10 cm long: 40 µm a quarter of the way."""
+    points = np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0], [0, 0, 0.02]])
+    radius, confidence = np.array([5e-5, 1e-5, 5e-5, 1e-5]), np.array([1.0, 0.0, 1.0, 0.0])
+    short = Strands(points, np.array([0, 2, 4]), radius, confidence).cut(0.025)
+    np.testing.assert_allclose(short.points[:, 2], [0, 0.025, 0, 0.02], rtol=1e-6)
+    np.testing.assert_allclose(short.radius, [5e-5, 4e-5, 5e-5, 1e-5], rtol=1e-6)
+    np.testing.assert_allclose(short.confidence, [1, 0.75, 1, 0], rtol=1e-6)
+
+
 def test_no_hair_is_allowed() -> None:
     bald = Strands.from_list([])
     assert len(bald) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 from contextlib import redirect_stdout
@@ -332,6 +333,45 @@ def test_exports_tell_of_what_they_do_not_hold(made, capsys, tmp_path, monkeypat
     said = capsys.readouterr().err
     assert "was moved" not in said
     assert "renders with a field" in said
+
+
+@pytest.mark.usefixtures("fitted")
+def test_a_scene_for_mitsuba_tells_of_the_lens_that_it_leaves_out(made, capsys, tmp_path):
+    """Its rows are 9.5 pixels from the middle at most, and 9.5 / 1.2 where a pixel is as high as
+    wide; the lens puts at the corner what is two pixels outside of it without one."""
+    capture = shutil.copytree(made.capture, tmp_path / "capture")
+    rig = json.loads((capture / "rig.json").read_text())
+    straight, (low, bent) = rig["cameras"], copy.deepcopy(rig["cameras"])
+    low["K"][1][1] *= 1.2
+    focal = bent["K"][0][0]
+    corner = np.hypot(9.5, 9.5) / focal
+    beyond = corner + 2 / focal
+    bent["distortion"] = [(corner / beyond - 1) / beyond**2]  # r (1 + k1 r²)
+    words = ["export", str(made.model), "--to", "mitsuba", "--capture", str(capture)]
+    for cameras, said in (([low, bent], ("1.6 pixels", "2.0 pixels")), (straight, ("", ""))):
+        (capture / "rig.json").write_text(json.dumps(rig | {"cameras": cameras}))
+        for name, off in zip(("cam_0", "cam_1"), said, strict=True):
+            assert main([*words, "--camera", name, "--out", str(tmp_path / name)]) == 0
+            told = capsys.readouterr().err
+            assert (f"{name} has a lens" in told, off in told) == (off != "", True)
+
+
+def test_a_head_without_hair_is_a_scene_for_mitsuba_where_a_camera_is_given(made, capsys, tmp_path):
+    """A view that shows all strands there is not: its error asks for what is given here."""
+    bald = Model(tmp_path / "bald").create()
+    bald.write_strands(Strands.from_list([]))
+    words = ("export", bald, "--to", "mitsuba", "--out", tmp_path / "scene")
+    code, found = run(capsys, *words)
+    assert (code, "give a camera of the capture's rig" in found["error"]["detail"]) == (3, True)
+    code, found = run(capsys, *words, "--capture", made.capture, "--camera", "cam_1")
+    assert (code, found.get("files")) == (0, [str(tmp_path / "scene" / "scene.xml")])
+
+
+def test_a_file_is_printed_by_the_name_that_it_has(made, capsys, tmp_path):
+    out = tmp_path / "a:x:b" / "[i] h:100:.hair"
+    assert main(["export", str(made.model), "--to", "hair", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out.rstrip("\n")
+    assert (printed, Path(printed).is_file()) == (str(out), True)
 
 
 @pytest.mark.usefixtures("fitted")
