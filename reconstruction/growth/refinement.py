@@ -28,7 +28,10 @@ GUESS = 0.05  # what a millimetre that nothing was measured at counts; the best 
 CELL, HEADINGS = 1e-3, 24  # metres and directions: what lies in one cell explains the same
 
 POINT_DEVIATION = 0.5e-3  # metres of a measured line across itself
-ANGLE_DEVIATION = np.radians(15.0)  # of a measured line of confidence 1
+ANGLE_DEVIATION = np.radians(30.0)
+"""Of a measured line of confidence 1: twice what it is off, as lines beside each other are read
+from the same pixels, and are off together. Followed further, they carry strands off their places.
+"""
 BEND_DEVIATION = 0.2  # per point: how the turn from one point to the next may change in all
 GUESS_DEVIATION = 3e-3  # metres that a point moves in all where nothing holds it
 COMPATIBLE = np.cos(np.radians(35.0))

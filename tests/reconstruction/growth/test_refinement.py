@@ -26,13 +26,24 @@ ASIDE = np.array([[x, y, 0.0] for x in (0, 4e-3, 8e-3) for y in (0, 4e-3)])
 """Six strands, 4 mm apart."""
 
 
-def lines(noise: float, angle_deg: float, below: float = 0.0) -> Measured:
-    """Lines measured on all six from `below` metres on, with errors across and of angle."""
+def lines(
+    noise: float, angle_deg: float, below: float = 0.0, together: float | None = None
+) -> Measured:
+    """Lines measured on all six from `below` metres on, with errors across and of angle.
+
+    Those of angle swing along each strand with a period of `together` metres; None: at random.
+    """
     rng = np.random.default_rng(2)
     s = rng.uniform(below, LENGTH, 600)
-    p, d = wave(s, ASIDE[rng.integers(0, len(ASIDE), len(s))])
+    which = rng.integers(0, len(ASIDE), len(s))
+    p, d = wave(s, ASIDE[which])
     p += noise * rng.normal(size=p.shape)
-    d += np.radians(angle_deg) * rng.normal(size=d.shape)
+    if together is None:
+        d += np.radians(angle_deg) * rng.normal(size=d.shape)
+    else:
+        phase = rng.uniform(0, 2 * np.pi, (len(ASIDE), 2))[which]
+        swing = np.sin(2 * np.pi * s[:, None] / together + phase)
+        d[:, :2] += np.radians(angle_deg) * 2**0.5 * swing
     d *= rng.choice([-1, 1], (len(d), 1)) / np.linalg.norm(d, axis=1, keepdims=True)
     return Measured(p, d, rng.uniform(0.5, 1.0, len(p)))
 
@@ -89,6 +100,13 @@ def test_more_steps_do_not_follow_the_noise_of_lines_further() -> None:
     few, many = (errors(refine(start, noisy, RefineOptions(steps=n, worth=0))[0]) for n in (3, 12))
     assert many[0] < 1.1 * few[0]
     assert many[1] < 1.15 * few[1]
+
+
+def test_directions_that_are_off_together_do_not_carry_strands_away() -> None:
+    """As those of lines are that were read from the same pixels."""
+    start, swinging = strands(6, 5e-4), lines(3e-4, 10.0, together=30e-3)
+    made, _ = refine(start, swinging, RefineOptions(worth=0))
+    assert errors(made)[0] < errors(start)[0]
 
 
 def test_copies_and_strands_across_the_measured_ones_go() -> None:
