@@ -49,10 +49,12 @@ class Board:
             raise CalibrationError(
                 f"board: OpenCV has no dictionary {self.dictionary!r}; one is 'DICT_4X4_50'"
             )
-        if min(self.columns, self.rows) < 3 or not 0 < self.marker < self.square < np.inf:
+        sizes = 1e-6 <= self.square <= 1e3 and 0.1 * self.square <= self.marker < self.square
+        if min(self.columns, self.rows) < 3 or not sizes:
             raise CalibrationError(
-                f"board: expected 3 × 3 squares or more, markers smaller than squares, got "
-                f"{self.columns} × {self.rows}, squares {self.square} m, markers {self.marker} m"
+                "board: expected 3 × 3 squares or more, of 1e-6 to 1e3 m, markers smaller than "
+                f"squares and a tenth of them at least, got {self.columns} × {self.rows}, squares "
+                f"{self.square} m, markers {self.marker} m"
             )
         most, need = len(self._dictionary.bytesList), self.columns * self.rows // 2
         if need > most:

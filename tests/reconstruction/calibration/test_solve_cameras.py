@@ -147,6 +147,9 @@ def test_noise_and_darkness_show_no_board(board: Board) -> None:
     [
         ({"dictionary": "DICT_9X9"}, "no dictionary"),
         ({"marker": 0.03}, "markers smaller than squares"),
+        ({"marker": 1e-300}, "a tenth of them"),
+        ({"square": 1e-300, "marker": 8e-301}, "1e-6 to 1e3 m"),
+        ({"square": float("nan")}, "1e-6 to 1e3 m"),
         ({"columns": 30, "rows": 30}, "has 50"),
     ],
 )
