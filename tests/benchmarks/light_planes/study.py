@@ -37,7 +37,7 @@ from reconstruction.light_planes import (
     triangulate,
 )
 from reconstruction.masks import HairMask, MaskedCapture
-from reconstruction.reconstruct_options import MotionOptions
+from reconstruction.reconstruct_options import MotionOptions, RefineOptions
 from reconstruction.report.plots import plot_report
 from reconstruction.tangents.estimate import measure_tangents
 
@@ -65,12 +65,14 @@ def study(
     case: SubjectCaptures,
     options: ReconstructOptions,
     *,
+    grown: bool = False,
     without_help: bool = False,
     studies: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """One subject, still and drifting, and baselines; leaves models and `OUT/result.json`.
 
+    `grown` adds the strands as they grew, not refined.
     `without_help` adds what head and rig are worth that come from elsewhere, and true masks.
     `studies` adds what one subject is enough for: the motion's worth in strands, error against run
     time of motion, field and growth, and how stages grow.
@@ -88,6 +90,11 @@ def study(
         "stages": {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb} for s in report.stages},
     }
     save(out / "result.json", result)
+    if grown:
+        runs.options = replace(options, refine=RefineOptions(steps=0, worth=0))
+        runs.add("grown", capture)
+        runs.options = options
+        save(out / "result.json", result)
     if without_help:
         with TemporaryDirectory(dir=case.still[0].parent) as folder:  # links stay on one disk
             result["calibration"] = _without_help(runs, case, Path(folder))

@@ -173,6 +173,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             folder / name,
             SubjectCaptures(*(capture.make(args.cache, tell) for capture in made)),
             options,
+            grown="grown" in also,
             without_help="without_help" in also,
             studies=name == "sintel" and "studies" in also,
             progress=tell,
@@ -183,6 +184,6 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     return results
 
 
-PARTS = ["drifting", "without_help", "studies"]
+PARTS = ["grown", "drifting", "without_help", "studies"]
 ALSO = option("--also", "beside the still capture", nargs="*", choices=PARTS, default=PARTS)
 BENCHMARK = Benchmark(run, (CACHE, ONLY, ALSO))

@@ -106,7 +106,7 @@ def test_directions_that_are_off_together_do_not_carry_strands_away() -> None:
     """As those of lines are that were read from the same pixels."""
     start, swinging = strands(6, 5e-4), lines(3e-4, 10.0, together=30e-3)
     made, _ = refine(start, swinging, RefineOptions(worth=0))
-    assert errors(made)[0] < errors(start)[0]
+    assert errors(made)[0] < 0.9 * errors(start)[0]
 
 
 def test_copies_and_strands_across_the_measured_ones_go() -> None:
