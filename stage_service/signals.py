@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 
 def taken(*numbers: signal.Signals) -> Callable[[], None]:
@@ -25,6 +26,25 @@ def taken(*numbers: signal.Signals) -> Callable[[], None]:
             pass
 
     return wait
+
+
+@contextlib.contextmanager
+def held(*numbers: signal.Signals) -> Iterator[None]:
+    """Hold these signals back in the main thread until the end of the with-block.
+
+    Unlike a blocked signal, one that is held is not held for the processes started meanwhile.
+    """
+    came: list[int] = []
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        for number in numbers:
+            signal.signal(number, lambda which, _: came.append(which))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for arrived in came:
+            signal.raise_signal(arrived)
 
 
 def tied(command: list[str], how: str = "TERM") -> list[str]:

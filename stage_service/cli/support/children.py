@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from stage_service.cli.support.commands import BAD_INPUT, UNREACHABLE, CommandError
-from stage_service.signals import tied
+from stage_service.signals import held, tied
 
 GRACE_S = 40.0
 """How long a child may take to end by itself: the service puts the lights off in that time."""
@@ -51,6 +51,8 @@ class Children:
         With `answers` its stdout is a pipe, for `first_line`.
         """
         with contextlib.ExitStack() as stack:
+            # A Ctrl-C between its start and its entry would leave a child that nobody ends.
+            stack.enter_context(held(signal.SIGINT, signal.SIGTERM))
             log = stack.enter_context(self.log(name).open("a")) if to_log else None
             child = subprocess.Popen(
                 tied(command),
@@ -60,7 +62,7 @@ class Children:
                 text=True,
                 start_new_session=True,
             )
-        self._running.append((name, child))
+            self._running.append((name, child))
         return child
 
     def log(self, name: str) -> Path:

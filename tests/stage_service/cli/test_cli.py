@@ -631,6 +631,31 @@ def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path)
     assert not alive(pids[0])
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_child_ends_with_a_command_that_is_interrupted_at_its_start(
+    monkeypatch, tmp_path, number
+):
+    popen, begun = subprocess.Popen, []
+
+    def interrupted(*args: Any, **kwargs: Any) -> subprocess.Popen[str]:
+        begun.append(popen(*args, **kwargs))
+        signal.raise_signal(number)
+        return begun[0]
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    before = signal.signal(number, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt), Children(tmp_path) as children:
+            children.start("x", [sys.executable, "-c", "import time; time.sleep(60)"])
+        assert signal.getsignal(number) is interrupt
+    finally:
+        signal.signal(number, before)
+    assert not alive(begun[0].pid)
+
+
 def test_children_end_where_their_command_is_killed(tmp_path):
     if shutil.which("setpriv") is None:
         pytest.skip("there is no setpriv here: children outlive a command that is killed")
