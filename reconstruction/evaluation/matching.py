@@ -14,9 +14,9 @@ from reconstruction.evaluation.oriented_points import (
     Drawn,
     Looker,
     OrientedPoints,
+    Sees,
     near_pairs,
 )
-from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.strands import Strands
 
 
@@ -91,7 +91,7 @@ class StrandComparison:
         *,
         seed: int = 0,
         samples: int | None = 40_000,
-        visibility: Visibility | None = None,
+        visibility: Sees | None = None,
     ) -> None:
         self.pred, self.true = pred, true
         self.predicted, self.truth = OrientedPoints(pred), OrientedPoints(true)
@@ -99,7 +99,7 @@ class StrandComparison:
             raise ValueError("there are no true strands to compare with")
         rng = np.random.default_rng(seed)
 
-        def drawn(sees: Visibility | None) -> tuple[Matches, Matches]:
+        def drawn(sees: Sees | None) -> tuple[Matches, Matches]:
             theirs = self.truth.draw(samples, rng, sees)
             if not len(theirs.points):
                 raise ValueError("no camera sees any of the true strands: are they in one frame?")
@@ -161,7 +161,7 @@ def compare_strands(
     pred: Strands,
     true: Strands,
     *,
-    visibility: Visibility | None = None,
+    visibility: Sees | None = None,
     seed: int = 0,
     samples: int | None = 40_000,
 ) -> dict[str, Any]:

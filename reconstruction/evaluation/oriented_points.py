@@ -6,7 +6,7 @@ at and then forgotten, so that memory does not grow with the hair.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -15,9 +15,11 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.arrays import Floats, Ints
-from reconstruction.evaluation.visibility import Visibility
+from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.geometry.strands import Resampling, Strands, unit_or_zero
+
+Sees = Callable[[Floats], Bools]
+"""Says which of points `(N, 3)` are visible, `(N,)`; `Visibility` is one."""
 
 STEP = 1e-3  # metres between the points
 BLOCK = 250_000  # points that are made together, whole strands: a longer one makes a longer block
@@ -130,7 +132,7 @@ class OrientedPoints:
                 looker.look(block)
 
     def draw(
-        self, samples: int | None, rng: np.random.Generator, sees: Visibility | None = None
+        self, samples: int | None, rng: np.random.Generator, sees: Sees | None = None
     ) -> Drawn:
         """At most `samples` of the points, or of those that `sees` says are visible."""
         if samples is None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from reconstruction import Capture, Model, Strands, read_strands
+from reconstruction import Camera, Capture, Model, Strands, read_strands
 from reconstruction.arrays import Array
 from reconstruction.evaluation.baselines import (
     baseline_hull,
@@ -105,6 +105,24 @@ class StrandTruth:
             samples=self._samples,
             visibility=self._visibility,
         )
+
+    def swept(self, strands: Strands) -> dict[str, Any]:
+        """Scores of what cameras see and a projector lights: all that a sweep can place.
+
+        `share` is that of what cameras see. Stripes are taken to be as fine as the truth.
+        """
+        projectors = [
+            Camera(name=p.name, K=p.K, R=p.R, t=p.t, width=p.width, height=p.height)
+            for p in self._capture.rig.projectors
+        ]
+        lit = Visibility(projectors, self.strands, self._capture.head)
+        seen = self._visibility
+        score = compare_strands(
+            strands, self.strands, samples=self._samples, visibility=lambda p: seen(p) & lit(p)
+        )
+        points = self.strands.resampled(4 * STEP).points
+        points = points[seen(points)]
+        return {"share": float(lit(points).mean()), **score["visible"]}
 
     def baselines(self, model: Model, spacing: float = 2e-3) -> dict[str, dict[str, Any]]:
         """Scores of what uses no method, in the masks that `model`'s reconstruction had.

@@ -86,6 +86,7 @@ def study(
     runs.scores |= truth.baselines(still)
     result: dict[str, Any] = {
         "scores": runs.scores,
+        "swept": truth.swept(still.strands()),
         "shares": _shares(report),
         "stages": {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb} for s in report.stages},
     }
