@@ -6,6 +6,7 @@ says in the report.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -14,6 +15,7 @@ import numpy as np
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.capture.kept_frames import frames_kept
+from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.strands import Strands
@@ -115,7 +117,7 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
         scalp = find_scalp(head.mesh, envelope)
         field = stages.field(envelope, measured, scalp)
         grown = stages.grown(field, scalp, seen, stages.options.within)
-        grown = stages.refined(grown, measured, cloud)
+        grown = stages.refined(grown, measured, cloud, masked.cameras, depths)
         stages.rooted(grown, lines, scalp, head.scalp_map)
 
 
@@ -290,7 +292,8 @@ class _Stages:
         field = self.field(envelope, with_descent(envelope, measured, bare), scalp)
         within = SHELL if o.within is None else o.within  # lines lie on the hull, millimetres off
         if head is not None and scalp is not None:
-            grown = self.refined(self.grown(field, scalp, seen, within), measured, cloud)
+            grown = self.grown(field, scalp, seen, within)
+            grown = self.refined(grown, measured, cloud, masked.cameras, depths)
             self.rooted(grown, written, scalp, head.scalp_map)
             return
         with self.report.stage("strands") as stage:
@@ -430,8 +433,18 @@ class _Stages:
                 )
         return strands
 
-    def refined(self, strands: Strands, measured: Measured, cloud: PointCloud) -> Strands:
-        """All strands refined together by the `measured` lines, where a sweep has placed these."""
+    def refined(
+        self,
+        strands: Strands,
+        measured: Measured,
+        cloud: PointCloud,
+        cameras: Sequence[Camera],
+        depths: Mapping[str, Array],
+    ) -> Strands:
+        """All strands refined together by the `measured` lines, where a sweep has placed these.
+
+        `depths` are those of each camera's hair pixels.
+        """
         o = self.options.refine
         with self.report.stage("refinement") as stage:
             lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
@@ -446,7 +459,8 @@ class _Stages:
                 stage.leave_out("refinement", why, "this stage; strands stay as they were grown")
                 return strands
             self.progress("refining strands", 0.8)
-            strands, figures = refine(strands, lines, o)
+            surfaces = [(camera, depths[camera.name]) for camera in cameras]
+            strands, figures = refine(strands, lines, o, surfaces)
             stage.figures.update(figures)
         return strands
 

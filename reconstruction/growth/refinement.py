@@ -3,12 +3,14 @@
 Growth traces strands one by one: many run into one ridge of the measured lines, and none knows of
 the others. Here strands are taken by what they add to what the others explain, and those that stay
 are moved onto the measured lines by Gauss-Newton, each line drawing only the strand nearest to it.
+What is guessed moves out of the cameras' sight: they would have measured it.
 """
 
 from __future__ import annotations
 
 import heapq
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -17,6 +19,7 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands, unit_or_zero
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
@@ -35,6 +38,9 @@ from the same pixels, and are off together. Followed further, they carry strands
 BEND_DEVIATION = 0.2  # per point: how the turn from one point to the next may change in all
 GUESS_DEVIATION = 3e-3  # metres that a point moves in all where nothing holds it
 COMPATIBLE = np.cos(np.radians(35.0))
+GUESSED = 0.05  # support up to which a point is guessed
+BEHIND, BEHIND_DEVIATION = 2e-3, 1e-3
+"""Metres behind what a camera sees where it does not see hair, and how exactly that holds."""
 
 _NEIGHBOURS = 6
 _SAMPLE = 1e-3  # metres between the points at which strands are compared
@@ -68,13 +74,55 @@ class Lines:
         return np.asarray(np.where(found, self.lines.confidence[index] * alike, 0.0).max(axis=1))
 
 
+Surfaces = Sequence[tuple[Camera, Array]]
+"""Cameras, each with the depth `(H, W)` of its hair's pixels, 0 elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Guesses:
+    """Points `which (G,)` of strands that no line supports, and the surfaces that cameras see."""
+
+    which: Ints
+    surfaces: Surfaces
+
+    @classmethod
+    def of(cls, strands: Strands, lines: Lines, surfaces: Surfaces) -> Guesses:
+        """Those of `strands`."""
+        support = lines.support(strands.points, strands.tangents())
+        return cls(np.flatnonzero(support < GUESSED), surfaces)
+
+    def out_of_sight(self, points: AnyFloats) -> Array:
+        """The way `(G, 3)`, metres, that takes each guessed one of `points (N, 3)` out of sight.
+
+        Along the ray of the camera that asks for most, to `BEHIND` behind what it sees there; 0 for
+        what lies there already, and for what lies more than `REACH` in front, which is no part of
+        that surface.
+        """
+        x = np.asarray(points[self.which], float)
+        out, most = np.zeros_like(x), np.zeros(len(x))
+        for camera, surface in self.surfaces:
+            seen, column, row, depth = camera.pixels_of(x)
+            there = surface[row, column]
+            front = there - depth
+            short = np.where(seen & (there > 0) & (front < REACH), front + BEHIND, 0.0)
+            more = short > most
+            most[more] = short[more]
+            out[more] = short[more, None] * unit_or_zero(x[more] - camera.center)
+        return out
+
+    def in_sight(self, points: AnyFloats) -> float:
+        """The share of `points (N, 3)` that are guessed where cameras would see them."""
+        return float(self.out_of_sight(points).any(axis=1).sum()) / max(len(points), 1)
+
+
 def refine(
-    strands: Strands, measured: Measured, options: RefineOptions
+    strands: Strands, measured: Measured, options: RefineOptions, surfaces: Surfaces = ()
 ) -> tuple[Strands, dict[str, Any]]:
     """Drop the strands that explain nothing new and move the others onto the measured lines.
 
-    Also returns JSON-ready figures on what became of them. At least one line must be measured.
-    Raises `ValueError` where no strand is worth enough to stay.
+    What is guessed moves behind the `surfaces`. Also returns JSON-ready figures on what became of
+    them. At least one line must be measured. Raises `ValueError` where no strand is worth enough to
+    stay.
     """
     lines = Lines(measured)
     kept = worthwhile(strands, lines, options.worth)
@@ -84,8 +132,9 @@ def refine(
             "0 keeps every strand"
         )
     start = out = strands.subset(kept)
+    guesses = Guesses.of(start, lines, surfaces)
     for _ in range(options.steps):
-        out = gauss_newton_step(out, start, lines)
+        out = gauss_newton_step(out, start, lines, guesses)
     moved = np.linalg.norm(out.points - start.points, axis=1)
     figures = {
         "removed": int((~kept).sum()),
@@ -95,6 +144,8 @@ def refine(
         "moved_mm": {f"p{q}": float(1e3 * np.percentile(moved, q)) for q in (50, 90, 99)},
         "residuals_before": residuals(start, lines),
         "residuals": residuals(out, lines),
+        "guessed_in_sight_before": guesses.in_sight(start.points),
+        "guessed_in_sight": guesses.in_sight(out.points),
     }
     return out, figures
 
@@ -181,12 +232,15 @@ def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
     }
 
 
-def gauss_newton_step(strands: Strands, start: Strands, lines: Lines) -> Strands:
+def gauss_newton_step(
+    strands: Strands, start: Strands, lines: Lines, guesses: Guesses | None = None
+) -> Strands:
     """All points moved at once: onto the lines, along their directions, bending little, roots kept.
 
     Residuals are linear in the points `x (N, 3)` once lines have their points, so a step is one
     banded solve. Each line holds the strand point that is nearest to it (across the line alone);
-    each segment turns to the mean of the lines around it. The displacement from `start`, the same
+    each segment turns to the mean of the lines around it; guessed points move out of sight, along
+    the ray that sees them. The displacement from `start`, the same
     strands before the first step, bends little from point to point and is held to 0: a prior on
     each step's own would let strands drift, with directions and away from the lines, without end.
     """
@@ -204,6 +258,8 @@ def gauss_newton_step(strands: Strands, start: Strands, lines: Lines) -> Strands
     right = -_product(diagonal, x - start.points)
     _hold_to_lines(x, tangents, lines, diagonal[0], right)
     _turn_to_lines(x, tangents, lines, ~last, diagonal, right)
+    if guesses is not None:
+        _hide(x, guesses, diagonal[0], right)
     return replace(strands, points=(x + _limited(_solve(diagonal, right))).astype(np.float32))
 
 
@@ -248,6 +304,14 @@ def _turn_to_lines(
     diagonal[1][i] -= block
     right[i] -= wanted
     right[i + 1] += wanted
+
+
+def _hide(x: Array, guesses: Guesses, own: Array, right: Array) -> None:
+    """Each guessed point that is in sight against where it is not, along the ray that sees it."""
+    way = guesses.out_of_sight(x)
+    ray = unit_or_zero(way)
+    own[guesses.which] += ray[:, :, None] * ray[:, None, :] / BEHIND_DEVIATION**2
+    right[guesses.which] += way / BEHIND_DEVIATION**2
 
 
 def _bend_little(x: Array, last: Bools, diagonal: Array) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
 from reconstruction.growth.refinement import _product, _solve, refine, supported
 from reconstruction.reconstruct_options import RefineOptions
@@ -127,6 +128,50 @@ def test_what_lies_far_from_every_line_hardly_moves() -> None:
     low = start.points[:, 2] < 15e-3
     moved = np.linalg.norm(made.points - start.points, axis=1)
     assert moved[low].max() < 0.2 * np.median(moved[start.points[:, 2] > 45e-3])
+
+
+@pytest.mark.parametrize(
+    ("before", "expected"),
+    [
+        (1e-3, 1.7e-3),  # in front of what is seen there
+        (-1.5e-3, 1.95e-3),  # behind it, but not out of sight
+        (-4e-3, 4e-3),  # out of sight
+        (8e-3, -8e-3),  # nothing of that surface
+    ],
+)
+def test_what_is_guessed_is_not_where_cameras_would_see_it(before: float, expected: float) -> None:
+    """A wall 0.5 m before a camera that looks along y; lines are measured on its left half.
+
+    What moves comes to the mean of 2 mm behind it (1 mm) and of where it was (3 mm).
+    """
+    axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    camera = Camera(
+        name="c",
+        K=np.array([[500.0, 0, 49.5], [0, 500, 49.5], [0, 0, 1]]),
+        R=axes,
+        t=-axes @ [0, -0.5, 0],
+        width=100,
+        height=100,
+    )
+    z = np.arange(-0.03, 0.03, 1e-3)
+    seen = np.stack([np.full_like(z, -0.02), np.zeros_like(z), z], axis=1)
+    up = np.tile([0.0, 0.0, 1.0], (len(z), 1))
+    given = Strands.from_list([seen, seen + np.array([0.04, -before, 0])])
+    surface = np.full((100, 100), 0.5)
+    made, figures = refine(
+        given, Measured(seen, up, np.ones(len(z))), RefineOptions(worth=0), [(camera, surface)]
+    )
+    middle = slice(len(z) + 20, len(z) + 50)  # the root stands
+    np.testing.assert_allclose(made.points[: len(z)], seen, atol=1e-6)  # what is measured stays
+    np.testing.assert_allclose(made.points[middle, 1], expected, atol=0.1e-3)
+    np.testing.assert_allclose(made.points[len(z)], given.points[len(z)], atol=1e-6)
+    surface[:] = 0  # a camera that sees no hair there says nothing
+    still, _ = refine(
+        given, Measured(seen, up, np.ones(len(z))), RefineOptions(worth=0), [(camera, surface)]
+    )
+    np.testing.assert_allclose(still.points, given.points, atol=1e-6)
+    in_sight = 0.5 if -2e-3 < before < 4e-3 else 0.0
+    assert figures["guessed_in_sight_before"] == in_sight
 
 
 def test_the_banded_solution_and_product_are_the_dense_ones() -> None:
