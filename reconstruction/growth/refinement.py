@@ -39,7 +39,7 @@ BEND_DEVIATION = 0.2  # per point: how the turn from one point to the next may c
 GUESS_DEVIATION = 3e-3  # metres that a point moves in all where nothing holds it
 COMPATIBLE = np.cos(np.radians(35.0))
 GUESSED = 0.05  # support up to which a point is guessed
-BEHIND, BEHIND_DEVIATION = 2e-3, 1e-3
+BEHIND, BEHIND_DEVIATION = 1e-3, 1e-3
 """Metres behind what a camera sees where it does not see hair, and how exactly that holds."""
 
 _NEIGHBOURS = 6
