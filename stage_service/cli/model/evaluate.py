@@ -133,7 +133,10 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
         results = _demo_results(path)
         by_subject.setdefault(results["subject"], []).append((path, results))
     columns: dict[str, list[dict[str, Any]]] = {}
+    stems = [Path(subject).stem for subject in by_subject]
     for subject, found in by_subject.items():
+        if stems.count(Path(subject).stem) == 1:  # strand files by their names
+            subject = Path(subject).stem
         seeds = [results["seed"] for _, results in found]
         if len(set(seeds)) == len(seeds):
             many = "s" if len(seeds) > 1 else ""

@@ -146,6 +146,7 @@ def _rows() -> dict[str, list[_Part]]:
     rows["β_M to render these strands with"] = [(partial(_beta_m, fit="fitted"), ".2f", "")]
     turns = partial(_fibre, key="disorder_deg")
     rows["turns of single hairs beyond our strands"] = [(turns, ".0f", "°")]
+    rows["σ_a, the channel that is furthest off"] = [(_absorption_error, ".0f", " %")]
     return rows
 
 
@@ -194,6 +195,15 @@ def _fibre(results: Mapping[str, Any], key: str) -> float | None:
 def _fibre_error(results: Mapping[str, Any]) -> float | None:
     value, error = (_fibre(results, key) for key in ("fibre_beta_m", "fibre_beta_m_error"))
     return None if value is None or error is None else value * error
+
+
+def _absorption_error(results: Mapping[str, Any]) -> float | None:
+    """By how much, in per cent, the channel of σ_a is off that is furthest from the truth."""
+    fits = results["appearance"]
+    fitted, true = (fits.get(fit, {}).get("sigma_a") for fit in ("fitted", "true"))
+    if not fitted or not true or not all(true):
+        return None
+    return 100 * max(abs(a / b - 1) for a, b in zip(fitted, true, strict=True))
 
 
 def _per_cent(value: Any) -> str:

@@ -524,11 +524,13 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     assert rest[-1] == "[1] fit: the roughness is at its bound"
     again = tmp_path / "again.json"
     found = {"fibre_beta_m": 0.3, "fibre_beta_m_error": 0.1, "disorder_deg": 14.2}
-    results["appearance"]["fitted"] |= {"beta_m": 0.3, **found}
+    results["appearance"]["fitted"] |= {"beta_m": 0.3, "sigma_a": [0.11, 0.15, 0.5], **found}
+    results["appearance"]["true"]["sigma_a"] = [0.1, 0.2, 0.45]
     again.write_text(json.dumps(results))
     assert main(["evaluate", "table", str(again)]) == 0
     rows = {"| β_M of the fibres: ours | 0.30 |", "| β_M of the fibres: standard error | 0.03 |"}
     rows |= {"| turns of single hairs beyond our strands | 14° |"}
+    rows |= {"| σ_a, the channel that is furthest off | 25 % |"}
     assert rows <= set(capsys.readouterr().out.splitlines())
     code, data = run(capsys, "evaluate", "table", file, again)
     assert (code, list(data["results"])) == (0, [f"curly, seed 3 ({f})" for f in (file, again)])
@@ -545,6 +547,17 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     code, data = run(capsys, "evaluate", "table", file, again)
     (spread,) = data["figures"]["curly, seeds 3, 4"]["β_M to render these strands with"]
     assert spread == pytest.approx({"mean": 0.587, "std": 0.3 * 2**0.5, "n": 2})
+    of_files = {"| F at 1 mm/10°, visible points: ours | 25.3 % | 25.3 % |"}
+    for names, heads in (
+        (("a/lee.npz", "b/kim.tfx"), ("lee", "kim")),
+        (("a/hair.npz", "b/hair.tfx"), ("a/hair.npz", "b/hair.tfx")),
+    ):
+        for path, subject in zip((file, again), names, strict=True):
+            path.write_text(json.dumps({**results, "subject": subject}))
+        assert main(["evaluate", "table", str(file), str(again)]) == 0
+        head, _, *rest = capsys.readouterr().out.splitlines()
+        assert head == f"|  | {heads[0]}, seed 3 [1] | {heads[1]}, seed 3 [2] |"
+        assert of_files <= set(rest)
     damaged = {**results, "geometry": {}}
     del results["subject"]
     for text, said in (
