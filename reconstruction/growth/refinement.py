@@ -110,9 +110,10 @@ class Guesses:
             out[more] = short[more, None] * unit_or_zero(x[more] - camera.center)
         return out
 
-    def in_sight(self, points: AnyFloats) -> float:
-        """The share of `points (N, 3)` that are guessed where cameras would see them."""
-        return float(self.out_of_sight(points).any(axis=1).sum()) / max(len(points), 1)
+    def in_front(self, points: AnyFloats) -> float:
+        """The share of `points (N, 3)` that are guessed in front of what cameras see."""
+        way = np.linalg.norm(self.out_of_sight(points), axis=1)
+        return float((way > BEHIND).sum()) / max(len(points), 1)
 
 
 def refine(
@@ -144,8 +145,8 @@ def refine(
         "moved_mm": {f"p{q}": float(1e3 * np.percentile(moved, q)) for q in (50, 90, 99)},
         "residuals_before": residuals(start, lines),
         "residuals": residuals(out, lines),
-        "guessed_in_sight_before": guesses.in_sight(start.points),
-        "guessed_in_sight": guesses.in_sight(out.points),
+        "guessed_in_front_before": guesses.in_front(start.points),
+        "guessed_in_front": guesses.in_front(out.points),
     }
     return out, figures
 
@@ -232,9 +233,7 @@ def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
     }
 
 
-def gauss_newton_step(
-    strands: Strands, start: Strands, lines: Lines, guesses: Guesses | None = None
-) -> Strands:
+def gauss_newton_step(strands: Strands, start: Strands, lines: Lines, guesses: Guesses) -> Strands:
     """All points moved at once: onto the lines, along their directions, bending little, roots kept.
 
     Residuals are linear in the points `x (N, 3)` once lines have their points, so a step is one
@@ -258,8 +257,7 @@ def gauss_newton_step(
     right = -_product(diagonal, x - start.points)
     _hold_to_lines(x, tangents, lines, diagonal[0], right)
     _turn_to_lines(x, tangents, lines, ~last, diagonal, right)
-    if guesses is not None:
-        _hide(x, guesses, diagonal[0], right)
+    _hide(x, guesses, diagonal[0], right)
     return replace(strands, points=(x + _limited(_solve(diagonal, right))).astype(np.float32))
 
 
