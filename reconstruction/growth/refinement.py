@@ -40,7 +40,7 @@ GUESS_DEVIATION = 3e-3  # metres that a point moves in all where nothing holds i
 COMPATIBLE = np.cos(np.radians(35.0))
 GUESSED = 0.05  # support up to which a point is guessed
 BEHIND, BEHIND_DEVIATION = 1e-3, 1e-3
-"""Metres behind what a camera sees where it does not see hair, and how exactly that holds."""
+"""Metres behind what a camera sees from which on hair is out of its sight, and how exactly."""
 
 _NEIGHBOURS = 6
 _SAMPLE = 1e-3  # metres between the points at which strands are compared
@@ -239,9 +239,9 @@ def gauss_newton_step(strands: Strands, start: Strands, lines: Lines, guesses: G
     Residuals are linear in the points `x (N, 3)` once lines have their points, so a step is one
     banded solve. Each line holds the strand point that is nearest to it (across the line alone);
     each segment turns to the mean of the lines around it; guessed points move out of sight, along
-    the ray that sees them. The displacement from `start`, the same
-    strands before the first step, bends little from point to point and is held to 0: a prior on
-    each step's own would let strands drift, with directions and away from the lines, without end.
+    the ray that sees them. The displacement from `start`, the same strands before the first step,
+    bends little from point to point and is held to 0: a prior on each step's own would let strands
+    drift, with directions and away from the lines, without end.
     """
     x = strands.points.astype(float)
     tangents = strands.tangents().astype(float)
