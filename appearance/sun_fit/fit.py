@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import count as count_from
 
 import numpy as np
@@ -29,7 +30,13 @@ from appearance.sun_fit.disorder import (
     disordered,
     match_disorder,
 )
-from appearance.sun_fit.fit_pixels import FitPixels, observed_pixels, reached
+from appearance.sun_fit.fit_pixels import (
+    COVERED,
+    FitPixels,
+    covered,
+    observed_pixels,
+    reached,
+)
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
 from appearance.sun_fit.highlights import WINDOW, Highlight, Highlights
 from appearance.sun_fit.light_correlation import Roughness, match_roughness
@@ -275,6 +282,11 @@ class SunFit:
             stage.warn(warning)
         return Roughnesses(as_are, fibres, plain, printed, first)
 
+    @cached_property
+    def covered(self) -> FitPixels:
+        """The pixels by which colours are compared."""
+        return covered(self.pixels, self.scene)
+
     def colour(
         self,
         beta_m: float,
@@ -298,12 +310,21 @@ class SunFit:
         base = HairAppearance((0.1, 0.1, 0.1), beta_m, BETA_N)
         result = fit_colour(
             self.scene.with_hair(base).with_skin(skin),
-            self.pixels,
+            self.covered,
             start=start,
             iterations=iterations or self.options.iterations,
             sampling=Sampling(self.options.colour_spp, MAX_DEPTH, self.seed),
             on_iteration=on_iteration,
         )
+        seen, kept = (sum(len(o.pixels) for o in p.hair) for p in (self.pixels, self.covered))
+        if self.covered.hair is self.pixels.hair:
+            stage.warn(
+                "the strands cover few of the pixels that show hair: the hair is found too light "
+                "where they are missing; are masks and geometry of one capture?"
+            )
+        elif kept < seen:
+            why = f"the strands cover less than {COVERED:.0%} of each"
+            stage.leave_out(f"{seen - kept} of {seen} hair pixels", why, "their renderings")
         stage.figures |= {
             "colour": list(result.colour),
             "sigma_a": list(result.hair.sigma_a),

@@ -9,6 +9,8 @@ import numpy as np
 
 from appearance.metrics.scores import Exposure
 from appearance.observations import Observed, chosen, observe
+from appearance.render.coverage import coverage
+from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.disorder import BESIDE
 from appearance.sun_fit.options import FitOptions
 from reconstruction import Capture, Model, Progress, Stage
@@ -18,6 +20,8 @@ SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
 COMPARED_PIXELS = 1500
 """Pixels a camera, about, that are compared with others beside them."""
+COVERED = 0.9
+"""Share of a pixel that the model's hair, or skin, covers where colours are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +112,24 @@ def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Sta
     stage.figures["lights_that_reach_hair"] = len(lit)
     each = (pixels.hair, pixels.skin, pixels.clusters)
     return FitPixels(*([o.under(lit) for o in some] for some in each))
+
+
+def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
+    """Those of hair and skin that show the scene's hair or head, too, by `COVERED`.
+
+    Where strands are missing, or stand before bare skin, a rendering is of another colour than the
+    hair, whatever the hair's is. All of them where the scene covers less than a tenth.
+    """
+
+    def of(views: Sequence[Observed], what: str) -> Sequence[Observed]:
+        shown = [
+            o.where(coverage(scene, o.camera)[what].ravel()[o.pixels] >= COVERED) for o in views
+        ]
+        left = sum(len(o.pixels) for o in shown)
+        enough = 10 * left >= sum(len(o.pixels) for o in views)
+        return [o for o in shown if len(o.pixels)] if enough else views
+
+    return FitPixels(of(pixels.hair, "hair"), of(pixels.skin, "head"), pixels.clusters)
 
 
 def _beside(pixels: Ints, mask: Bools) -> Ints:

@@ -9,7 +9,7 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import DiffuseHair
-from appearance.sun_fit.fit_pixels import FitPixels
+from appearance.sun_fit.fit_pixels import FitPixels, covered
 from appearance.sun_fit.fitted_appearance import absorption_warnings
 from appearance.sun_fit.mirror_samples import (
     LobeBins,
@@ -178,6 +178,27 @@ def test_colour_of_rendered_hair_is_recovered(wisp):
     np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.12)
     assert found.errors[-1] < 0.06  # of two noisy renderings
     assert found.errors[-1] < found.errors[0]
+
+
+def test_what_strands_lack_does_not_lighten_the_hair(wisp):
+    """A third of the pixels shows hair like the rest, where there is no strand."""
+    strands, camera, lights = wisp
+    truth = HairAppearance((0.1, 0.3, 0.9), 0.3, 0.2)
+    scene = build_scene(strands.subset(strands.roots[:, 0] < 0.01), None, hair=truth)
+    o = observed(scene, camera, lights[::6], 64)
+    bare = o.pixels % camera.width > 11
+    radiance = np.where(bare[:, None], o.radiance[:, ~bare].mean(axis=1, keepdims=True), o.radiance)
+    seen = FitPixels([replace(o, radiance=radiance)])
+    kept = covered(seen, scene)
+    assert 0.3 < len(kept.hair[0].pixels) / len(o.pixels) < 0.75
+    start = scene.with_hair(replace(truth, sigma_a=(0.5, 0.5, 0.5)))
+    found, lighter = (
+        fit_colour(start, p, sampling=replace(SAMPLING, spp=256)) for p in (kept, seen)
+    )
+    np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.12)
+    assert np.max(np.divide(lighter.hair.sigma_a, truth.sigma_a)) < 0.8
+    nothing = build_scene(strands.subset(strands.roots[:, 0] < -0.035), None, hair=truth)
+    assert covered(seen, nothing).hair is seen.hair
 
 
 def test_a_colour_at_an_end_of_its_range_has_no_error():
