@@ -30,6 +30,7 @@ from appearance.render.smoothed import olat_smoothed
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import HairScene
+from appearance.sun_fit.fit_pixels import FitPixels, covered
 from appearance.sun_fit.roughness_and_colour import fit_diffuse
 from reconstruction import Camera, Capture, Light, Model, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Array, Bools
@@ -147,7 +148,7 @@ class _Comparison:
         seen = [o.radiance[o.valid] for o in training if o.valid.any()]
         colour = np.mean([x.mean(axis=0) for x in seen], axis=0)
         scene = self.fitted.scene()
-        albedo = fit_diffuse(scene, training, seed=self.seed)
+        albedo = fit_diffuse(scene, covered(FitPixels(training), scene).hair, seed=self.seed)
         both = FittedModel.alternatives(self.model, self.capture)
         lit = {name: (fit.scene(), fit) for name, fit in both.items()}
         if self.fitted.field is not None and not both:
