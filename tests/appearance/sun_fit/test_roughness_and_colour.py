@@ -195,7 +195,7 @@ def test_what_strands_lack_does_not_lighten_the_hair(wisp):
     found, lighter = (
         fit_colour(start, p, sampling=replace(SAMPLING, spp=256)) for p in (kept, seen)
     )
-    np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.12)
+    np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.15)
     assert np.max(np.divide(lighter.hair.sigma_a, truth.sigma_a)) < 0.8
     nothing = build_scene(strands.subset(strands.roots[:, 0] < -0.035), None, hair=truth)
     assert covered(seen, nothing).hair is seen.hair
