@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appearance import HairAppearance, build_scene
-from appearance.render.coverage import coverage, pixel_coverage
+from appearance.render.coverage import coverage
 from reconstruction import Camera, Mesh, Strands
 
 HAIR = HairAppearance((0.1, 0.1, 0.1), 0.3, 0.2)
@@ -41,15 +41,8 @@ def test_wall_and_fibres_cover_the_columns_that_they_stand_in(scene):
     found = coverage(scene, camera())
     np.testing.assert_array_equal(found["head"], head)
     np.testing.assert_array_equal(found["hair"], hair)
-    some = np.array([4, 5, 11, 12, 255, 5 * 16 + 4])
-    found = pixel_coverage(scene, camera(), some, spp=4)
-    np.testing.assert_array_equal(found["head"], head.ravel()[some])
-    np.testing.assert_array_equal(found["hair"], hair.ravel()[some])
 
 
-def test_no_pixels_are_none_and_pixels_beyond_the_picture_an_error(scene):
-    assert [len(share) for share in pixel_coverage(scene, camera(), []).values()] == [0, 0]
-    with pytest.raises(ValueError, match="flat indices in"):
-        pixel_coverage(scene, camera(), [256])
+def test_without_samples_it_is_an_error(scene):
     with pytest.raises(ValueError, match="spp must be positive"):
-        pixel_coverage(scene, camera(), [0], spp=0)
+        coverage(scene, camera(), spp=0)
