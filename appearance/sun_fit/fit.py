@@ -34,6 +34,7 @@ from appearance.sun_fit.fit_pixels import (
     COVERED,
     FitPixels,
     covered,
+    in_front,
     observed_pixels,
     reached,
 )
@@ -57,6 +58,7 @@ from appearance.sun_fit.roughness_and_colour import (
     MOST_SKIN,
     Colours,
     Lobe,
+    absorption_error,
     fit_colour,
     fit_lobe,
     fit_lobe_as_printed,
@@ -130,9 +132,7 @@ def fit(
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
             stage.warn("no camera sees skin: its colour is a guess")
-        red, green, blue = (
-            x if np.isfinite(x) else None for x in colours.absorption_error(first.pairs).tolist()
-        )
+        red, green, blue = fitting.absorption_error(colours)
         stage.figures["sigma_a_error"] = [red, green, blue]
         for warning in absorption_warnings(colours.hair.sigma_a, (red, green, blue)):
             stage.warn(warning)
@@ -216,7 +216,9 @@ class SunFit:
         channel = int(np.argmin(np.where(mean > 0, mean, np.inf)))  # a black one tells nothing
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
-        first = self.colour(plain.beta_m, None, np.array(self.scene.skin), Stage("first colour"))
+        skin, unseen = np.array(self.scene.skin), Stage("first colour")
+        # that of all light: near a highlight, what comes from other fibres does from all sides
+        first = self.colour(plain.beta_m, None, skin, unseen, pixels=self.covered)
         captured, highlights = self._highlights(views, channel)
         series = Series("roughness", "standard error of log β_M")
         stage.series.append(series)
@@ -287,17 +289,23 @@ class SunFit:
         """The pixels by which colours are compared."""
         return covered(self.pixels, self.scene)
 
+    @cached_property
+    def in_front(self) -> FitPixels:
+        """Those, under the lights by which hair is."""
+        return in_front(self.covered, self.scene)
+
     def colour(
         self,
         beta_m: float,
         start: Array | None,
         skin: Array,
         stage: Stage,
-        iterations: int | None = None,
+        pixels: FitPixels | None = None,
     ) -> Colours:
         """Hair and skin colour at a roughness, from albedos `start (3,)` and `skin (3,)`.
 
-        Errors against run time go into `stage`.
+        They are matched in `pixels`, those `in_front` unless given. Errors against run time go into
+        `stage`.
         """
         began = time.perf_counter()
         series = Series("hair colour", "relative error of the mean colour under uniform light")
@@ -310,9 +318,9 @@ class SunFit:
         base = HairAppearance((0.1, 0.1, 0.1), beta_m, BETA_N)
         result = fit_colour(
             self.scene.with_hair(base).with_skin(skin),
-            self.covered,
+            pixels or self.in_front,
             start=start,
-            iterations=iterations or self.options.iterations,
+            iterations=self.options.iterations,
             sampling=Sampling(self.options.colour_spp, MAX_DEPTH, self.seed),
             on_iteration=on_iteration,
         )
@@ -322,9 +330,17 @@ class SunFit:
                 "the strands cover few of the pixels that show hair: the hair is found too light "
                 "where they are missing; are masks and geometry of one capture?"
             )
-        elif kept < seen:
+        elif self.in_front.hair is self.covered.hair:
+            stage.warn(
+                "no light stands on its camera's side of the hair: its colour is told from light "
+                "that came through it, by how much of it the strands let through"
+            )
+        if kept < seen:
             why = f"the strands cover less than {COVERED:.0%} of each"
             stage.leave_out(f"{seen - kept} of {seen} hair pixels", why, "their renderings")
+        if self.in_front.hair is not self.covered.hair:
+            why = "strands that are off change light that comes through them most"
+            stage.leave_out("lights behind the hair", why, "their renderings")
         stage.figures |= {
             "colour": list(result.colour),
             "sigma_a": list(result.hair.sigma_a),
@@ -345,6 +361,13 @@ class SunFit:
             off = f"the mean colour is off by {min(result.errors):.0%}"
             stage.warn(f"{off}: is the geometry whole?")
         return result
+
+    def absorption_error(self, colours: Colours) -> list[float | None]:
+        """Standard error of log sigma_a of each channel; None where the colour does not tell it."""
+        self.progress("how the colour answers", 0.97)
+        sampling = Sampling(self.options.colour_spp, MAX_DEPTH, self.seed)
+        errors = absorption_error(self.scene, self.covered.hair, colours, sampling)
+        return [float(x) if np.isfinite(x) else None for x in errors]
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:
         """Pixels of hair of one direction, their fibres, the lights near a mirror."""

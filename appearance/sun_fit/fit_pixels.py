@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from appearance.metrics.scores import Exposure
 from appearance.observations import Observed, chosen, observe
 from appearance.render.coverage import coverage
-from appearance.scene.hair_scene import HairScene
+from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.sun_fit.disorder import BESIDE
 from appearance.sun_fit.options import FitOptions
 from reconstruction import Capture, Model, Progress, Stage
-from reconstruction.arrays import Bools, Ints
+from reconstruction.arrays import Array, Bools, Ints
 
 SKIN_PIXELS = 200
 """Pixels a camera that tell the skin's colour."""
@@ -130,6 +130,28 @@ def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
         return [o for o in shown if len(o.pixels)] if enough else views
 
     return FitPixels(of(pixels.hair, "hair"), of(pixels.skin, "head"), pixels.clusters)
+
+
+def in_front(pixels: FitPixels, scene: HairScene) -> FitPixels:
+    """The hair under lights on its camera's side of the scene; under all where none is there.
+
+    How much light comes through hair from behind is a matter of how many strands there are and how
+    far apart, which a reconstruction knows less well than where they lie.
+    """
+    nearer = [
+        (o, np.flatnonzero(cosines_of_lights(scene, o) > 0).astype(np.int64)) for o in pixels.hair
+    ]
+    lit = [o.under(lights) for o, lights in nearer if len(lights)]
+    return replace(pixels, hair=lit if any(o.valid.any() for o in lit) else pixels.hair)
+
+
+def cosines_of_lights(scene: HairScene, o: Observed) -> Array:
+    """Cosine `(L,)` between the ways from the middle of the scene to each light and the camera."""
+    middle = np.array(scene.mi_scene.bbox().center()).ravel() / SCALE
+    ways = np.array([x.position for x in o.lights]).reshape(-1, 3) - middle
+    towards = o.camera.center - middle
+    lengths = np.linalg.norm(ways, axis=1) * np.linalg.norm(towards)
+    return np.asarray(ways @ towards / np.maximum(lengths, 1e-12))
 
 
 def _beside(pixels: Ints, mask: Bools) -> Ints:

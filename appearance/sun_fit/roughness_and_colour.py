@@ -25,17 +25,21 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from appearance.scene.hair_scene import HairScene
-from appearance.sun_fit.fit_pixels import FitPixels
+from appearance.sun_fit.fit_pixels import FitPixels, cosines_of_lights
 from appearance.sun_fit.hair_parts import SIDE, parts_of
 from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
-LEAST_ALBEDO, MOST_ALBEDO = 0.005, 0.995
+LEAST_ALBEDO, MOST_ALBEDO = 0.001, 0.995
 LEAST_SKIN, MOST_SKIN = 0.005, 0.98
 SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
+MORE = 2.0
+"""Times as much absorption, and as little, whose renderings say how the mean colour answers."""
+LEAST_PATHS = 100_000
+"""Of each of those renderings: noise would look like an answer, or hide one."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +101,7 @@ class Colours:
     """What Algorithm 1 found: C, its hair and the skin's albedo.
 
     `pairs` are the C that were rendered, each `(3,)`, and the hair's mean colours; `errors` how far
-    off each was, relative. `scatter (3,)` is the standard error of the logarithm of the last one's
-    mean over the captured one's, over parts of the hair and between views.
+    off each was, relative.
     """
 
     colour: tuple[float, float, float]
@@ -106,24 +109,6 @@ class Colours:
     skin: tuple[float, float, float]
     pairs: list[tuple[Array, Array]]
     errors: list[float]
-    scatter: Array
-
-    def absorption_error(self, earlier: Sequence[tuple[Array, Array]] = ()) -> Array:
-        """Standard error of log sigma_a `(3,)`: `scatter`, by how the mean colour answers to C.
-
-        That is read off all pairs, those `earlier` too. It is infinite where the colour does not
-        answer, as black hair is no darker for more absorption, and at an end of C's range.
-        """
-        c, r = (
-            np.log(np.maximum(x, 1e-12)) for x in np.array([*earlier, *self.pairs]).swapaxes(0, 1)
-        )
-        spread = ((c - c.mean(0)) ** 2).sum(0)
-        answers = ((c - c.mean(0)) * (r - r.mean(0))).sum(0)
-        gradient = np.where(spread > 1e-4, answers / np.maximum(spread, 1e-4), 1.0)
-        colour = np.array(self.colour)
-        slope = gradient * np.abs(np.log(colour))
-        known = (slope > 0) & (colour > LEAST_ALBEDO) & (colour < MOST_ALBEDO)
-        return np.where(known, 2 * self.scatter / np.maximum(slope, 1e-12), np.inf)
 
 
 def fit_colour(
@@ -172,8 +157,35 @@ def fit_colour(
             break
         colour = next_colour(pairs, target)
     best = _with_colour(scene.hair, colour, beta_n)
-    scatter = _scatter(pixels.hair, views)
-    return Colours(_rgb(colour), best, _rgb(albedo), pairs, errors, scatter)
+    return Colours(_rgb(colour), best, _rgb(albedo), pairs, errors)
+
+
+def absorption_error(
+    scene: HairScene, hair: Sequence[Observed], colours: Colours, sampling: Sampling = SAMPLING
+) -> Array:
+    """Standard error of log sigma_a `(3,)`, over pixels under lights from all around.
+
+    The mean captured colour over the rendered one scatters over parts of the hair, between views,
+    and between lights before, beside and behind it, which geometry that is off has disagree. By how
+    much the mean colour answers to sigma_a tells what that means for it. Infinite where it does not
+    answer, as black hair is no darker for more absorption, and at an end of C's range.
+    """
+    paths = sampling.spp * sum(len(o.pixels) for o in hair)
+    sampling = replace(sampling, spp=sampling.spp * max(1, LEAST_PATHS // max(paths, 1)))
+    as_dark = (1 / MORE, 1.0, MORE)
+    each = [
+        replace(colours.hair, sigma_a=_rgb(x * np.array(colours.hair.sigma_a))) for x in as_dark
+    ]
+    less, lit, more = (
+        [_rendered(scene.with_hair(x).with_skin(colours.skin), o, sampling) for o in hair]
+        for x in each
+    )
+    bright, dark = (np.maximum(_mean_colour(views), 1e-12) for views in (less, more))
+    slope = np.log(bright / dark) / (2 * np.log(MORE))
+    colour = np.array(colours.colour)
+    known = (slope > 0) & (colour > LEAST_ALBEDO) & (colour < MOST_ALBEDO)
+    scatter = np.maximum(_scatter(hair, lit), _disagreement(scene, hair, lit))
+    return np.where(known, scatter / np.where(known, slope, 1.0), np.inf)
 
 
 def fit_diffuse(
@@ -221,7 +233,8 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
 
 
 def _off(seen: Array, target: Array) -> float:
-    return float(np.linalg.norm(seen - target) / np.linalg.norm(target))
+    """Relative error of the channel that is furthest off; one without light does not count."""
+    return float(np.max(np.abs(seen - target) / np.maximum(target, 1e-3 * target.max())))
 
 
 def _with_colour(hair: HairAppearance, colour: Array, beta_n: float) -> HairAppearance:
@@ -255,6 +268,26 @@ def _scatter(captured: Sequence[Observed], rendered: Sequence[Observed]) -> Arra
         views = np.log(np.maximum(one.sum(1), 1e-12) / np.maximum(other.sum(1), 1e-12))
         scatter = np.maximum(scatter, views.std(axis=0, ddof=1) / np.sqrt(len(views)))
     return np.asarray(scatter)
+
+
+def _disagreement(
+    scene: HairScene, captured: Sequence[Observed], rendered: Sequence[Observed]
+) -> Array:
+    """Standard error `(3,)` of the log ratio of mean colours between thirds of the lights."""
+    sides = [np.digitize(cosines_of_lights(scene, o), (-1 / 3, 1 / 3)) for o in captured]
+    ratios = []
+    for side in range(3):
+        one, other = (
+            _mean_colour(
+                [o.under(np.flatnonzero(s == side)) for o, s in zip(x, sides, strict=True)]
+            )
+            for x in (captured, rendered)
+        )
+        if (one > 0).all() and (other > 0).all():
+            ratios.append(np.log(one / other))
+    if len(ratios) < 2:
+        return np.zeros(3)
+    return np.asarray(np.std(ratios, axis=0, ddof=1) / np.sqrt(len(ratios)))
 
 
 def _sums(o: Observed) -> Array:

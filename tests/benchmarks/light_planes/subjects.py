@@ -33,7 +33,9 @@ from reconstruction.head.fit import HeadHints, fit_head
 from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
 from stage_service.cli.support.commands import rig_path
 
-CAMERAS, PROJECTORS = 8, 3
+CAMERAS = 8
+PROJECTORS = [(180, 15), (300, 35), (60, 15), (0, 45), (120, 35), (240, 15)]
+"""Azimuth from the front and elevation in degrees; a rig has the first three, or more."""
 WIDTH, HEIGHT, ROWS, LIGHTS = 320, 400, 256, 120
 DRIFT_MM = 4.0
 OPTIONS = ReconstructOptions(
@@ -78,8 +80,8 @@ FRAMINGS = {
 }
 
 
-def rig_text(framing: Framing, tracking_every: int = 64) -> str:
-    """A rig file: 8 cameras of 320×400 around, every other one raised, 3 projectors of 256 rows."""
+def rig_text(framing: Framing, tracking_every: int = 64, projectors: int = 3) -> str:
+    """A rig file: 8 cameras of 320×400 around, every other one raised, projectors of 256 rows."""
 
     def place(azimuth_deg: float, elevation_deg: float, distance: float) -> list[float]:
         a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
@@ -96,14 +98,14 @@ def rig_text(framing: Framing, tracking_every: int = 64) -> str:
         for k in range(CAMERAS)
     ]
     wide = Optics(framing.target, math.degrees(2 * math.atan(0.625 * framing.width / 1.1)))
-    projectors = [
+    sweeping = [
         wide.device("projectors", k, place(azimuth, elevation, 1.1))
         + f"roll_deg = 90.0\nwidth = {rows * 5 // 4}\nheight = {rows}\n"
         "intensity = [20.0, 20.0, 20.0]\nline_sigma = 0.6"
-        for k, (azimuth, elevation) in enumerate([(180, 15), (300, 35), (60, 15)])
+        for k, (azimuth, elevation) in enumerate(PROJECTORS[:projectors])
     ]
     capture = f"tracking_every = {tracking_every}\n" + levels(all_on=0.05)
-    return rig_file("light_planes", dome, [*cameras, *projectors], capture)
+    return rig_file("light_planes", dome, [*cameras, *sweeping], capture)
 
 
 def ponytail(source: Path, folder: Path) -> tuple[Path, Path]:
@@ -120,7 +122,13 @@ def ponytail(source: Path, folder: Path) -> tuple[Path, Path]:
 
 
 def subject_capture(
-    name: str, framing: Framing, cache: Path, drift_mm: float, spp: int = 16, seed: int = 0
+    name: str,
+    framing: Framing,
+    cache: Path,
+    drift_mm: float,
+    spp: int = 16,
+    seed: int = 0,
+    projectors: int = 3,
 ) -> SimulatedCapture:
     """The capture of a subject of `FRAMINGS`."""
     subject, head, data = name, None, data_folder() or Path()
@@ -135,7 +143,8 @@ def subject_capture(
                     file.replace(made / file.name)
         subject, head = (str(made / f) for f in ("ponytail.npz", "ponytail_head.obj"))
     label = f"{name}-{'still' if drift_mm == 0 else 'drifting'}"
-    rig = rig_text(framing, framing.rows if drift_mm > 0 else 64 // framing.coarser)
+    tracking = framing.rows if drift_mm > 0 else 64 // framing.coarser
+    rig = rig_text(framing, tracking, projectors)
     return SimulatedCapture(label, rig, subject, head, drift_mm, spp, seed)
 
 
@@ -162,7 +171,9 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         else:
             drifts = (0.0, DRIFT_MM) if "drifting" in also else (0.0,)
             made = [
-                subject_capture(name, framing, args.cache, drift, seed=args.seed)
+                subject_capture(
+                    name, framing, args.cache, drift, seed=args.seed, projectors=args.projectors
+                )
                 for drift in drifts
             ]
             options = replace(OPTIONS, max_length=framing.longest)
@@ -186,4 +197,11 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 PARTS = ["grown", "drifting", "without_help", "studies"]
 ALSO = option("--also", "beside the still capture", nargs="*", choices=PARTS, default=PARTS)
-BENCHMARK = Benchmark(run, (CACHE, ONLY, ALSO))
+SWEEPING = option(
+    "--projectors",
+    "how many sweep (the demo's rig has three)",
+    type=int,
+    choices=range(1, len(PROJECTORS) + 1),
+    default=3,
+)
+BENCHMARK = Benchmark(run, (CACHE, ONLY, ALSO, SWEEPING))
