@@ -31,7 +31,7 @@ from appearance.sun_fit.mirror_samples import LobeBins
 from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
-LEAST_ALBEDO, MOST_ALBEDO = 0.001, 0.995
+LEAST_ALBEDO, MOST_ALBEDO = 0.005, 0.995
 LEAST_SKIN, MOST_SKIN = 0.005, 0.98
 SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
@@ -233,8 +233,7 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
 
 
 def _off(seen: Array, target: Array) -> float:
-    """Relative error of the channel that is furthest off; one without light does not count."""
-    return float(np.max(np.abs(seen - target) / np.maximum(target, 1e-3 * target.max())))
+    return float(np.linalg.norm(seen - target) / np.linalg.norm(target))
 
 
 def _with_colour(hair: HairAppearance, colour: Array, beta_n: float) -> HairAppearance:

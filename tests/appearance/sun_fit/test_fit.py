@@ -31,7 +31,7 @@ from reconstruction import (
 )
 from reconstruction.geometry.lights import dome_positions
 
-TRUTH = HairAppearance((0.15, 0.3, 0.8), 0.25, 0.2)
+TRUTH = HairAppearance((0.15, 0.3, 0.6), 0.25, 0.2)
 SKIN = (0.4, 0.3, 0.2)
 LEFT_OUT = HeldOut(("cam_2",), ("l5", "l7"))
 OPTIONS = FitOptions(hair_pixels=200, roughness_cameras=2, roughness_spp=36, colour_spp=16)
