@@ -5,8 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
-from appearance.render.paths import Surface, wave
+from appearance.render.paths import Surface, pixel_indices, wave
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.scene.opaque import opaque
 from reconstruction import Camera
@@ -19,10 +20,22 @@ FUZZ = 0.005
 
 def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, Floats]:
     """Share of each pixel that shows `"hair"` and `"head"`: two images `(H, W)` in [0, 1]."""
+    size = camera.height, camera.width
+    shares = pixel_coverage(scene, camera, np.arange(size[0] * size[1]), spp, seed)
+    return {name: share.reshape(size) for name, share in shares.items()}
+
+
+def pixel_coverage(
+    scene: HairScene, camera: Camera, pixels: ArrayLike, spp: int = 16, seed: int = 0
+) -> dict[str, Floats]:
+    """`coverage` of some pixels, flat indices `(P,)`: two of `(P,)`, however large the picture."""
     if spp < 1:
         raise ValueError(f"spp must be positive, got {spp}")
-    size = camera.width * camera.height
-    paths = wave(camera, dr.arange(mi.UInt32, size), size, 0, spp, spp, seed)
+    index = pixel_indices(camera, pixels)
+    size = len(index)
+    if not size:
+        return {name: np.zeros(0, np.float32) for name in ("hair", "head")}
+    paths = wave(camera, mi.UInt32(index), size, 0, spp, spp, seed)
     surface = Surface(scene)
     pi = scene.mi_scene.ray_intersect_preliminary(paths.rays, coherent=True)
     hit = pi.is_valid()
@@ -31,8 +44,7 @@ def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> 
     for name, mask in (("hair", hair), ("head", hit & ~hair)):
         count = dr.zeros(mi.UInt32, size)
         dr.scatter_add(count, mi.UInt32(1), paths.slot, mask)
-        share = np.array(count, dtype=np.float32) / np.float32(spp)
-        out[name] = share.reshape(camera.height, camera.width)
+        out[name] = np.array(count, dtype=np.float32) / np.float32(spp)
     return out
 
 

@@ -335,6 +335,11 @@ class SunFit:
                 "no light stands on its camera's side of the hair: its colour is told from light "
                 "that came through it, by how much of it the strands let through"
             )
+        if self.pixels.skin and self.covered.skin is self.pixels.skin:
+            stage.warn(
+                "the head covers few of the pixels that show skin: the skin is found too light "
+                "where it is missing; are masks and head of one capture?"
+            )
         if kept < seen:
             why = f"the strands cover less than {COVERED:.0%} of each"
             stage.leave_out(f"{seen - kept} of {seen} hair pixels", why, "their renderings")

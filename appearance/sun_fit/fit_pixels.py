@@ -9,7 +9,7 @@ import numpy as np
 
 from appearance.metrics.scores import Exposure
 from appearance.observations import Observed, chosen, observe
-from appearance.render.coverage import coverage
+from appearance.render.coverage import pixel_coverage
 from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.sun_fit.disorder import BESIDE
 from appearance.sun_fit.options import FitOptions
@@ -122,9 +122,8 @@ def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
     """
 
     def of(views: Sequence[Observed], what: str) -> Sequence[Observed]:
-        shown = [
-            o.where(coverage(scene, o.camera)[what].ravel()[o.pixels] >= COVERED) for o in views
-        ]
+        shares = [pixel_coverage(scene, o.camera, o.pixels)[what] for o in views]
+        shown = [o.where(share >= COVERED) for o, share in zip(views, shares, strict=True)]
         left = sum(len(o.pixels) for o in shown)
         enough = 10 * left >= sum(len(o.pixels) for o in views)
         return [o for o in shown if len(o.pixels)] if enough else views

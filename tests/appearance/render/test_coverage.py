@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appearance import HairAppearance, build_scene
-from appearance.render.coverage import coverage
+from appearance.render.coverage import coverage, pixel_coverage
 from reconstruction import Camera, Mesh, Strands
 
 HAIR = HairAppearance((0.1, 0.1, 0.1), 0.3, 0.2)
@@ -41,6 +41,10 @@ def test_wall_and_fibres_cover_the_columns_that_they_stand_in(scene):
     found = coverage(scene, camera())
     np.testing.assert_array_equal(found["head"], head)
     np.testing.assert_array_equal(found["hair"], hair)
+    for some in ([0, 4, 5, 11, 12, 255], []):
+        few = pixel_coverage(scene, camera(), some)
+        np.testing.assert_array_equal(few["head"], head.ravel()[np.array(some, int)])
+        np.testing.assert_array_equal(few["hair"], hair.ravel()[np.array(some, int)])
 
 
 def test_without_samples_it_is_an_error(scene):

@@ -9,6 +9,7 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import DiffuseHair
+from appearance.sun_fit.fit import SunFit
 from appearance.sun_fit.fit_pixels import FitPixels, cosines_of_lights, covered, in_front
 from appearance.sun_fit.fitted_appearance import absorption_warnings
 from appearance.sun_fit.mirror_samples import (
@@ -18,6 +19,7 @@ from appearance.sun_fit.mirror_samples import (
     mirror_lights,
     mirror_samples,
 )
+from appearance.sun_fit.options import FitOptions
 from appearance.sun_fit.roughness_and_colour import (
     LEAST_ALBEDO,
     MOST_ALBEDO,
@@ -31,7 +33,7 @@ from appearance.sun_fit.roughness_and_colour import (
     next_colour,
 )
 from appearance.sun_fit.visible_fibres import visible_fibres
-from reconstruction import Camera, Light, Strands
+from reconstruction import Camera, Light, Stage, Strands, silent
 from reconstruction.geometry.lights import dome_positions
 
 
@@ -229,6 +231,18 @@ def test_colours_are_compared_under_lights_before_the_hair(brighter_behind):
     )
     assert (found > 1.02 * by_all).all()
     np.testing.assert_allclose(by_all, scene.hair.sigma_a, rtol=0.3)
+
+
+def test_what_colours_are_told_badly_by_is_warned_of(brighter_behind):
+    scene, o = brighter_behind
+    behind = o.under(np.flatnonzero(cosines_of_lights(scene, o) < 0))
+    stage, few = Stage("colour"), FitOptions(colour_spp=1, iterations=1)
+    skin = o.where(np.arange(8))  # of a head that is not in the scene
+    SunFit(scene, FitPixels([behind], [skin]), few, 0, silent).colour(
+        0.3, None, np.full(3, 0.3), stage
+    )
+    for what in ("light stands on its camera's side", "head covers few"):
+        assert any(what in warning for warning in stage.warnings)
 
 
 def test_lights_that_disagree_are_in_the_absorption_s_error(brighter_behind):
