@@ -37,7 +37,7 @@ SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
 MORE = 2.0
-"""Times as much absorption, and as little, whose renderings say how the mean colour answers."""
+"""Renderings of so many times the absorption, and of its part, say how the mean colour answers."""
 LEAST_PATHS = 100_000
 """Of each of those renderings: noise would look like an answer, or hide one."""
 
@@ -282,8 +282,8 @@ def _disagreement(
             )
             for x in (captured, rendered)
         )
-        if (one > 0).all() and (other > 0).all():
-            ratios.append(np.log(one / other))
+        if one.any() and other.any():
+            ratios.append(np.log(np.maximum(one, 1e-12) / np.maximum(other, 1e-12)))
     if len(ratios) < 2:
         return np.zeros(3)
     return np.asarray(np.std(ratios, axis=0, ddof=1) / np.sqrt(len(ratios)))
