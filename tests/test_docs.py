@@ -128,7 +128,7 @@ def test_links_on_the_pages_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_lines_of_the_pages_are_not_too_long(page: Path) -> None:
     lines = page.read_text().splitlines()
-    most = [150 if line.startswith("|") else 120 for line in lines]  # a table's rows do not break
+    most = [170 if line.startswith("|") else 120 for line in lines]  # a table's rows do not break
     long = [k for k, line in enumerate(lines) if len(line) > most[k]]
     assert [f"{k + 1}: {lines[k]}" for k in long] == []
 
