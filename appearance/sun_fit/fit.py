@@ -291,7 +291,7 @@ class SunFit:
 
     @cached_property
     def in_front(self) -> FitPixels:
-        """Those, under the lights by which hair is."""
+        """Those, and hair under lights on its camera's side only: what its colour is told by."""
         return in_front(self.covered, self.scene)
 
     def colour(

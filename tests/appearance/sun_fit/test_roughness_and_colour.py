@@ -254,6 +254,9 @@ def test_lights_that_disagree_are_in_the_absorption_s_error(brighter_behind):
     means = [observed(scene.with_hair(x), o.camera, few, 512).radiance.mean((0, 1)) for x in each]
     answer = np.log(means[0] / means[1]) / np.log(1.25 / 0.8)
     np.testing.assert_allclose(error, 0.105 / answer, rtol=0.4)
+    no_blue = replace(o, radiance=o.radiance * np.array([1, 1, 0], np.float32))
+    again = absorption_error(scene, [no_blue], Colours((0.5, 0.4, 0.3), hair, (0.3,) * 3, [], []))
+    np.testing.assert_allclose(again[:2], error[:2], rtol=1e-6)
 
 
 def test_hair_that_no_absorption_changes_has_no_error(brighter_behind):
