@@ -23,18 +23,13 @@ class HeldOut:
 
         Raises `CaptureError` where a name is not in the capture, or nothing is left to fit.
         """
-        cameras, lights = [c.name for c in capture.rig.cameras], capture.olat_lights()
-        left = []
-        for kind, names, known in (
-            ("camera", self.cameras, cameras),
-            ("light", self.lights, lights),
-        ):
-            if unknown := sorted(set(names) - set(known)):
-                raise CaptureError(f"held-out {kind}s {unknown} are not in {capture.path}")
-            left.append([name for name in known if name not in names])
-            if not left[-1]:
+        capture.view(cameras=self.cameras, lights=self.lights)  # raises for unknown names
+        cameras = [c.name for c in capture.rig.cameras if c.name not in self.cameras]
+        lights = [name for name in capture.olat_lights() if name not in self.lights]
+        for kind, left in (("camera", cameras), ("light", lights)):
+            if not left:
                 raise CaptureError(f"{capture.path}: every {kind} is held out or none was shot")
-        return capture.view(cameras=left[0], lights=left[1])
+        return capture.view(cameras=cameras, lights=lights)
 
 
 @dataclass(frozen=True, eq=False)

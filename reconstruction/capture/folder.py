@@ -190,7 +190,11 @@ class Capture:
     def _known(self, kind: str, names: Iterable[str], known: list[str]) -> set[str]:
         wanted = set(names)
         if unknown := sorted(wanted - set(known)):
-            raise CaptureError(f"{self.path}: there is no {kind} {unknown}; there are {known}")
+            some = known if len(known) <= 12 else [*known[:3], "…", *known[-3:]]
+            raise CaptureError(
+                f"{self.path}: there is no {kind} {', '.join(unknown)}; its {len(known)} are "
+                f"{', '.join(some)}"
+            )
         return wanted
 
     def mask_as_shot(self, camera: str, mask: Bools) -> Bools:

@@ -22,6 +22,7 @@ from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import (
     Camera,
     Capture,
+    CaptureError,
     CaptureWriter,
     Light,
     Mesh,
@@ -134,6 +135,15 @@ def test_a_group_with_nothing_held_out_is_left_out(made):
     found = assess(capture, model, held_out=HeldOut((), ("l4",)), options=OPTIONS)
     assert "held_out_lights" in found
     assert "held_out_camera" not in found
+
+
+def test_what_cannot_be_held_out_is_told_with_what_there_is(made):
+    capture, *_ = made
+    lights, cameras = capture.olat_lights(), tuple(c.name for c in capture.rig.cameras)
+    with pytest.raises(CaptureError, match=f"no light nope; its {len(lights)} are {lights[0]}, "):
+        HeldOut((), ("nope",)).training(capture)
+    with pytest.raises(CaptureError, match="every camera is held out"):
+        HeldOut(cameras).training(capture)
 
 
 def test_a_black_frame_is_told_and_not_compared(made, monkeypatch):
