@@ -79,16 +79,17 @@ class MeasureOptions:
 class SearchOptions:
     """How line stereo searches depths.
 
-    `step` metres between depths. Segments are compared in up to `neighbours` nearest visible views.
-    The `candidates` best depths of each pixel by few points go on to all of a segment's; 0 gives
-    them all depths (brute force). The first stage takes every `coarse`th depth; the second also
-    those between a candidate and the next. Every `lattice`th pixel both ways is searched
-    first, the others near what was found around them; 1 searches all of them alike.
+    `step` metres between depths, less where pixels are narrower than 0.3 mm. Segments are compared
+    in up to `neighbours` nearest visible views. The `candidates` best depths of each pixel by few
+    points go on to all of a segment's; 0 gives them all depths (brute force). The first stage takes
+    every `coarse`th depth; the second also those between a candidate and the next. Every
+    `lattice`th pixel both ways is searched first, the others near what was found around them; 1
+    searches all of them alike.
     """
 
-    step: Length = 2.5e-4
+    step: Length = 5e-4
     neighbours: Annotated[int, Field(ge=1, le=31)] = 16  # with the reference their bits fill a word
-    candidates: Annotated[int, Field(ge=0)] = 8
+    candidates: Annotated[int, Field(ge=0)] = 4
     coarse: Count = 1
     lattice: Count = 4
 

@@ -215,7 +215,7 @@ def unit_or_zero(vectors: Array) -> Array:
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
-_AT_A_TIME = 4000  # lines
+_AT_A_TIME = 400  # lines: what the processor keeps near
 
 
 def smoothed(lines: Sequence[Array], sigma: float) -> list[Array]:
@@ -241,19 +241,28 @@ def _smoothed_together(lines: Sequence[Array], sigma: float) -> list[Array]:
     length[ends - count] = 0.0
     step = np.bincount(owner, length, len(lines)) / np.maximum(count - 1, 1)
     fits = (count > 2) & (step > 0) & (sigma > 0)
-    width = np.where(fits, sigma / np.where(fits, step, 1.0), 0.0)[owner]
-    begin, period = (ends - count)[owner], 2 * np.maximum(count - 1, 1)[owner]
-    last = begin + count[owner] - 1
-    across = x[last] - x[begin]
-    place = np.arange(len(x)) - begin
-    total, weights = x.copy(), np.ones(len(x))
-    for k in range(1, int(np.ceil(4 * width.max(initial=0.0))) + 1):
+    width = np.where(fits, sigma / np.where(fits, step, 1.0), 0.0)
+    reach = np.ceil(4 * width).astype(np.int64)
+    furthest = int(reach.max(initial=0))
+    # every line with `reach` points more at both ends, end to end
+    size = count + 2 * reach
+    line = np.repeat(np.arange(len(lines)), size)
+    place = np.arange(len(line)) - (np.cumsum(size) - size + reach)[line]
+    begin, span = (ends - count)[line], np.maximum(count - 1, 1)[line]
+    turn, j = np.divmod(place, 2 * span)
+    last = begin + count[line] - 1
+    back = j > last - begin
+    longer = x[begin + np.where(back, np.minimum(2 * span - j, last - begin), j)]
+    longer = np.where(back[:, None], 2 * x[last] - longer, longer)
+    longer += (2 * turn)[:, None] * (x[last] - x[begin])
+    longer = np.pad(longer, ((furthest, furthest), (0, 0)))
+    total, weights = longer.copy(), np.ones(len(lines))
+    inner = slice(furthest, furthest + len(line))
+    for k in range(1, furthest + 1):
         weight = np.where(k <= 4 * width, np.exp(-0.5 * (k / np.maximum(width, 1e-9)) ** 2), 0.0)
         weights += 2 * weight
-        for i in (place - k, place + k):
-            turn, j = np.divmod(i, period)
-            back = j > last - begin
-            there = x[begin + np.where(back, np.minimum(period - j, last - begin), j)]
-            there = np.where(back[:, None], 2 * x[last] - there, there)
-            total += weight[:, None] * (there + (2 * turn)[:, None] * across)
-    return np.split(total / weights[:, None], ends[:-1])
+        pair = longer[inner.start - k : inner.stop - k] + longer[inner.start + k : inner.stop + k]
+        pair *= weight[line][:, None]
+        total[inner] += pair
+    own = (place >= 0) & (place < count[line])
+    return np.split(total[inner][own] / weights[owner][:, None], ends[:-1])

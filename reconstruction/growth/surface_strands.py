@@ -22,7 +22,6 @@ NEIGHBOURS = 16
 ANGLE_DEG, SAME_DEG = 35.0, 20.0
 PULL = 0.6
 LEAST_SUPPORT = 0.5
-SPACING = 0.4
 
 # Strands that are traced at once, as soon as one ends another begins: few of few lines, because
 # those that begin together do not yet know which lines the others will pass.
@@ -36,13 +35,14 @@ class SurfaceOptions:
     `apart` is about how far the lines are from one another. Those within 2.5 `BANDWIDTH`s that
     turn by at most `ANGLE_DEG` lead a strand, at most `NEIGHBOURS` of them; every `step` it moves
     `PULL` of the way to their middle. It ends where their confidences, each less the further
-    away, add up to less than `LEAST_SUPPORT`, and at `longest` metres. Lines closer than `SPACING`
+    away, add up to less than `LEAST_SUPPORT`, and at `longest` metres. Lines closer than `spacing`
     to one of its points that run along it within `SAME_DEG` start no other; strands shorter than
     `shortest` are not kept, the others are smoothed along their length by a Gaussian of `smooth`.
     """
 
     apart: float = 1.25e-3
     step: float = 0.4
+    spacing: float = 0.4
     longest: float = 0.3
     shortest: float = 2.4
     smooth: float = 1.0
@@ -77,7 +77,8 @@ class LineCloud:
         near = np.exp(-(np.where(there, distance, 0) ** 2) / (2 * self._bandwidth**2))
         weight = np.where(there, near * self._lines.confidence[index], 0.0)
         support = weight.sum(axis=1)
-        beside = (distance <= SPACING * self._options.apart) & (support >= LEAST_SUPPORT)[:, None]
+        spacing = self._options.spacing * self._options.apart
+        beside = (distance <= spacing) & (support >= LEAST_SUPPORT)[:, None]
         mean = np.einsum("nk,nki->ni", weight * np.sign(cosine), d)
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         mean = np.where(length > 1e-12, mean / np.maximum(length, 1e-12), along)

@@ -37,18 +37,18 @@ class LmvsSearch(DepthSearch):
         self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
     ) -> tuple[Any, ...]:
         """As `DepthSearch.search`; the agreement `(P,)` is 1 less the cost over a right angle."""
-        t, options = self.types, self.options
+        t = self.types
         pixels.code = []  # this method knows no lightcode: nothing is compared, all is equal
         along = self._in_plane(view, x, y)
         near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
-        step, samples = dr.opaque(t.Float, options.step), dr.opaque(t.UInt32, SAMPLES)
+        step, samples = dr.opaque(t.Float, self.steps[view]), dr.opaque(t.UInt32, SAMPLES)
         total = len(self.neighbours[view])
         few = min(COARSE_NEIGHBOURS, total)
         coarse = _Cost(self.device, pixels, along, few, LENGTH)
         cost, depth, tilt = _sweep(coarse, near, step, number)
         fine = _Cost(self.device, pixels, along, total, LENGTH)
         cost = fine(depth, tilt, samples)
-        move, turn = 0.5 * options.step, 0.5 * float(FAN[1] - FAN[0])
+        move, turn = 0.5 * self.steps[view], 0.5 * float(FAN[1] - FAN[0])
         for _ in range(ROUNDS):
             for dz, da in ((move, 0.0), (-move, 0.0), (0.0, turn), (0.0, -turn)):
                 d, a = depth + dr.opaque(t.Float, dz), tilt + dr.opaque(t.Float, da)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reconstruction.array_backend import array_types, for_kernels
 from reconstruction.arrays import Bools, Floats, Ints
+from reconstruction.geometry.cameras import Camera
 from reconstruction.light_codes.code_views import View, nearest_views
 from reconstruction.light_codes.codes import unpack
 from reconstruction.light_codes.device_views import DeviceViews
@@ -22,8 +23,11 @@ FEW_SAMPLES = 3
 """Points of a segment in the first stage. Sun's compares lightcodes alone there, which change too
 little from one strand to the next: its best 24 depths of 160 held the best in 88 % of pixels."""
 
-SAMPLES, LENGTH = 25, 5e-3
+SAMPLES, LENGTH = 13, 5e-3
 """Points of a segment that are compared in the second stage, and metres from its end to its end."""
+
+STEP_PIXELS = 5 / 3
+"""Pixels that a step is at most as wide as: coarser ones pass by the best depth."""
 
 AROUND, FEWEST, LEFT_OUT, BEYOND = 2, 8, 0.1, 1.5e-3
 """Of the lattice: pixels to every side of one that tell its depths, how few tell nothing, the share
@@ -66,6 +70,7 @@ class DepthSearch:
         self.types = array_types()
         self.device = DeviceViews(self.types, views)
         self.neighbours = nearest_views(views, subject, options.neighbours)
+        self.steps = [step_of(v.camera, subject, options) for v in views]
 
     def visible(self, view: int, y: Ints, x: Ints) -> Bools:
         """Which neighbours see the pixels `(P, N)`: a light beside them reaches the pixel.
@@ -125,14 +130,13 @@ class DepthSearch:
 
     def _among(self, view: int, asked: Bools, near: Floats, far: Floats) -> DepthMap:
         """Search the pixels that are `asked (H, W)`."""
-        options = self.options
         y, x = np.nonzero(asked)
         if not len(x) or not self.neighbours[view]:
             none, no = np.zeros(0, np.int64), np.zeros(0, np.float32)
             return DepthMap(none, none, no, np.zeros((0, 3), np.float32), no, no, no, none)
         pixels, seen_by = self.pixels(view, y, x)
         start = near[y, x].astype(np.float32)
-        counts = np.ceil((far[y, x] - start) / options.step).astype(np.uint32) + 1
+        counts = np.ceil((far[y, x] - start) / self.steps[view]).astype(np.uint32) + 1
         found = self.search(pixels, x, y, start, counts, view)
         _, _, agree, spread, _ = found
         keep = (seen_by > 0) & (spread >= LEAST_SPREAD) & (agree > 0)
@@ -147,7 +151,7 @@ class DepthSearch:
         """
         t, options = self.types, self.options
         near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
-        step = dr.opaque(t.Float, options.step)
+        step = dr.opaque(t.Float, self.steps[view])
         fine = _Depths(self.device, pixels, near, step, SAMPLES, LENGTH / (SAMPLES - 1))
         if options.candidates:
             every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
@@ -169,6 +173,12 @@ class DepthSearch:
         depth += step * dr.clip(shift, -0.5, 0.5)
         agree, line = fine.worth(depth)
         return fetched(depth, line.direction, agree, line)
+
+
+def step_of(camera: Camera, subject: Any, options: SearchOptions) -> float:
+    """Metres between a view's depths: the option's, or less where its pixels are fine."""
+    pixel = np.linalg.norm(camera.center - np.asarray(subject, float)) / camera.K[0, 0]
+    return min(options.step, float(STEP_PIXELS * pixel))
 
 
 def narrowed(found: DepthMap, near: Floats, far: Floats, apart: int) -> tuple[Floats, Floats]:
