@@ -23,7 +23,7 @@ from reconstruction.light_codes.segments import to_segments
 from reconstruction.reconstruct_options import LightCodeOptions, LogGaborBank, SearchOptions
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "depth step, mm": {str(1e3 * s): {"step": s} for s in (1e-3, 5e-4, 2.5e-4, 1.25e-4)},
+    "depth step, mm": {str(1e3 * s): {"step": s} for s in (5e-4, 2.5e-4, 1.25e-4)},
     "neighbours": {str(n): {"neighbours": n} for n in (4, 8, 16, 23)},
     "candidates": {str(n): {"candidates": n} for n in (1, 4, 8, 24)}
     | {"all": {"candidates": 0, "lattice": 1}},
