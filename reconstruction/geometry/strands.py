@@ -242,6 +242,7 @@ def _smoothed_together(lines: Sequence[Array], sigma: float) -> list[Array]:
     step = np.bincount(owner, length, len(lines)) / np.maximum(count - 1, 1)
     fits = (count > 2) & (step > 0) & (sigma > 0)
     width = np.where(fits, sigma / np.where(fits, step, 1.0), 0.0)
+    width = np.minimum(width, 2 * count)  # wider ones leave the chord alike, to 1e-5
     reach = np.ceil(4 * width).astype(np.int64)
     furthest = int(reach.max(initial=0))
     # every line with `reach` points more at both ends, end to end

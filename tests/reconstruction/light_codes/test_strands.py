@@ -44,6 +44,16 @@ def test_smoothing_keeps_the_ends_and_takes_the_jitter() -> None:
     np.testing.assert_array_equal(smoothed([jitter[:2]], 2e-3)[0], jitter[:2])
 
 
+@pytest.mark.parametrize("length", [1e-12, 1e-6, 1e-3])
+def test_what_is_far_shorter_than_the_gaussian_becomes_its_chord(length: float) -> None:
+    s = np.linspace(0, 1, 9)
+    bow = length * np.stack([s, np.sin(np.pi * s), 0 * s], axis=1)
+    (found,) = smoothed([bow], 0.01)
+    np.testing.assert_allclose(
+        found, length * np.stack([s, 0 * s, 0 * s], axis=1), atol=2e-5 * length
+    )
+
+
 def test_lines_that_are_smoothed_together_know_nothing_of_one_another() -> None:
     """Straight ones stay as they are, however short; a wave loses what a Gaussian takes of it."""
     rng = np.random.default_rng(5)
