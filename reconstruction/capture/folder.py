@@ -182,6 +182,15 @@ class Capture:
             out.steps = tuple(s for s in self.steps if s.kind != "olat" or s.light in names)
         return out
 
+    def without_lights(self, names: Iterable[str]) -> Capture:
+        """The capture as if these lights had not been shot one at a time.
+
+        Raises `CaptureError` for names that are not there.
+        """
+        known = self.olat_lights()
+        out = self._known("light", names, known)
+        return self.view(lights=[name for name in known if name not in out])
+
     @property
     def lenses(self) -> Mapping[str, Lens]:
         """What an undistorted view resamples, by camera."""

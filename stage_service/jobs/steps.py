@@ -61,9 +61,7 @@ def reconstruct(context: StepContext) -> Figures:
 
     asked = context.options
     options = replace(asked.reconstruct, held_out=asked.held_out_cameras, seed=asked.seed)
-    capture = context.frames()
-    left = [name for name in capture.olat_lights() if name not in asked.held_out_lights]
-    capture = capture.view(lights=left)
+    capture = context.frames().without_lights(asked.held_out_lights)
     run(capture, context.model, method=asked.method, options=options, progress=context.progress)
     return {"strands": "strands.npz"}
 

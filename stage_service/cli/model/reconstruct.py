@@ -112,8 +112,7 @@ def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:
     from reconstruction.estimate import estimate
 
     asked = replace(options.reconstruct, held_out=options.held_out_cameras, seed=options.seed)
-    left = [name for name in capture.olat_lights() if name not in options.held_out_lights]
-    capture, by = capture.view(lights=left), options.reduced
+    capture, by = capture.without_lights(options.held_out_lights), options.reduced
     machine_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
 
     def tried(by: int) -> Estimate:

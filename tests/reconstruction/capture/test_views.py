@@ -197,6 +197,9 @@ def test_a_view_is_a_part_and_leaves_the_whole_alone(bent: Capture) -> None:
     assert view.view(undistorted=False).rig.cameras == bent.rig.cameras[1:]
     assert len(bent.rig.cameras) == 2
     assert bent.olat_lights() == lights
+    assert bent.without_lights(lights[:1]).olat_lights() == lights[1:]
+    with pytest.raises(CaptureError, match="no light nope"):
+        bent.without_lights(["nope"])
     with pytest.raises(CaptureError, match="no camera middle; its 2 are left, right"):
         bent.view(cameras=["middle"])
 
