@@ -23,13 +23,13 @@ class HeldOut:
 
         Raises `CaptureError` where a name is not in the capture, or nothing is left to fit.
         """
-        capture.view(cameras=self.cameras, lights=self.lights)  # raises for unknown names
+        capture.view(cameras=self.cameras)  # raises for unknown names
+        out = capture.without_lights(self.lights)
         cameras = [c.name for c in capture.rig.cameras if c.name not in self.cameras]
-        lights = [name for name in capture.olat_lights() if name not in self.lights]
-        for kind, left in (("camera", cameras), ("light", lights)):
+        for kind, left in (("camera", cameras), ("light", out.olat_lights())):
             if not left:
                 raise CaptureError(f"{capture.path}: every {kind} is held out or none was shot")
-        return capture.view(cameras=cameras, lights=lights)
+        return out.view(cameras=cameras)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,8 @@ SWEPT, UNSWEPT = 2.0, 8.0
 DEPTHS = 1.6e-6
 """Seconds that line stereo takes for a pixel and a neighbour on two cores; all share it evenly.
 
-Depths are 0.5 mm apart; three fifths of it are theirs."""
+Depths are 0.5 mm apart; three fifths of it are theirs.
+"""
 
 HEAD_FIT = 2.0  # seconds: points are thinned to about as many, whatever the capture
 ROWS = 12  # of a sweep that the probe searches, in each of three places

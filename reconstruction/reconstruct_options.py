@@ -79,12 +79,12 @@ class MeasureOptions:
 class SearchOptions:
     """How line stereo searches depths.
 
-    `step` metres between depths, less where pixels are narrower than 0.3 mm. Segments are compared
-    in up to `neighbours` nearest visible views. The `candidates` best depths of each pixel by few
-    points go on to all of a segment's; 0 gives them all depths (brute force). The first stage takes
-    every `coarse`th depth; the second also those between a candidate and the next. Every
-    `lattice`th pixel both ways is searched first, the others near what was found around them; 1
-    searches all of them alike.
+    `step` metres between depths, and 5/3 of a pixel's width at most. Segments are compared in up to
+    `neighbours` nearest visible views. The `candidates` best depths of each pixel by few points go
+    on to all of a segment's; 0 gives them all depths (brute force). The first stage takes every
+    `coarse`th depth; the second also those between a candidate and the next. Every `lattice`th
+    pixel both ways is searched first, the others near what was found around them; 1 searches all of
+    them alike.
     """
 
     step: Length = 5e-4
