@@ -12,6 +12,9 @@ import drjit
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+VARIANT = "HAIRSTAGE_VARIANT"
+"""The environment variable that names the variant."""
+
 _PACKET = 256  # bytes: no vector of any back end is longer
 
 
@@ -21,10 +24,21 @@ def chosen_variant(variant: str | None = None) -> str:
     Named as Mitsuba's are, such as `llvm_ad_rgb` or `cuda_ad_rgb`. Makes libLLVM known to Dr.Jit
     where it is needed; raises `BackendError` when it is too old or absent.
     """
-    chosen = variant or os.environ.get("HAIRSTAGE_VARIANT") or "llvm_ad_rgb"
+    chosen = variant or os.environ.get(VARIANT) or "llvm_ad_rgb"
     if chosen.startswith("llvm"):
         os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
     return chosen
+
+
+def prefer_cuda() -> bool:
+    """Whether this process runs on a GPU: it does where there is one and nothing else was chosen.
+
+    `HAIRSTAGE_VARIANT` comes first; where it says nothing and there is a CUDA device, it says CUDA
+    from now on.
+    """
+    if not os.environ.get(VARIANT) and drjit.has_backend(drjit.JitBackend.CUDA):
+        os.environ[VARIANT] = "cuda_ad_rgb"
+    return os.environ.get(VARIANT, "").startswith("cuda")
 
 
 def array_types(variant: str | None = None) -> Any:

@@ -66,4 +66,4 @@ def sees(scene: HairScene, camera: Camera, points: AnyFloats) -> Bools:
     towards = mi.Vector3f(*opaque(end)) - mi.Vector3f(origin)
     ray = mi.Ray3f(origin, dr.normalize(towards))
     ray.maxt = dr.norm(towards)
-    return ~np.array(scene.mi_scene.ray_test(ray, mi.Bool(True)), dtype=bool)
+    return ~np.array(scene.occluded(ray), dtype=bool)

@@ -295,7 +295,7 @@ class _Walk:
                 value = beta * self.surface.eval(si, wo, active) * (intensity / squared)
             lit = active & (dr.max(dr.detach(value)) > 0)
             ray = si.spawn_ray_to(dr.detach(target))
-            lit &= ~self.surface.scene.mi_scene.ray_test(ray, lit)
+            lit &= ~self.surface.scene.occluded(ray, lit)
             put = (light * slots + self.paths.slot) * 3
             if self.film is not None:
                 for channel in range(3):

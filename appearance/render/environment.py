@@ -237,5 +237,5 @@ class _Gather:
         if self.factor is not None:
             value = value * self.factor.towards(paths.slot, towards, paths.active)
         lit = paths.active & (dr.max(value) > 0)
-        lit &= ~self.surface.scene.mi_scene.ray_test(si.spawn_ray(towards), lit)
+        lit &= ~self.surface.scene.occluded(si.spawn_ray(towards), lit)
         add_light(self.film, value, paths.slot * 3, lit)

@@ -259,7 +259,7 @@ class _Drawing:
             bright = dr.max(v.throughput * value * intensity) * counts / squared
             chance = dr.minimum(1, bright / dim)
             lit = v.valid & (rng.next_float32() < chance)
-            lit &= ~self.surface.scene.mi_scene.ray_test(v.si.spawn_ray_to(target), lit)
+            lit &= ~self.surface.scene.occluded(v.si.spawn_ray_to(target), lit)
             full = dr.sum(dr.gather(mi.Color3f, bank.intensities, light, v.valid))
             scale = dr.sum(intensity) / (full * squared * chance)
             found.put((lane, light), (*v.frame.enter(wo), scale, *value), lit)

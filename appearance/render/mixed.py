@@ -169,5 +169,5 @@ class _Gather:
 
     def _add(self, value: Any, ray: Any, paths: Paths) -> None:
         lit = paths.active & (dr.max(dr.abs(value)) > 0)
-        lit &= ~self.surface.scene.mi_scene.ray_test(ray, lit)
+        lit &= ~self.surface.scene.occluded(ray, lit)
         add_light(self.film, value, paths.slot * 3, lit)

@@ -139,7 +139,7 @@ def light_from(
     kept = dr.maximum(brightest, source.dim)
     chance = dr.maximum(chance, 1e-9)  # at 0 a contribution of 1e-40 would count as infinitely many
     lit = active & (chance * kept < brightest)
-    lit &= ~surface.scene.mi_scene.ray_test(si.spawn_ray_to(source.position), lit)
+    lit &= ~surface.scene.occluded(si.spawn_ray_to(source.position), lit)
     return value * (kept / brightest), lit
 
 

@@ -28,7 +28,7 @@ def reached(scene: HairScene, points: Array, towards: Array, offset: Array) -> B
     away = target - lanes
     ray: Any = mi.Ray3f(lanes, away)
     ray.maxt = mi.Float(1)
-    return ~np.array(scene.mi_scene.ray_test(ray), bool)
+    return ~np.array(scene.occluded(ray), bool)
 
 
 def within_fibres(points: Array, towards: Array, radii: Array, seed: int) -> Array:

@@ -15,6 +15,7 @@ BENCHMARKS = {
     "acquisition": "steps and bytes a second beside what wires and disk allow",
     "agreement": "a capture that Blender Cycles rendered, from its true strands",
     "appearance": "inverse rendering and its ablations on subjects of known appearance",
+    "backends": "BSDF, OLAT, stage 1 and line stereo on CPU and GPU: seconds, agreement",
     "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
     "captures": "10,000 captures in a root: the service's start, and a page of them",
     "console": "a capture and an idle service, beside three open pages, streams of events, nobody",

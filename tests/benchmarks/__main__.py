@@ -22,6 +22,7 @@ MODULES = {
     "acquisition": "benchmarks.acquisition.rates",
     "agreement": "benchmarks.renderers.agreement",
     "appearance": "benchmarks.appearance.ablations",
+    "backends": "benchmarks.backends.side_by_side",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "captures": "benchmarks.acquisition.listing",
     "console": "benchmarks.service.watched",

@@ -171,8 +171,13 @@ def run_worker(args: argparse.Namespace, output: Output) -> None:
     the root and share a PostgreSQL database, $HAIRSTAGE_DATABASE_URL.
     """
     log_to_stderr(args.log_json)
+    from reconstruction.array_backend import VARIANT, prefer_cuda
     from stage_service.jobs.worker import run_worker as work
 
+    if args.gpu and not prefer_cuda():
+        chosen = os.environ.get(VARIANT)
+        why = f"${VARIANT} is {chosen}" if chosen else "no CUDA device is found"
+        output.note(f"jobs render on the CPU: {why}")
     os.umask(PRIVATE)
     args.root.mkdir(parents=True, exist_ok=True)
     work(

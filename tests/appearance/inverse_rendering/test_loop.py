@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -85,8 +86,10 @@ def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_pa
         run(plain, START, options=options, seed=1, monitor=Monitor(killed, file))
     resumed = run(plain, START, options=options, seed=1, monitor=Monitor(checkpoint=file))
     assert resumed.steps == whole.steps
-    np.testing.assert_allclose(resumed.maps.sigma_a, whole.maps.sigma_a, rtol=1e-3)
-    assert resumed.maps.beta_m == pytest.approx(whole.maps.beta_m, rel=1e-3)
+    # on a GPU a gradient's sums come in any order: no two fits are the same
+    near = 0.03 if str(mi.variant()).startswith("cuda") else 1e-3
+    np.testing.assert_allclose(resumed.maps.sigma_a, whole.maps.sigma_a, rtol=near)
+    assert resumed.maps.beta_m == pytest.approx(whole.maps.beta_m, rel=near)
     other = run(
         plain, START, options=replace(options, steps=1), seed=2, monitor=Monitor(checkpoint=file)
     )

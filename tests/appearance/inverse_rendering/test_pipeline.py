@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 
 import cv2
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -289,6 +290,8 @@ print(before[0], stage.figures["memory_needed_gb"], stage.peak_gb)
 @pytest.mark.parametrize("copies", [1, 150])
 def test_the_memory_that_is_told_is_what_the_process_takes(made, tmp_path, copies):
     """By the kernel's own account of a process that does nothing else."""
+    if str(mi.variant()).startswith("cuda"):
+        pytest.skip("what is told is of the CPU: of a GPU's memory the kernel knows nothing")
     capture, model = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)

@@ -251,6 +251,7 @@ def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
         render()
 
 
+@pytest.mark.usefixtures("mitsubas_shadows")
 def test_lights_of_every_shape_shine_in_olat_images(tufted):
     """Each light alone, against the mixture of that one light."""
     scene, camera, lights = tufted

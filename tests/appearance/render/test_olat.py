@@ -55,6 +55,7 @@ def path_means(tufted):
     return np.array(runs, float)
 
 
+@pytest.mark.usefixtures("mitsubas_shadows")
 @pytest.mark.parametrize("how", SPENDING, ids=str)
 def test_agrees_with_mitsubas_path_however_rays_are_spent(tufted, path_means, how):
     scene, camera, lights = tufted

@@ -21,9 +21,7 @@ def arriving(brought: tuple[float, float, float], chance: float, dim: float = 1.
     )
     surface = SimpleNamespace(
         eval=lambda si, wo, active: mi.Color3f(1),
-        scene=SimpleNamespace(
-            mi_scene=SimpleNamespace(ray_test=lambda ray, active: mi.Bool(False))
-        ),
+        scene=SimpleNamespace(occluded=lambda ray, active: mi.Bool(False)),
     )
     source = PointSource(mi.Point3f(0, 0, 1), mi.Color3f(1), mi.Float(dim))
     throughput = mi.Color3f(*brought)

@@ -11,6 +11,7 @@ from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, _guarded
 from reconstruction import Camera, Light, Strands
+from reconstruction.array_backend import for_kernels
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 
@@ -54,6 +55,26 @@ def test_only_unevenly_spaced_strands_are_resampled():
     start, end = knots(control, segments)
     np.testing.assert_allclose(start[:, 2], [0, 1, 2, 0, 1, 2], atol=1e-6)
     np.testing.assert_allclose(end[3:, 2], [1, 2, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [4e-5, 8e-5, 4e-4])
+def test_a_ray_through_the_fibre_that_it_starts_on_meets_nothing(radius):
+    """Light from behind passes it. By Mitsuba's `ray_test`, OptiX stops up to a third of it."""
+    s = np.linspace(-0.5, 0.5, 40)[:, None]
+    line = [0.05, -0.08, 0.05] + 0.1 * s * [0.44, 0.87, 0.22] + 0.02 * s**2 * [0.89, -0.45, 0]
+    scene = build_scene(Strands.from_list([line], radius), None, hair=HAIR)
+    rng = np.random.default_rng(0)
+    targets = np.repeat(line[10:30], 1000, axis=0)
+    way = rng.normal(size=targets.shape)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    origin = mi.Point3f(for_kernels(SCALE * (targets - way).T))
+    si = scene.mi_scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(for_kernels(way.T))))
+    met = np.array(si.is_valid())
+    assert met.mean() > 0.99
+    behind = si.p - SCALE * si.n
+    assert np.array(scene.occluded(si.spawn_ray_to(behind)))[met].mean() < 1e-3
+    # and what stands in the way does stop it
+    assert np.array(scene.occluded(mi.Ray3f(origin, mi.Vector3f(for_kernels(way.T)))))[met].all()
 
 
 def test_empty_scenes_render(small):

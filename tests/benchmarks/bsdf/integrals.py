@@ -16,7 +16,7 @@ import numpy as np
 
 from appearance.bsdf import reference as ref
 from appearance.bsdf.lobes import Fibre
-from reconstruction.array_backend import for_kernels
+from reconstruction.array_backend import chosen_variant, for_kernels
 from reconstruction.arrays import Array
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
@@ -49,8 +49,14 @@ class Case:
 
 
 def array_types(double: bool) -> tuple[Any, Any]:
-    """(float, vector of 3) Dr.Jit types of the back end that Mitsuba's variant has."""
-    module: Any = dr.cuda.ad if str(mi.variant()).startswith("cuda") else dr.llvm.ad
+    """(float, vector of 3) Dr.Jit types of the back end that Mitsuba's variant has.
+
+    Those of float64 are LLVM's: on a GPU, Dr.Jit's division and roots have seven digits in either.
+    """
+    if double:
+        chosen_variant("llvm_ad_rgb")  # makes libLLVM known
+    cuda = str(mi.variant()).startswith("cuda") and not double
+    module: Any = dr.cuda.ad if cuda else dr.llvm.ad
     return (module.Float64, module.Array3f64) if double else (module.Float, module.Array3f)
 
 

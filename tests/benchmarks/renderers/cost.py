@@ -124,7 +124,7 @@ def bare_rays(view: View, rounds: int = 64) -> dict[str, float]:
     """Microseconds of CPU a ray of the scene takes when nothing else is done.
 
     From each pixel's first hit towards random directions: `closest_us` with the surface's answer
-    (`ray_intersect`), `shadow_us` (`ray_test`).
+    (`ray_intersect`), `shadow_us` (`occluded`).
     """
     scene, lanes = view.scene, len(view.index)
     surface = Surface(scene)
@@ -145,7 +145,7 @@ def bare_rays(view: View, rounds: int = 64) -> dict[str, float]:
                 )
                 ray = start.spawn_ray(towards)
                 if name == "shadow_us":
-                    hit = scene.mi_scene.ray_test(ray)
+                    hit = scene.occluded(ray)
                 else:
                     hit = surface.interact(ray, mi.Bool(True)).t < 1
                 return i + 1, count + dr.select(hit, mi.UInt32(1), 0), rng

@@ -1,0 +1,67 @@
+"""CPU and GPU side by side: processes of their own, failures that are told, what is compared."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+
+import drjit as dr
+import numpy as np
+import pytest
+from benchmarks.backends import jobs
+from benchmarks.backends.jobs import Done
+from benchmarks.backends.side_by_side import compared, done_by, processor, report
+
+from reconstruction.array_backend import VARIANT, prefer_cuda
+
+LLVM, CUDA = "llvm_ad_rgb", "cuda_ad_rgb"
+needs_gpu = pytest.mark.skipif(
+    not dr.has_backend(dr.JitBackend.CUDA), reason="no CUDA device; LLVM's part runs"
+)
+
+
+def found(*values: float) -> Done:
+    return Done(1.0, 1.0, np.array(values, np.float32), {})
+
+
+def test_what_both_have_is_compared_and_what_one_lacks_is_counted() -> None:
+    nan = float("nan")
+    said = compared(found(1.0, 2.0, nan, 4.0, nan), found(1.0, 2.0001, 3.0, nan, nan))
+    assert said["only_one"] == pytest.approx(2 / 4)
+    assert said["near"] == 1
+    assert said["mean"] == pytest.approx(0.0001 / 3, rel=1e-2)
+    assert said["rms"] == pytest.approx(0.0001 / 5**0.5, rel=1e-2)
+    assert compared(found(nan), found(nan)) == {"only_one": 0.0}
+    with pytest.raises(ValueError, match=r"\(2,\) numbers"):
+        compared(found(1.0, 2.0), found(1.0))
+
+
+@pytest.mark.parametrize("variant", [LLVM, pytest.param(CUDA, marks=needs_gpu)])
+def test_the_bsdf_is_the_same_in_a_process_of_either_variant(variant: str) -> None:
+    job = partial(jobs.bsdf, 2000, 3)
+    here, there = job(), done_by(variant, job)
+    assert there.values.shape == (4, 2000)
+    assert compared(here, there)["rms"] < 1e-3
+    assert processor(variant)
+
+
+def test_a_job_that_fails_is_told_with_its_error() -> None:
+    with pytest.raises(ValueError, match="no back end"):
+        done_by(LLVM, partial(_fails, "no back end"))
+    jobs_of = {"bsdf": {LLVM: {"failed": "ValueError: no back end"}}}
+    assert "ValueError: no back end" in report({"processors": {LLVM: "CPU"}, "jobs": jobs_of})
+
+
+def _fails(why: str) -> Done:
+    raise ValueError(why)
+
+
+def test_a_worker_takes_a_gpu_where_there_is_one_and_nothing_else_was_chosen(monkeypatch) -> None:
+    monkeypatch.setenv(VARIANT, LLVM)
+    assert not prefer_cuda()
+    assert os.environ[VARIANT] == LLVM
+    for there in (False, True):
+        monkeypatch.setenv(VARIANT, "")
+        monkeypatch.setattr(dr, "has_backend", lambda backend, there=there: there)
+        assert prefer_cuda() == there
+        assert os.environ[VARIANT] == (CUDA if there else "")
