@@ -22,11 +22,16 @@ def chosen_variant(variant: str | None = None) -> str:
     """The variant to run: `variant`, else `HAIRSTAGE_VARIANT`, else LLVM, which every CPU runs.
 
     Named as Mitsuba's are, such as `llvm_ad_rgb` or `cuda_ad_rgb`. Makes libLLVM known to Dr.Jit
-    where it is needed; raises `BackendError` when it is too old or absent.
+    where it is needed; raises `BackendError` when it is too old or absent, or without a GPU.
     """
     chosen = variant or os.environ.get(VARIANT) or "llvm_ad_rgb"
     if chosen.startswith("llvm"):
         os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
+    if chosen.startswith("cuda") and not drjit.has_backend(drjit.JitBackend.CUDA):
+        raise BackendError(
+            f"{chosen} needs an NVIDIA GPU with its driver, and none is found: leave {VARIANT} "
+            "unset to run on the CPU"
+        )
     return chosen
 
 

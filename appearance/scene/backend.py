@@ -17,9 +17,11 @@ def ensure_backend(variant: str | None = None, *, threads: int | None = None) ->
     """Set Mitsuba's variant once and return it; `threads` is how many Dr.Jit runs on, from now.
 
     `variant` or `HAIRSTAGE_VARIANT` overrides the choice; otherwise LLVM, which runs on every CPU.
-    Raises `BackendError` when libLLVM is too old or absent.
+    Raises `BackendError` when libLLVM is too old or absent, or the variant is none that runs here.
     """
     chosen = chosen_variant(variant)
+    if chosen not in mi.variants():
+        raise BackendError(f"there is no variant {chosen!r}: choose llvm_ad_rgb or cuda_ad_rgb")
     if mi.variant() != chosen:
         mi.set_variant(chosen)
     if threads is not None:

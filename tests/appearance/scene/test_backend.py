@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import drjit
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -103,6 +104,7 @@ assert protect(start + page, page, 0) == 0
 five = np.frombuffer(memory, np.float32, count=5, offset=page - 20)
 five[:] = range(5)
 ensure_backend("llvm_ad_rgb")
+import drjit
 import mitsuba as mi
 print((mi.Float(for_kernels(five)) + 1).numpy().tolist())
 """
@@ -126,3 +128,10 @@ def test_arrays_for_kernels_begin_at_a_packet_and_have_room_after_their_end(shap
         owner = owner.base
     assert copy.ctypes.data % 128 == 0
     assert owner.ctypes.data + owner.nbytes - copy.ctypes.data - copy.nbytes >= 128
+
+
+@pytest.mark.parametrize(("variant", "said"), [("cuda_ad_rgb", "NVIDIA GPU"), ("llvm", "'llvm'")])
+def test_a_variant_that_does_not_run_here_is_a_sentence(variant, said, monkeypatch):
+    monkeypatch.setattr(drjit, "has_backend", lambda backend: False)
+    with pytest.raises(BackendError, match=said):
+        ensure_backend(variant)
