@@ -118,8 +118,11 @@ def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera])
             assert image.shape == (96, 96)
 
 
-def runs_down(strands: Strands, within_deg: float = 7) -> None:
-    """Asserts that strands follow the meridians once they have risen from the scalp."""
+def runs_down(strands: Strands, within_deg: float = 7, mostly: float = 0.8) -> None:
+    """Asserts that strands follow the meridians once they have risen from the scalp.
+
+    Half of their points within `within_deg`, the share `mostly` of them within 20°.
+    """
     assert len(strands) > 300
     distance = np.linalg.norm(strands.roots, axis=1)
     assert np.abs(distance - HEAD).max() < 1e-3
@@ -128,7 +131,7 @@ def runs_down(strands: Strands, within_deg: float = 7) -> None:
     along = (strands.tangents()[outer] * down(strands.points[outer])).sum(axis=1)
     turned = np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))
     assert np.median(turned) < within_deg
-    assert (turned < 20).mean() > 0.8
+    assert (turned < 20).mean() > mostly
 
 
 def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:
@@ -136,9 +139,9 @@ def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:
 
 
 @pytest.mark.slow
-def test_half_as_many_pixels_a_side_give_the_same_strands(unswept: Capture, tmp_path: Path) -> None:
+def test_half_as_many_pixels_a_side_give_nearly_the_same(unswept: Capture, tmp_path: Path) -> None:
     reconstruct(unswept.view(reduced=2), Model(tmp_path), options=QUICK)
-    runs_down(read_strands(tmp_path / "strands.npz"), within_deg=10)
+    runs_down(read_strands(tmp_path / "strands.npz"), within_deg=10, mostly=0.65)
     image = cv2.imread(str(tmp_path / "masks" / "c72_hair.png"), 0)
     assert image is not None
     assert image.shape == (96, 96)  # masks are left in the pixels of the frames

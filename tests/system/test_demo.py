@@ -51,7 +51,7 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
             assert set(figures[over]) == thresholds
             for scores in figures[over].values():
                 assert all(0 <= scores[k] <= 1 for k in ("precision", "recall", "f"))
-    assert set(results["baselines"]) == {"hull_vertical", "hull_smooth_field"}
+    assert set(results["baselines"]) == {"hull_vertical", "hull_smooth_field", "true_directions"}
     assert results["images"]["rendered"] in ("sun_fit", "inverse_rendering")
     fits = ("ours", "sun_fit", "inverse_rendering", "mean_colour", "diffuse")
     for group, of_frames in (
@@ -62,7 +62,7 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
             assert results["images"][group][method]["psnr"] > 0
             assert -1 <= results["images"][group][method]["ssim"] <= 1
     fitted, true = results["appearance"]["fitted"], results["appearance"]["true"]
-    assert set(fitted) == set(true) >= {"beta_m", "v", "colour", "skin"}
+    assert set(fitted) > set(true) >= {"beta_m", "v", "colour", "skin"}
     assert results["held_out"]["held_out_cameras"] == ["cam_07"]
     for name in ("strands.npz", "strands.hair", "strands.usdc", "appearance.json", "report.json"):
         assert (out / "model" / name).is_file(), name

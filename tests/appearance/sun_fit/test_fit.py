@@ -180,11 +180,14 @@ def covers(appearance, report, beta):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beta", [0.05, 0.8])
-def test_smooth_and_rough_fibres_are_found_or_warned_of(made, tmp_path, beta):
+@pytest.mark.parametrize(("beta", "rtol", "warned"), [(0.05, 0.2, 2), (0.8, 0.08, 0)])
+def test_smooth_and_rough_fibres_are_found_or_warned_of(made, tmp_path, beta, rtol, warned):
     appearance, report = fit_of(tmp_path, made, HairAppearance(TRUTH.sigma_a, beta, 0.2))
     assert covers(appearance, report, beta)
-    np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.1)
+    sigma_a = np.array(appearance.hair.sigma_a)
+    np.testing.assert_allclose(sigma_a, TRUTH.sigma_a, rtol=rtol)
+    assert (np.abs(sigma_a / TRUTH.sigma_a - 1) < np.maximum(appearance.sigma_a_error, 0.08)).all()
+    assert sum("uncertain" in w for w in report["colour"].warnings) == warned
 
 
 @pytest.mark.slow
