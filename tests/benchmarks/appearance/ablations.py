@@ -415,14 +415,14 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     effort: dict[str, Any] = {"options": QUICK, "rig": SMALL} if args.quick else {}
     seeds = min(args.seeds, 1) if args.quick else args.seeds
     result: dict[str, Any] = {}
-    if args.only != "cycles":
+    if not args.only_cycles:
         result = run_bench(
             args.out, subject, seeds=seeds, seed=args.seed, progress=progress, **effort
         )
     try:
         folder = cycles_folder(args.capture)
     except LeftOut as error:
-        if args.only == "cycles":
+        if args.only_cycles:
             raise
         return {**result, "cycles": {"left_out": str(error)}}
     for name, start in (("cycles", None), ("cycles_from_afar", AFAR)):
@@ -440,7 +440,7 @@ BENCHMARK = Benchmark(
     (
         *SUBJECT,
         CAPTURE,
-        option("--only", "what Cycles rendered, and no table at 36", choices=("cycles",)),
+        option("--only-cycles", "no tables: what Cycles rendered alone", action="store_true"),
         option("--size", "pixels a side: 36, or the ladder at 128 or 256", type=int, default=36),
         option("--seeds", "of the spread, on (b); at size on all", type=int, default=3),
         option("--ladders", "at size: which of b, c, r and cycles", default="b,c"),
