@@ -24,12 +24,12 @@ from benchmarks.appearance.ablations import AT_SIZE, AT_SIZE_OPTIONS, QUICK, SMA
 from benchmarks.appearance.known_subjects import SmallStage
 from benchmarks.backends import jobs
 from benchmarks.backends.jobs import Done
-from benchmarks.command import CACHE, SUBJECT, Benchmark, option
+from benchmarks.command import CACHE, SUBJECT, Benchmark, LeftOut, option
 from benchmarks.light_codes.rig import patch
 from benchmarks.results import markdown, save
 from benchmarks.strand_truth import write_hair_masks
 from benchmarks.subjects import simulated
-from reconstruction import Camera, Capture, Progress, ReconstructOptions, Report, read_obj
+from reconstruction import Camera, Capture, Progress, ReconstructOptions, Report
 from reconstruction.array_backend import VARIANT
 from reconstruction.light_codes.line_strands import build_views
 from reconstruction.masks import MaskedCapture, hair_masks
@@ -53,11 +53,11 @@ def _olat(pixels: int, lights: int, args: argparse.Namespace) -> Job:
 
 def _fit(args: argparse.Namespace) -> Job:
     subject = simulated(args.rig, args.subject, args.head, args.seed)
-    stage, options = AT_SIZE.get(args.size, STAGE), STAGE_OPTIONS
-    if args.size in AT_SIZE:
-        options = AT_SIZE_OPTIONS
+    stage, options = STAGE, STAGE_OPTIONS
     if args.quick:
         stage, options = SMALL, QUICK
+    elif args.size in AT_SIZE:
+        stage, options = AT_SIZE[args.size], AT_SIZE_OPTIONS
     return partial(jobs.fit, subject, stage, options, args.seed)
 
 
@@ -67,9 +67,8 @@ def _search(args: argparse.Namespace) -> Job:
     capture = Capture(folder)
     write_hair_masks(capture, truth)
     codes = ReconstructOptions().light_codes
-    head = read_obj(truth / "head.obj")
     masked = MaskedCapture(capture, hair_masks(capture, None, capture.head))
-    views, volume = build_views(masked, head, Report(), options=codes)
+    views, volume = build_views(masked, capture.head, Report(), options=codes)
     return partial(jobs.search, views, volume, codes.search)
 
 
@@ -101,12 +100,8 @@ def processor(variant: str) -> str | None:
 
 def done_by(variant: str, job: Job) -> Done:
     """Do a job in a process of its own, whose variant it is. Raises what the job raised."""
-    with ProcessPoolExecutor(
-        1,
-        get_context("spawn"),
-        initializer=_choose,
-        initargs=(variant,),
-    ) as pool:
+    fresh = get_context("spawn")
+    with ProcessPoolExecutor(1, fresh, initializer=_choose, initargs=(variant,)) as pool:
         return pool.submit(job).result()
 
 
@@ -155,6 +150,7 @@ def report(result: dict[str, Any]) -> str:
         if "compared" in found:
             figures = ", ".join(f"{k} {v:.2g}" for k, v in found["compared"].items())
             lines.append(f"- {name}, the one beside the other: {figures}\n")
+    lines += [f"- {name}: not here\n" for name, on in variants.items() if on == "not here"]
     return "\n".join(lines)
 
 
@@ -162,11 +158,13 @@ def _cells(got: dict[str, Any], found: dict[str, Any]) -> list[str]:
     first = found.get(VARIANTS[0], {})
     ratio = f"{got['seconds'] / first['seconds']:.2f}" if "seconds" in first else ""
     figures = ", ".join(f"{k} {v:.4g}" for k, v in got["figures"].items())
-    return [f"{got['seconds']:.2f}", f"{got['first']:.2f}", ratio, figures]
+    return [f"{got['seconds']:.3g}", f"{got['first']:.3g}", ratio, figures]
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     on = {v: processor(v) for v in args.variants}
+    if not any(on.values()):
+        raise LeftOut("no CUDA device is found: leave --variants out to measure the CPU alone")
     result: dict[str, Any] = {"processors": {v: p or "not here" for v, p in on.items()}}
     result["jobs"] = {}
     failed: list[str] = []
@@ -200,7 +198,7 @@ BENCHMARK = Benchmark(
     (
         *SUBJECT,
         CACHE,
-        option("--size", "of the fit: 64, or the ladder's 128 or 256", type=int, default=64),
+        option("--size", "of the fit's pictures", type=int, choices=(64, *AT_SIZE), default=64),
         option("--jobs", "which of them", nargs="+", choices=tuple(JOBS), default=list(JOBS)),
         option("--variants", "Mitsuba's", nargs="+", choices=VARIANTS, default=list(VARIANTS)),
     ),

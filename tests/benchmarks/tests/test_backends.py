@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 from functools import partial
 
 import drjit as dr
 import numpy as np
 import pytest
+from benchmarks.__main__ import main
 from benchmarks.backends import jobs
 from benchmarks.backends.jobs import Done
-from benchmarks.backends.side_by_side import compared, done_by, processor, report
+from benchmarks.backends.side_by_side import compared, done_by, report
 
 from reconstruction.array_backend import VARIANT, prefer_cuda
 
@@ -36,13 +38,36 @@ def test_what_both_have_is_compared_and_what_one_lacks_is_counted() -> None:
         compared(found(1.0, 2.0), found(1.0))
 
 
-@pytest.mark.parametrize("variant", [LLVM, pytest.param(CUDA, marks=needs_gpu)])
-def test_the_bsdf_is_the_same_in_a_process_of_either_variant(variant: str) -> None:
-    job = partial(jobs.bsdf, 2000, 3)
-    here, there = job(), done_by(variant, job)
-    assert there.values.shape == (4, 2000)
-    assert compared(here, there)["rms"] < 1e-3
-    assert processor(variant)
+@needs_gpu
+def test_the_bsdf_is_the_same_on_a_gpu() -> None:
+    one, other = (done_by(v, partial(jobs.bsdf, 2000, 3)) for v in (LLVM, CUDA))
+    assert compared(one, other)["rms"] < 1e-5
+
+
+def test_a_quick_run_leaves_what_the_cpu_does_and_says_what_is_not_here(tmp_path, capsys) -> None:
+    assert main(["backends", "--quick", "--jobs", "bsdf", "--out", str(tmp_path)]) == 0
+    (job,) = json.loads((tmp_path / "backends.json").read_text())["jobs"].values()
+    assert job[LLVM]["seconds"] > 0
+    told = (tmp_path / "backends.md").read_text()
+    assert f"{len(os.sched_getaffinity(0))} threads" in told
+    assert (CUDA in job) != (f"{CUDA}: not here" in told)
+
+
+def test_a_gpu_alone_that_is_not_there_is_a_failure(monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.setattr(dr, "has_backend", lambda backend: False)
+    assert main(["backends", "--quick", "--variants", CUDA, "--out", str(tmp_path)]) == 1
+    assert "leave --variants out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("variant", [LLVM, CUDA])
+def test_a_job_runs_in_a_process_of_its_own_whose_variant_it_is(variant, monkeypatch) -> None:
+    monkeypatch.setenv(VARIANT, "mine")
+    assert done_by(variant, _tells).figures == {variant: 1}
+    assert os.environ[VARIANT] == "mine"
+
+
+def _tells() -> Done:
+    return Done(0, 0, np.zeros(0, np.float32), {os.environ[VARIANT]: 1})
 
 
 def test_a_job_that_fails_is_told_with_its_error() -> None:
