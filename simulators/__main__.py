@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
+from appearance.scene.backend import BackendError, ensure_backend
 from reconstruction.geometry.rig import RigError
 from simulators.frames.frames import FrameMaker, Sensor, cache_key
 from simulators.frames.render_process import RenderPool
@@ -61,8 +62,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"simulators: {error}", file=sys.stderr)
         return _BAD_INPUT
     try:
+        if isinstance(subject, Subject):
+            ensure_backend()  # here, not at the first frame of a capture
         _run(args, rig_file, subject, drift, faults)
-    except OSError as error:
+    except (OSError, BackendError) as error:
         print(f"simulators: {error}", file=sys.stderr)
         return _FAILED
     return 0

@@ -59,6 +59,8 @@ def calibrate_cameras(
     not determine its lens, and where no pose ties cameras together.
     """
     usable = {c.name: _usable(c, board, sightings.get(c.name, {}), keep_lens) for c in nominal}
+    if keep_lens:
+        usable = {c.name: {p: _upright(c, s) for p, s in usable[c.name].items()} for c in nominal}
     alone = [_Lens.kept(c) if keep_lens else _one_lens(c, board, usable[c.name]) for c in nominal]
     bundle = _Bundle(board, [c.name for c in nominal], usable, alone)
     solution = minimise(bundle, bundle.start(_chain(board, usable, alone)), huber=3.0)
@@ -85,18 +87,27 @@ def _usable(
     return out
 
 
+def _upright(camera: Camera, sighting: Sighting) -> Sighting:
+    """What a camera of no skew would have seen: OpenCV knows no other."""
+    _, skew, _, _, fy, cy = camera.K[:2].ravel()
+    return replace(
+        sighting, pixels=sighting.pixels - np.outer((sighting.pixels[:, 1] - cy) / fy, (skew, 0))
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class _Lens:
-    """fx, fy, cx, cy, k1, k2, p1, p2, k3 `(9,)`, and which of them are estimated."""
+    """fx, fy, cx, cy, k1, k2, p1, p2, k3 `(9,)`, which of them are estimated, and a kept skew."""
 
     values: Array
     free: Ints
+    skew: float = 0.0
 
     @classmethod
     def kept(cls, camera: Camera) -> _Lens:
         K = camera.K
         values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera.distortion])
-        return cls(values, np.zeros(0, np.int64))
+        return cls(values, np.zeros(0, np.int64), float(K[0, 1]))
 
     def matrix(self) -> Array:
         fx, fy, cx, cy = self.values[:4]
@@ -268,6 +279,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
     for k, c in enumerate(nominal):
         lens, pose = bundle.lens(x, k), bundle.camera_pose(x, k)
         K, R, t = lens.matrix(), pose.rotation, pose.translation
+        K[0, 1] = lens.skew
         try:
             found.append(replace(c, K=K, R=R, t=t, distortion=lens.values[4:]))
         except ValueError as error:

@@ -75,3 +75,13 @@ def test_wrong_arguments_end_it_with_code_2(rig_file, capsys, arguments, said):
         code = ended.code
     assert code == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_variant_that_cannot_run_is_told_before_any_capture(
+    rig_file, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("HAIRSTAGE_VARIANT", "nonsense")
+    assert main(["--rig", str(rig_file), "--state", str(tmp_path / "state")]) == 1
+    said = capsys.readouterr()
+    assert said.err.startswith("simulators: there is no variant 'nonsense'")
+    assert said.out == "", "nobody is told that it is ready"

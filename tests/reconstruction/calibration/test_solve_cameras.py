@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -92,6 +93,20 @@ def test_one_pose_leaves_lenses_open_but_places_cameras_whose_lens_is_kept(
     assert all(
         np.array_equal(a.K, b.K) for a, b in zip(found.cameras, true_rig.cameras, strict=True)
     )
+
+
+def test_a_kept_lens_keeps_its_skew(board: Board) -> None:
+    K = np.array([[900.0, 60, 320], [0, 880, 240], [0, 0, 1]])
+    camera = Camera("front", 640, 480, K, np.eye(3), np.array([0, 0, 0.9]), (-0.2, 0, 0, 0, 0))
+    turn = cv2.Rodrigues(np.array([0.4, -0.3, 0.2]))[0]
+    points = (board.corners - (*board.size / 2, 0)) @ turn.T
+    seen = {"only": Sighting(np.arange(len(points)), camera.project(points)[0])}
+    found = calibrate_cameras([camera], board, {"front": seen}, keep_lens=True)
+    np.testing.assert_array_equal(found.cameras[0].K, K)
+    to_world = found.board_to_world["only"]
+    again, _ = found.cameras[0].project(to_world(board.corners))
+    np.testing.assert_allclose(again, seen["only"].pixels, atol=1e-3)
+    np.testing.assert_allclose(found.cameras[0].R @ to_world.rotation, turn, atol=1e-5)
 
 
 def test_parallel_poses_leave_the_lens_open(board: Board) -> None:
