@@ -37,6 +37,9 @@ def add(commands: Commands) -> None:
 
     table = add_command(group, "table", run_table)
     table.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="results.json")
+    table.add_argument(
+        "--short", action="store_true", help="as the README's: warnings are only counted"
+    )
 
 
 def run_geometry(args: argparse.Namespace, output: Output) -> None:
@@ -119,7 +122,7 @@ def run_images(args: argparse.Namespace, output: Output) -> None:
 
 
 def run_table(args: argparse.Namespace, output: Output) -> None:
-    """The README's table of figures, as Markdown.
+    """The README's tables of figures, as Markdown.
 
     Print a column for each subject of some 'hairstage demo': F of the strands at 1 mm/10° over
     visible and all points beside the baselines, PSNR / SSIM of held-out lights and camera, fitted
@@ -150,7 +153,7 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
             "results": columns,
             "figures": {name: figures_of(results) for name, results in columns.items()},
         },
-        markdown_table(columns),
+        markdown_table(columns, short=args.short),
     )
 
 

@@ -68,11 +68,14 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     )
 
 
-def markdown_table(columns: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """The README's table of figures: a column for each list of results, one a seed, by its name.
+def markdown_table(
+    columns: Mapping[str, Sequence[Mapping[str, Any]]], *, short: bool = False
+) -> str:
+    """A table of figures: a column for each list of results, one a seed, by its name.
 
     A cell is the figure of one seed, or mean ± standard deviation (n - 1) over seeds. Warnings
-    stand below, each with the seeds that had it; its numbers are those of the first.
+    stand below, each with the seeds that had it; its numbers are those of the first. The README's
+    is `short`: what is ours and what it is held against, and how many warnings there are.
     """
     table, notes = [["", *columns], ["---"] * (len(columns) + 1)], []
     for number, (name, results) in enumerate(columns.items(), 1):
@@ -88,8 +91,11 @@ def markdown_table(columns: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
         for alike, text in first.items():
             of = f" (seed {', '.join(seeds_of[alike])})" if len(results) > 1 else ""
             notes.append(f"[{number}] {text}{of}")
+        if short and first:
+            many = "s" if len(first) > 1 else ""
+            notes[-len(first) :] = [f"[{number}] {len(first)} warning{many} of these runs"]
     figures = [figures_of(results) for results in columns.values()]
-    for title, parts in _rows().items():
+    for title, parts in _rows(short).items():
         cells = [" / ".join(_cell(f[title], parts)) if title in f else "–" for f in figures]
         if set(cells) != {"–"}:
             table.append([title, *cells])
@@ -120,23 +126,32 @@ _Part = tuple[Callable[[Mapping[str, Any]], float | None], str, str]
 """A figure of a result, None where it has none; the form of the number, and its unit."""
 
 
-def _rows() -> dict[str, list[_Part]]:
-    """The README's rows by title."""
+_SHORT = frozenset(
+    ("ours", "hull_smooth_field", "guided_frames", "diffuse", "three_nearest", "nearest_cameras")
+)
+"""What the README's rows of F and of pictures are of; its other rows are ours."""
+
+
+def _rows(short: bool = False) -> dict[str, list[_Part]]:
+    """The table's rows by title."""
     rows: dict[str, list[_Part]] = {}
+    strands = {n: title for n, title in STRANDS.items() if n in _SHORT or not short}
+    pictures = {n: title for n, title in PICTURES.items() if n in _SHORT or not short}
+    ours = {"ours": STRANDS["ours"]} if short else STRANDS
     for over in ("visible", "all"):
-        for at, how in (("", ""), ("equal_length", ", at equal length")):
-            for name, title in STRANDS.items():
+        for at, how, of in (("", "", strands), ("equal_length", ", at equal length", ours)):
+            for name, title in of.items():
                 read = partial(_f, at=at, over=over, name=name)
                 rows[f"F at 1 mm/10°, {over} points{how}: {title}"] = [(read, ".1f", " %")]
     for title, form, unit, place in STRAND_FIGURES:
-        for name, who in STRANDS.items():
+        for name, who in ours.items():
             figure = partial(_strand_figure, place=place, name=name)
             rows[f"{title}: {who}"] = [(figure, form, unit)]
         if title in OF_TRUTH:
             truth = partial(_strand_figure, place=OF_TRUTH[title], name="ours")
             rows[f"{title}: the truth"] = [(truth, form, unit)]
     for group in GROUPS:
-        for name, title in PICTURES.items():
+        for name, title in pictures.items():
             decibels, ssim = (partial(_score, group=group, name=name, score=s) for s in _SCORES)
             where = group.replace("held_out_", "held-out ")
             rows[f"{where}: {title}"] = [(decibels, ".1f", " dB"), (ssim, ".2f", "")]

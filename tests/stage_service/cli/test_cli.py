@@ -526,6 +526,14 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     }
     assert rows <= set(rest)
     assert rest[-1] == "[1] fit: the roughness is at its bound"
+    assert main(["evaluate", "table", "--short", str(file)]) == 0
+    brief = capsys.readouterr().out.splitlines()
+    left_out = {title for title, *_ in (line[2:].split(" |") for line in {*rest} - {*brief})}
+    assert left_out == {own, "F at 1 mm/10°, visible points: hull + vertical"} | {
+        "F at 1 mm/10°, all points: hull + vertical",
+        "] fit: the roughness is at its bound",
+    }, "what is ours stays, and what it is held against"
+    assert brief[-1] == "[1] 1 warning of these runs"
     again = tmp_path / "again.json"
     found = {"fibre_beta_m": 0.3, "fibre_beta_m_error": 0.1, "disorder_deg": 14.2}
     results["appearance"]["fitted"] |= {"beta_m": 0.3, "sigma_a": [0.11, 0.15, 0.5], **found}
