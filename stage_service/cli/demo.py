@@ -75,7 +75,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     out: Path = args.out
     os.environ.setdefault("HAIRSTAGE_TOKEN_FILE", str((out / "token").resolve()))
     rig = Rig.load(args.rig)
-    held_out = _held_out(rig, args.hold_out_camera)
+    held_out = hold_out(rig, args.hold_out_camera)
     chosen_variant()  # what is missing is told before anything is started
     _check(args)
     _prepare(out)
@@ -183,7 +183,8 @@ def _start(children: Children, args: argparse.Namespace) -> str:
     return url
 
 
-def _held_out(rig: Rig, camera: str | None) -> dict[str, list[str]]:
+def hold_out(rig: Rig, camera: str | None = None) -> dict[str, list[str]]:
+    """The job's options that hold out `camera` (default: the rig's last) and a dozen lights."""
     name = rig.cameras[-1].name if camera is None else rig.camera(camera).name
     every = min(EVERY_NTH_LIGHT, max(len(rig.lights) // 4, 1))
     lights = [light.name for light in rig.lights[every // 2 :: every]]

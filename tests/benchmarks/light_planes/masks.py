@@ -1,19 +1,22 @@
 """Automatic hair masks beside the true ones, at several path counts: noise must not decide them.
 
-And strands, and a head, of the same captures without their sweep and head, as of photographs under
-single lights, by masks that light alone has told. Captures of the demo's rig go through the wires
-once and are kept. Leaves `masks.json`.
+And what the demo's job makes of the captures by its own masks and by the true ones; and strands,
+and a head, of the same captures without their sweep and head, as of photographs under single
+lights, by masks that light alone has told. Captures of the demo's rig go through the wires once and
+are kept. Leaves `masks.json` and `masks.md`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from appearance import HairAppearance, build_scene
@@ -21,6 +24,7 @@ from appearance.render.coverage import coverage
 from benchmarks.captures import SimulatedCapture
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, option, within
 from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
+from benchmarks.light_planes.without_help import copied
 from benchmarks.results import save
 from benchmarks.strand_truth import StrandTruth
 from reconstruction import Capture, Mesh, Model, Progress, Stage, read_strands, reconstruct
@@ -34,9 +38,20 @@ from reconstruction.masks import (
     distance_to,
     hair_masks,
 )
+from stage_service.cli.demo import hold_out
 from stage_service.cli.support.commands import rig_path
+from stage_service.cli.support.tables import markdown_table
+from stage_service.jobs.records import JobOptions
+from stage_service.jobs.steps import STEPS, StepContext
 
 SUBJECTS = ("wavy", "curly", "sintel")
+JOB = ("reconstruct", "fit", "assess", "evaluate", "results")
+"""Of the pipeline "full", what masks can change: inverse rendering is taken on no demo."""
+
+QUICK = {
+    "fit": {"roughness_spp": 2, "colour_spp": 2, "iterations": 1},
+    "assess": {"cameras": 1, "lights": 1, "spp": 2, "relit_size": 16, "relit_spp": 1},
+}
 LEAST_SHARE = 0.1
 """Of a pixel that the subject must cover to be in its true mask: less is near a frame's noise."""
 
@@ -77,16 +92,33 @@ class SingleLights(Capture):
         """None."""
 
 
-def judge(folder: Path, truth_folder: Path, model: Model) -> dict[str, Any]:
+def demo_job(
+    capture: Capture, truth: Path, model: Model, options: JobOptions, progress: Progress
+) -> dict[str, Any]:
+    """The `results.json` of the demo's job on `capture`, without inverse rendering."""
+    asked = options.model_copy(update={"truth": str(truth), **hold_out(capture.rig)})
+    done: dict[str, Any] = {}
+    for k, name in enumerate(JOB):
+        tell = within(progress, name, k / len(JOB), 1 / len(JOB))
+        begin = time.perf_counter()
+        figures = STEPS[name](StepContext(capture.path, model, asked, tell, done))
+        done[name] = {"figures": figures, "seconds": time.perf_counter() - begin}
+    return model.json("results.json")
+
+
+def judge(
+    folder: Path, truth_folder: Path, out: Path, options: JobOptions, progress: Progress
+) -> dict[str, Any]:
     """Overlaps, disagreements and the envelope, with masks of the light, without head and true.
 
-    `model` is where strands of single lights alone are left; their baselines have the head.
+    Then the demo's job by its own masks and by the true ones, and strands of single lights alone,
+    whose baselines have the head. Models are left in `out`.
     """
     capture = Capture(folder)
     cloud, head = triangulate(capture), capture.head
     assert head is not None
     true = true_masks(capture, truth_folder)
-    out: dict[str, Any] = {}
+    told: dict[str, Any] = {}
     kinds = {
         "automatic": hair_masks(capture, cloud, head),
         "without head": hair_masks(capture, cloud),
@@ -96,20 +128,30 @@ def judge(folder: Path, truth_folder: Path, model: Model) -> dict[str, Any]:
         stage = Stage("envelope")
         masked = MaskedCapture(capture, masks)
         build_envelope(masked, cloud, head, grid=2e-3, margin=2e-3, stage=stage)
-        out[kind] = {
+        told[kind] = {
             "overlap": overlaps(masks, true),
             "disagreement": disagreements(masks, capture.rig.cameras, cloud, head),
             "envelope_litres": stage.figures["envelope_litres"],
         }
-    alone = SingleLights(folder)
+    given = copied(capture, out / "capture")
+    for name, mask in true.items():
+        (given.path / "masks").mkdir(exist_ok=True)
+        cv2.imwrite(str(given.path / "masks" / f"{name}.png"), 255 * mask.hair.astype(np.uint8))
+    told["jobs"] = {
+        kind: demo_job(
+            shot, truth_folder, Model(out / kind), options, within(progress, kind, k / 2, 0.5)
+        )
+        for k, (kind, shot) in enumerate({"automatic": capture, "true": given}.items())
+    }
+    alone, model = SingleLights(folder), Model(out / "single_lights_alone")
     reconstruct(alone, model, method="auto")
     truth = StrandTruth(capture, truth_folder)
-    out["single lights alone"] = {
+    told["single lights alone"] = {
         "overlap": overlaps(hair_masks(alone), true),
         "head_mm": _apart(model.head(alone), head),
         "strands": {"ours": truth.score(model.strands()), **truth.baselines(model)},
     }
-    return out
+    return told
 
 
 def _apart(found: Mesh | None, true: Mesh) -> dict[str, float] | None:
@@ -150,10 +192,27 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     captures = _captures(args)
     for k, ((name, paths), capture) in enumerate(captures.items()):
         tell = within(progress, f"{name}, {paths} paths", k / len(captures), 1 / len(captures))
-        model = Model(args.out / f"masks-{name}-{paths}")
-        results.setdefault(name, {})[str(paths)] = judge(*capture.make(args.cache, tell), model)
+        folder, truth = capture.make(args.cache, within(tell, "capture", 0.0, 0.7))
+        options = JobOptions.model_validate(QUICK if args.quick else {})
+        options = options.model_copy(update={"seed": args.seed})
+        into = args.out / f"masks-{name}-{paths}"
+        judged = judge(folder, truth, into, options, within(tell, "judged", 0.7, 0.3))
+        results.setdefault(name, {})[str(paths)] = judged
         save(args.out / "masks.json", results)
+        (args.out / "masks.md").write_text(report(results, args.seed))
     return results
+
+
+def report(results: Mapping[str, Mapping[str, Any]], seed: int) -> str:
+    """The overlaps, and the README's table of the jobs."""
+    jobs, text = {}, []
+    for name, of_paths in results.items():
+        for paths, judged in of_paths.items():
+            told = judged["automatic"]["overlap"].values()
+            text.append(f"- {name}, {paths} paths: masks overlap by {min(told):.3f} at least")
+            for kind, job in judged["jobs"].items():
+                jobs[f"{name}, {paths} paths, {kind} masks"] = [{**job, "seed": seed}]
+    return "\n".join([*text, "", markdown_table(jobs, short=True), ""])
 
 
 BENCHMARK = Benchmark(run, (CACHE, ONLY, PATHS))
