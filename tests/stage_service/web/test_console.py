@@ -13,6 +13,7 @@ from browsing import Pages, says
 from serving import serving
 from waiting import until
 
+from reconstruction import Model
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import Blackout
@@ -471,3 +472,18 @@ def test_what_is_removed_elsewhere_is_shown_no_more(console):
     http.post(f"/trash/{removed}/restore").raise_for_status()
     now.wait_for_selector(f".said:has-text({ids[1]!r})")
     frames.wait_for_selector(f".list button:has-text({ids[1]!r})")
+
+
+def test_an_open_job_shows_what_its_end_left(console):
+    http, pages = console()
+    plan = {"lights": [], "projectors": []}
+    capture = http.post("/captures", json={"plan": plan}).json()["id"]
+    until(lambda: http.service.capture(capture).outcome == "completed")
+    asked = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "mine"}
+    job = http.post("/jobs", json=asked).json()["id"]
+    page = pages.open(f"jobs/{job}")
+    page.wait_for_selector(".said:has-text('It waits for a worker.')")
+    Model(http.service.root / "models" / "mine").create().write_json("results.json", {"a": 1})
+    http.delete(f"/jobs/{job}").raise_for_status()
+    page.wait_for_selector("dd:text-is('cancelled')")
+    page.wait_for_selector("summary:text-is('Files (1)')")
