@@ -308,6 +308,9 @@ def test_what_a_page_shows_of_a_capture(http, rig_file):
     png = np.frombuffer(http.get(f"{frames}/{step}/cam_0.png", params=white).content, np.uint8)
     brightest = cv2.imdecode(png, cv2.IMREAD_COLOR).max()
     assert brightest == round(255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055)), "half of white, in sRGB"
+    for beyond in ("1e-320", "1e308", "inf", "0"):  # no number of a frame's, or none at all
+        refused = http.get(f"{frames}/{step}/cam_0.png", params={"white": beyond})
+        problem(refused, "invalid-request")
     rig = http.get("/rig").json()
     assert [x["name"] for x in rig["lights"]] == [x.name for x in rig_file.rig.lights]
     camera = rig_file.rig.cameras[0]

@@ -277,6 +277,8 @@ def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monke
     assert listed == {"name": model.name, "files": ["strands.npz"], "bytes": 4}
     files = http.get(f"/jobs/{job['id']}/artifacts").json()
     assert files == [{"path": "strands.npz", "bytes": 4}]
+    for path in (f"/models/{model.name}/archive.tar", f"/jobs/{job['id']}/artifacts/relit.png"):
+        assert slug(http.get(path)) == "in-use"
 
 
 def test_a_snapshot_is_nothing_to_keep(http):
