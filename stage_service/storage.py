@@ -127,7 +127,9 @@ class Storage:
                 return self._into_trash(found, folder)
 
         work = partial(self._captures.set_aside, capture, move)
-        return self._control.do(by, "capture.remove", work, capture)
+        removed = self._control.do(by, "capture.remove", work, capture)
+        self._tell("removed", removed)
+        return removed
 
     def remove_model(self, name: str, by: Caller, *, dry_run: bool) -> Removed:
         """Put a model into the trash. Raises `NotThere`, `InUse`, `Forbidden`,
@@ -141,7 +143,9 @@ class Storage:
         if dry_run:
             return found
         work = partial(self._into_trash, found, model.path)
-        return self._control.do(by, "model.remove", work, name, steers=False)
+        removed = self._control.do(by, "model.remove", work, name, steers=False)
+        self._tell("removed", removed)
+        return removed
 
     def trash(self) -> list[Removed]:
         """What was removed, oldest first."""
@@ -179,7 +183,9 @@ class Storage:
                 self._captures.catalogue.adopt(found.id)
             return found
 
-        return self._control.do(by, f"{found.kind}.restore", work, found.id, steers=False)
+        restored = self._control.do(by, f"{found.kind}.restore", work, found.id, steers=False)
+        self._tell("restored", restored)
+        return restored
 
     def empty(self, older_than_days: float, by: Caller, *, dry_run: bool) -> list[Removed]:
         """Delete for good what was removed so many days ago; returns what was. `Forbidden`."""
@@ -277,6 +283,9 @@ class Storage:
         flush(place)
         flush(folder.parent)
         return found.model_copy(update={"name": name})
+
+    def _tell(self, what: str, found: Removed) -> None:
+        self._captures.events.publish(f"{found.kind}.{what}", {"id": found.id})
 
     def _all_jobs(self) -> Iterator[Job]:
         offset = 0

@@ -101,7 +101,10 @@ class Submitting:
 
     def cancel(self, job_id: str, by: Caller) -> Job:
         """Cancel a job: a queued one at once, a running one at its next progress call."""
-        work = partial(self._queue.cancel, job_id)
+
+        def work() -> Job:
+            return self._queue.cancel(self.get(job_id).id)  # one that is owed is there from now on
+
         return self._control.do(by, "job.cancel", work, job_id, steers=False)
 
     def artifacts(self, job_id: str) -> list[Artifact]:

@@ -44,12 +44,18 @@ def possible(state: State, outcome: Outcome | None) -> dict[str, State]:
     return {} if state == "done" and outcome in ("completed", "damaged") else TRANSITIONS[state]
 
 
+ASKED = {"abort": "abort", "pause": "pause", "resume": "resume", "continue": "resume"}
+"""The actions that are for a person to ask for, and by which word; all others are the run's own."""
+
+
 class WrongState(RuntimeError):
-    """The state does not allow the action; the message lists what it allows."""
+    """The state does not allow the action; the message lists what can be asked for."""
 
     def __init__(self, action: str, state: State, outcome: Outcome | None = None) -> None:
-        allowed = ", ".join(sorted(possible(state, outcome))) or "nothing"
-        super().__init__(f"cannot {action} a capture that is {state}; possible now: {allowed}")
+        allowed = ", ".join(sorted(ASKED[a] for a in possible(state, outcome) if a in ASKED))
+        known = f"{state} ({outcome})" if state == "done" and outcome else state
+        told = f"cannot {action} a capture that is {known}; possible now: {allowed or 'nothing'}"
+        super().__init__(told)
         self.action, self.state = action, state
 
 

@@ -6,6 +6,7 @@ RFC 9110, 13 and 14: one range a request, `If-Range`, `If-None-Match`.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import tarfile
 from bisect import bisect_right
@@ -20,6 +21,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stage_service.api.problems import problem_response
+from stage_service.storage import InUse
 
 CHUNK = 1 << 20
 READERS = 8
@@ -91,8 +93,8 @@ class Ranged(Response):
 
 
 def file_response(file: Path, media_type: str) -> Ranged:
-    """A file. Raises `OSError` where it is not there."""
-    found = file.stat()
+    """A file. Raises `InUse` where it has just gone."""
+    found = _stat(file)
     etag = f"{found.st_mtime_ns:x}-{found.st_size:x}-{found.st_ino:x}"
     return Ranged(found.st_size, _reader(file), etag, media_type)
 
@@ -104,7 +106,7 @@ def bytes_response(data: bytes, media_type: str) -> Ranged:
 
 
 def tar_response(name: str, files: Mapping[str, Path]) -> Ranged:
-    """The files, by their names in it, as `name`.tar. Raises `OSError` for one that has gone."""
+    """The files, by their names in it, as `name`.tar. Raises `InUse` for one that has gone."""
     tar = _Tar(name, files)
     return Ranged(tar.size, tar.read, tar.etag, "application/x-tar", f"{name}.tar")
 
@@ -116,7 +118,7 @@ class _Tar:
         digest = hashlib.sha256()
         self._parts: list[tuple[int, Read]] = []
         for relative, path in files.items():
-            found = path.stat()
+            found = _stat(path)
             entry = tarfile.TarInfo(f"{name}/{relative}")
             entry.size, entry.mtime, entry.mode = found.st_size, int(found.st_mtime), 0o640
             head = entry.tobuf(tarfile.GNU_FORMAT)
@@ -154,6 +156,14 @@ def _fixed(data: bytes) -> Read:
 
 def _zeros(first: int, last: int) -> bytes:
     return bytes(last - first)
+
+
+def _stat(file: Path) -> os.stat_result:
+    try:
+        return file.stat()
+    except FileNotFoundError:
+        told = f"{file.name} has just gone: a job writes or compresses there. Ask again after it"
+        raise InUse(told) from None
 
 
 def _reader(file: Path) -> Read:

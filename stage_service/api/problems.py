@@ -95,7 +95,8 @@ unknown-entry 404 Nothing of that name waits
 queue-full 409 The queue has no room
     Remove what waits, or name lights by a rule and not one by one.
 in-use 409 A job still needs it
-    `detail` names the job. Wait until it is done, or cancel it.
+    `detail` names the job, or the file that one has just put away. Wait until it is done, or
+    cancel it.
 not-there 404 No such thing in the store
     `GET /models`, `/uploads` and `/trash` list what there is.
 disk-full 507 The disk has no room

@@ -131,7 +131,9 @@ def get_preview(
     camera: str,
     service: OnService,
     percentile: Annotated[float, Query(ge=50, le=100, description="what becomes white")] = 99.5,
-    white: Annotated[float | None, Query(gt=0, description="this does instead, W/(sr m²)")] = None,
+    white: Annotated[
+        float | None, Query(ge=1e-30, le=1e30, description="this does instead, W/(sr m²)")
+    ] = None,
     size: Annotated[int | None, Query(ge=8, le=4096, description="of the longer side")] = None,
     mark: Annotated[bool, Query(description="paint what is saturated")] = False,
 ) -> Response:

@@ -8,6 +8,7 @@ import { S, events } from "./state.js";
 
 const PAGE = 50;
 const FILM_MS = 120;
+const LISTED = ["capture.state", "capture.over", "capture.removed", "capture.restored", "captures.read", "fresh"];
 
 export function open(view, [asked]) {
   const list = h(".list", { role: "group", "aria-label": "captures" });
@@ -55,10 +56,17 @@ export function open(view, [asked]) {
     mark();
   }
 
-  const onState = () => loadList();
-  events.addEventListener("capture.state", onState);
+  function onChange({ type, detail: told }) {
+    if (type === "capture.removed" && told.id === shown?.id) {
+      shown.stop();
+      shown = asked = null;
+      detail.replaceChildren();
+    }
+    loadList();
+  }
+  for (const kind of LISTED) events.addEventListener(kind, onChange);
   loadList();
-  return { end() { events.removeEventListener("capture.state", onState); shown?.stop(); }, update() { shown?.update(); } };
+  return { end() { for (const kind of LISTED) events.removeEventListener(kind, onChange); shown?.stop(); }, update() { shown?.update(); } };
 }
 
 function captureOf(view, id) {

@@ -62,13 +62,17 @@ function jobOf(view, id) {
     const known = S.jobs?.find((j) => j.id === id) ?? await attempt(() => get(`/jobs/${id}`));
     if (!known) return;
     job = known;
-    const step = `${job.state}/${job.outcome}/${job.progress?.step}`;
-    if (step === last) return update();
-    last = step;
     update();
+  }
+
+  /** What has come of it, once after each step and at its end. */
+  async function look() {
+    const step = `${job.state}/${job.outcome}/${job.progress?.step}`;
+    if (step === last) return;
+    last = step;
     const list = await get(`/jobs/${id}/artifacts`).catch(() => []);
     if (list.some((f) => f.path === "report.json")) reportOf(await get(`/jobs/${id}/report`));
-    filesOf(list);
+    if (step === last) filesOf(list);
   }
 
   /** How long the rest takes, by what the share that is done took. */
@@ -93,6 +97,7 @@ function jobOf(view, id) {
     say(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "It waits for a worker." : "");
     meter.hidden = job.state !== "running";
     what.hidden = job.state === "done";
+    look().catch(() => { last = ""; });
     meter.value = p?.share ?? 0;
     meter.title = percent(p?.share ?? 0);
     const may = S.who?.scopes.includes("jobs");

@@ -20,6 +20,7 @@ export const S = {
 
 const listeners = new Set();
 const SOON_MS = 30;
+const AGAIN_MS = 1000; // after a question that got no answer
 const CALM_MS = 250; // a capture tells its progress five times a second: drawing that is work, for nobody's eye
 let due = 0; // when it is drawn next; 0: nothing is to be
 let drawn = 0;
@@ -80,6 +81,8 @@ async function fresh(name, path, take) {
   return entry.promise;
 }
 
+const SNAPSHOT = "snapshot"; // it is no capture but while it is taken
+
 export const load = {
   rig: () => fresh("rig", "/rig", (x) => { S.rig = x; }),
   health: () => fresh("health", "/health", (x) => { S.health = x; }),
@@ -88,14 +91,18 @@ export const load = {
   jobs: () => fresh("jobs", "/jobs?limit=100", (x) => { S.jobs = x; S.jobsProblem = null; })
     .catch((error) => { S.jobsProblem = error.message; changed(); }),
   capture: (id) => fresh(`capture ${id}`, `/captures/${id}`, takeCapture),
-  newest: () => fresh("newest", "/captures?limit=1", (list) => { if (list.length) takeCapture(list.at(-1)); else S.capture = null; }),
+  /** The capture that runs, which need not be the newest, else that. */
+  now: async () => {
+    await load.health();
+    const going = S.health.capture;
+    if (going === null || going === SNAPSHOT) await fresh("newest", "/captures?limit=1", takeNewest);
+    if (going !== null) await load.capture(going);
+  },
 };
-
-const SNAPSHOT = "snapshot"; // it is no capture but while it is taken
 
 function takeCapture(status) {
   if (status.id === SNAPSHOT && status.state === "done") {
-    if (S.capture?.id === SNAPSHOT) load.newest().catch(() => {});
+    if (S.capture?.id === SNAPSHOT) load.now().catch(() => {});
     return;
   }
   if (S.capture?.id !== status.id) {
@@ -105,6 +112,18 @@ function takeCapture(status) {
   } else resumed(status.state);
   S.capture = status;
   if (status.state !== "done") S.failed = null;
+}
+
+function takeNewest([newest]) {
+  if (S.capture?.id === SNAPSHOT && !newest) S.capture = null;
+  else if (S.capture && S.capture.id !== SNAPSHOT && !(newest?.id >= S.capture.id)) gone(); // removed meanwhile
+  if (newest) takeCapture(newest);
+}
+
+/** The capture that is shown is there no more. */
+function gone() {
+  S.capture = S.failed = null;
+  S.missing = [];
 }
 
 /** What the capture lacked is shot now. */
@@ -132,6 +151,14 @@ function heard(kind, data) {
     load.capture(data.id).catch(() => {});
     load.health().catch(() => {});
     load.queue().catch(() => {});
+  } else if (kind === "capture.removed") {
+    if (S.failed?.id === data.id) S.failed = null;
+    if (S.capture?.id === data.id) {
+      gone();
+      load.now().catch(() => {});
+    }
+  } else if (kind === "capture.restored" || kind === "captures.read") {
+    if (S.failed === null) load.now().catch(() => {}); // else what failed stays until it is seen
   } else if (kind === "capture.frame_missing") {
     S.missing = [{ ...data, at: new Date().toISOString() }, ...S.missing].slice(0, 200);
   } else if (kind === "stage.lease") {
@@ -150,33 +177,51 @@ function heard(kind, data) {
   if (kind !== "capture.step") changed(kind === "capture.progress" || kind === "job.progress");
 }
 
+let line = 0; // which of the lines to the service is the one that holds, or was lost last
+
 /** Ask for everything: at the start, and whenever the line was lost. */
-async function all() {
+async function all(mine) {
   const version = S.health?.version;
-  await Promise.all([load.rig(), load.health(), load.lease(), load.queue(), load.newest(), load.jobs()]);
+  await Promise.all([load.rig(), load.lease(), load.queue(), load.now(), load.jobs()]);
   if (version && S.health.version !== version) location.reload(); // another console came with it
   if (S.capture?.state === "done" && S.capture.outcome === "failed" && S.failed === null
       && sessionStorage.getItem("seen") !== S.capture.id) S.failed = { id: S.capture.id, error: S.capture.error };
   await keepLease();
+  if (mine !== line) return;
   S.connected = true;
   changed();
   events.dispatchEvent(new Event("fresh"));
 }
 
+/** Ask until all is answered: one lost question does not end the line, which would have it asked again. */
+async function up() {
+  const mine = ++line;
+  while (mine === line) {
+    try {
+      return await all(mine);
+    } catch (error) {
+      if (error.status === 401) return undefined;
+      await new Promise((later) => setTimeout(later, AGAIN_MS));
+    }
+  }
+  return undefined;
+}
+
 /** Begin; raises where nobody is logged in. */
 export async function begin() {
   S.who = await get("/login");
-  const line = follow({
+  const followed = follow({
     event: heard,
-    up: () => all().catch(() => {}),
+    up,
     down: () => {
+      line++;
       if (S.connected !== false) S.lostAt = new Date().toISOString();
       S.connected = false;
       changed();
     },
   });
   setInterval(() => { if (S.connected && !document.hidden) load.health().catch(() => {}); }, 30_000); // the disk
-  return line;
+  return followed;
 }
 
 // The lease, for as long as a page holds it.

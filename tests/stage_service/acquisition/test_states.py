@@ -42,6 +42,26 @@ def test_whatever_is_not_in_the_table_is_refused_and_changes_nothing():
         machine.do("abort")
 
 
+@pytest.mark.parametrize(
+    ("done", "told"),
+    [
+        (("start",), "running; possible now: abort, pause"),
+        (("start", "pause"), "pausing; possible now: abort, resume"),
+        (("start", "pause", "hold"), "paused; possible now: abort, resume"),
+        (("start", "complete"), "finishing; possible now: nothing"),
+        (("start", "fail", "finish"), "done (failed); possible now: resume"),
+        (("start", "complete", "finish"), "done (completed); possible now: nothing"),
+    ],
+)
+def test_a_refusal_names_what_a_person_can_ask_for(done, told):
+    machine = Machine()
+    for action in done:
+        machine.do(action)
+    with pytest.raises(WrongState) as refused:
+        machine.do("start")
+    assert str(refused.value) == f"cannot start a capture that is {told}"
+
+
 @pytest.mark.parametrize("end", [("abort", "stop"), ("fail",)])
 def test_only_what_did_not_complete_can_be_continued(end):
     machine = Machine()

@@ -164,6 +164,16 @@ def test_a_plan_is_expanded_once_for_a_capture(http, monkeypatch):
     assert len(expanded) == 1
 
 
+def test_a_job_that_is_about_to_be_enqueued_can_be_cancelled(http, server, head, monkeypatch):
+    monkeypatch.setattr(server.service._follower, "_enqueue_what_is_owed", lambda: None)
+    body = {"plan": SHORT, "pipeline": {"name": "reconstruct"}, "head": head}
+    job = capture_done(http, body)["job"]
+    cancelled = http.delete(f"/jobs/{job}")
+    assert cancelled.status_code == 200, cancelled.text
+    assert (cancelled.json()["id"], cancelled.json()["outcome"]) == (job, "cancelled")
+    assert [j["outcome"] for j in http.get("/jobs").json()] == ["cancelled"]
+
+
 def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, tmp_path, head):
     server = Server(rig_file, tmp_path)
     server.service._captures._on_complete = None  # as if killed right after the manifest
@@ -298,6 +308,9 @@ def test_what_a_page_shows_of_a_capture(http, rig_file):
     png = np.frombuffer(http.get(f"{frames}/{step}/cam_0.png", params=white).content, np.uint8)
     brightest = cv2.imdecode(png, cv2.IMREAD_COLOR).max()
     assert brightest == round(255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055)), "half of white, in sRGB"
+    for beyond in ("1e-320", "1e308", "inf", "0"):  # no number of a frame's, or none at all
+        refused = http.get(f"{frames}/{step}/cam_0.png", params={"white": beyond})
+        problem(refused, "invalid-request")
     rig = http.get("/rig").json()
     assert [x["name"] for x in rig["lights"]] == [x.name for x in rig_file.rig.lights]
     camera = rig_file.rig.cameras[0]

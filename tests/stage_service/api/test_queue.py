@@ -100,7 +100,7 @@ def test_who_aborts_what_is_not_there_or_over_is_told_the_truth(http):
     assert slug(http.post("/captures/20260101-000000-0000/abort")) == "unknown-capture"
     assert http.get("/queue").json()["held"] is None
     over = http.post(f"/captures/{done}/abort").json()
-    assert over["detail"].endswith("that is done; possible now: nothing")
+    assert over["detail"].endswith("that is done (completed); possible now: nothing")
     assert "to be aborted by" in http.get("/queue").json()["held"]
     refused = [a for a in http.get("/audit").json() if a["action"] == "capture.abort"]
     assert [a["result"] for a in refused] == ["refused", "refused"]

@@ -95,11 +95,15 @@ def test_what_is_removed_is_in_the_trash_and_comes_back(http):
     assert slug(http.get(f"/captures/{name}")) == "unknown-capture"
     assert slug(http.delete(f"/captures/{name}")) == "unknown-capture"
     assert http.get("/trash").json() == [removed]
+    told = http.service.events.after(0, 10_000)
+    assert [e.data for e in told if e.kind == "capture.removed"] == [{"id": name}]
     assert http.delete("/trash").json() == [], "it is kept for 30 days"
     assert http.post(f"/trash/{removed['name']}/restore").json()["id"] == name
     assert {p.name: p.stat().st_size for p in path.rglob("*") if p.is_file()} == before
     assert verify(path) == []
     assert [c["outcome"] for c in http.get("/captures").json()] == ["completed"]
+    told = http.service.events.after(0, 10_000)
+    assert [e.data for e in told if e.kind == "capture.restored"] == [{"id": name}]
     http.delete(f"/captures/{name}")
     gone = http.delete("/trash", params={"older_than_days": 0, "dry_run": True}).json()
     assert http.delete("/trash", params={"older_than_days": 0}).json() == gone
@@ -273,6 +277,8 @@ def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monke
     assert listed == {"name": model.name, "files": ["strands.npz"], "bytes": 4}
     files = http.get(f"/jobs/{job['id']}/artifacts").json()
     assert files == [{"path": "strands.npz", "bytes": 4}]
+    for path in (f"/models/{model.name}/archive.tar", f"/jobs/{job['id']}/artifacts/relit.png"):
+        assert slug(http.get(path)) == "in-use"
 
 
 def test_a_snapshot_is_nothing_to_keep(http):

@@ -13,6 +13,7 @@ from browsing import Pages, says
 from serving import serving
 from waiting import until
 
+from reconstruction import Model
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import Blackout
@@ -408,3 +409,81 @@ def test_what_waits_is_put_elsewhere(console):
     line(3, 1, 2)
     page.click(".queue li >> nth=1 >> button:text-is('remove')")
     line(3, 2)
+
+
+def test_a_page_that_is_opened_in_a_pause_shows_the_capture_that_is_paused(console):
+    http, pages = console()
+    older = http.post("/captures", json={"plan": PACED}).json()["id"]
+    http.post(f"/captures/{older}/abort").raise_for_status()
+    until(lambda: http.service.capture(older).state == "done")
+    newer = http.post("/captures", json={"plan": {"lights": [], "projectors": []}}).json()["id"]
+    until(lambda: http.service.capture(newer).outcome == "completed")
+    assert older < newer
+    http.post(f"/captures/{older}/resume").raise_for_status()
+    until(lambda: http.service.capture(older).state == "running")
+    http.post(f"/captures/{older}/pause").raise_for_status()
+    until(lambda: http.service.capture(older).state == "paused")
+    page = pages.open()
+    says(page, "Paused")
+    assert older in page.text_content(".facts")
+    page.keyboard.press("F8")
+    says(page, "Dark, verified")
+    until(lambda: http.service.capture(older).outcome == "aborted")
+
+
+def test_a_question_that_is_lost_is_asked_again(console):
+    _, pages = console()
+    page = pages.open()
+    says(page, "Dark, verified")
+    left = [503]
+
+    def answer(route: Any) -> None:
+        if left:
+            route.fulfill(status=left.pop(), body="")
+        else:
+            route.continue_()
+
+    page.route("**/queue", answer)
+    page.reload()
+    says(page, "Dark, verified")
+    assert left == []
+    page.wait_for_selector("strong.state:text-is('dark')")
+    assert [c for c in pages.complaints if "503" not in c] == []
+    pages.complaints.clear()
+
+
+def test_what_is_removed_elsewhere_is_shown_no_more(console):
+    http, pages = console()
+    ids = []
+    for _ in range(2):
+        short = {"lights": [], "projectors": []}
+        ids.append(http.post("/captures", json={"plan": short}).json()["id"])
+        until(lambda: http.service.capture(ids[-1]).outcome == "completed")
+    now, frames = pages.open(), pages.open("frames")
+    now.wait_for_selector(f".said:has-text({ids[1]!r})")
+    frames.wait_for_selector(f".list button:has-text({ids[1]!r})")
+    loaded = "[...document.querySelectorAll('figure img')].filter(x => x.naturalWidth).length"
+    until(lambda: frames.evaluate(loaded) == 2)  # no picture is asked for that is gone
+    removed = http.delete(f"/captures/{ids[1]}").json()["name"]
+    now.wait_for_selector(f".said:has-text({ids[0]!r})")
+    frames.wait_for_selector(f".list button:has-text({ids[1]!r})", state="detached")
+    frames.wait_for_selector(f"h2:has-text({ids[0]!r})")
+    until(lambda: frames.evaluate(loaded) == 2)
+    http.post(f"/trash/{removed}/restore").raise_for_status()
+    now.wait_for_selector(f".said:has-text({ids[1]!r})")
+    frames.wait_for_selector(f".list button:has-text({ids[1]!r})")
+
+
+def test_an_open_job_shows_what_its_end_left(console):
+    http, pages = console()
+    plan = {"lights": [], "projectors": []}
+    capture = http.post("/captures", json={"plan": plan}).json()["id"]
+    until(lambda: http.service.capture(capture).outcome == "completed")
+    asked = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "mine"}
+    job = http.post("/jobs", json=asked).json()["id"]
+    page = pages.open(f"jobs/{job}")
+    page.wait_for_selector(".said:has-text('It waits for a worker.')")
+    Model(http.service.root / "models" / "mine").create().write_json("results.json", {"a": 1})
+    http.delete(f"/jobs/{job}").raise_for_status()
+    page.wait_for_selector("dd:text-is('cancelled')")
+    page.wait_for_selector("summary:text-is('Files (1)')")
