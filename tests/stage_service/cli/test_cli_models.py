@@ -250,6 +250,7 @@ def test_other_strands_in_another_unit_are_told(made, capsys, tmp_path):
         (("--recolour", "1,1,1", "--along", "2,3"), "0 <= a < b <= 1"),
         (("--wisp", "0,0,1"), "--recolour"),
         (("--cut", "-1"), "above 0"),
+        (("--cut", "inf"), "a finite length"),
         (("--roughen", "100"), "beta_m"),
         (("--recolour", "2,0,0"), "at most 1"),
         (("--pigment=-1,0",), "0 or more"),
