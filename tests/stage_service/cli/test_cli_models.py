@@ -290,6 +290,7 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     [
         (("--seed", "-1"), "--seed -1: expected 0 or more"),
         (("--spp", "0"), "--spp 0: expected 1 or more"),
+        (("--size", "100000"), "--size 100000: expected 16 to 16384"),
         (("--guide", "none"), "go with --field interpolation"),
         (("--refine",), "go with --field interpolation"),
         (("--frames", "9"), "--frames: of --turntable"),
