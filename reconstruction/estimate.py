@@ -27,7 +27,7 @@ from reconstruction.light_codes.line_strands import MOST_LINES
 from reconstruction.light_codes.search import STEP_PIXELS
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
 from reconstruction.methods import Method
-from reconstruction.pipeline import FINE_PIXEL, method_for
+from reconstruction.pipeline import FINE_PIXEL, method_for, without
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
 from reconstruction.report.report import Progress, silent
 from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS
@@ -98,11 +98,11 @@ def estimate(
     """What `reconstruct(capture, model, method=method, options=options)` will take on this machine.
 
     `hairstage bench large` shows how far off it is. Where other work keeps the machine busy it
-    takes longer. Raises `CaptureError` where a frame that the probe reads cannot be read.
+    takes longer. Raises `CaptureError` where a frame that the probe reads cannot be read, and for
+    held-out cameras what `reconstruct` raises.
     """
     capture = capture.view(undistorted=True)
-    kept = [c.name for c in capture.rig.cameras if c.name not in options.held_out]
-    probe = _Probe(capture.view(cameras=kept), options, progress)
+    probe = _Probe(without(capture, options.held_out), options, progress)
     stages = probe.stages(method)
     method = method_for(capture) if method == "auto" else method
     progress("probed", 1.0)

@@ -94,7 +94,7 @@ def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | Non
     """The stages of `method`, as `reconstruct` says."""
     stages.imported(capture)
     whole = stages.undistorted(capture)
-    capture = _without(whole, stages.options.held_out)
+    capture = without(whole, stages.options.held_out)
     heads = Heads(stages.model, stages.options, stages.progress, stages.report)
     head = heads.known(capture)
     if method == "auto":
@@ -126,8 +126,11 @@ def method_for(capture: Capture) -> Method:
     return "light_planes" if capture.of_kind("scanline") and capture.olat_lights() else "hull"
 
 
-def _without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
-    """The capture as if it had never had these cameras."""
+def without(capture: Capture, cameras: tuple[str, ...]) -> Capture:
+    """The capture as if it had never had these cameras.
+
+    Raises `KeyError` for one that is not there, `CaptureError` where under two are left.
+    """
     for name in cameras:
         capture.rig.camera(name)
     left = [c.name for c in capture.rig.cameras if c.name not in cameras]

@@ -85,8 +85,8 @@ def roughened(maps: HairMaps, factor: float) -> HairMaps:
 
 def cut(fitted: FittedModel, length: float) -> FittedModel:
     """The model with no strand longer than `length` metres; colours stay where they are on them."""
-    if not length > 0:
-        raise ValueError(f"strands can be cut to a length above 0 m, got {length}")
+    if not 0 < length < np.inf:
+        raise ValueError(f"strands can be cut to a finite length above 0 m, got {length}")
     strands = fitted.strands
     share = np.minimum(1.0, length / np.maximum(strands.lengths(), 1e-12))
     maps, (w, h) = fitted.maps, fitted.maps.shape[1:]

@@ -32,7 +32,7 @@ from reconstruction.files.masks import read_mask
 from reconstruction.geometry.blocks import block_any, block_means, unblocked
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.rig import Rig, counted
 from reconstruction.reading import parse_json, read_json
 
 if TYPE_CHECKING:
@@ -199,10 +199,8 @@ class Capture:
     def _known(self, kind: str, names: Iterable[str], known: list[str]) -> set[str]:
         wanted = set(names)
         if unknown := sorted(wanted - set(known)):
-            some = known if len(known) <= 12 else [*known[:3], "…", *known[-3:]]
             raise CaptureError(
-                f"{self.path}: there is no {kind} {', '.join(unknown)}; its {len(known)} are "
-                f"{', '.join(some)}"
+                f"{self.path}: there is no {kind} {', '.join(unknown)}; {counted(known)}"
             )
         return wanted
 

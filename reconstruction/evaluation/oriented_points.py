@@ -81,27 +81,32 @@ class Looker(Protocol):
         """Take one block of the other set into account."""
 
 
+def require_hair(strands: Strands) -> None:
+    """Raise `ValueError` where strands are longer than any hair."""
+    lengths = strands.lengths()  # not counts of points, which integers may not hold
+    if (together := float(lengths.sum())) > MOST_POINTS * STEP:
+        raise ValueError(
+            f"the {len(strands)} strands are {together / 1e3:,.0f} km long together, "
+            f"at most {MOST_POINTS * STEP / 1e3:,.0f} km are compared: are they in metres?"
+        )
+    if (longest := float(lengths.max(initial=0))) > MOST_OF_ONE * STEP:
+        raise ValueError(
+            f"the longest strand is {longest:,.0f} m long, at most "
+            f"{MOST_OF_ONE * STEP:,.0f} m are compared: are the strands in metres?"
+        )
+
+
 class OrientedPoints:
     """`strands` as `count` points, `STEP` apart.
 
-    Raises `ValueError` where there are more of them than any hair has.
+    Raises `ValueError` where strands are longer than any hair.
     """
 
     def __init__(self, strands: Strands) -> None:
+        require_hair(strands)
         self._at = Resampling(strands, STEP)
         self.offsets = self._at.offsets
         self.count = int(self.offsets[-1])
-        if self.count > MOST_POINTS:
-            raise ValueError(
-                f"the {len(strands)} strands are {self.count * STEP / 1e3:,.0f} km long together, "
-                f"at most {MOST_POINTS * STEP / 1e3:,.0f} km are compared: are they in metres?"
-            )
-        longest = int(np.diff(self.offsets).max(initial=0))
-        if longest > MOST_OF_ONE:
-            raise ValueError(
-                f"the longest strand is {longest * STEP:,.0f} m long, at most "
-                f"{MOST_OF_ONE * STEP:,.0f} m are compared: are the strands in metres?"
-            )
         ends = [0]
         while ends[-1] < len(strands):
             fits = np.searchsorted(self.offsets, self.offsets[ends[-1]] + BLOCK, side="right") - 1

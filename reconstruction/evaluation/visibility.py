@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
+from reconstruction.evaluation.oriented_points import require_hair
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
@@ -24,9 +25,12 @@ class Visibility:
     camera's axis) behind the nearest part of strands and head in the same pixel of a z-buffer. The
     z-buffers are made for this: whatever the cameras' own resolution, their pixels span one strand
     width (twice the median radius, 0.5 to 1 mm) at the strands' median depth.
+
+    Raises as `require_hair` does.
     """
 
     def __init__(self, cameras: Sequence[Camera], strands: Strands, head: Mesh | None = None):
+        require_hair(strands)
         width = 2 * float(np.median(strands.radius)) if len(strands) else NARROWEST
         pixel = float(np.clip(width, NARROWEST, WIDEST))
         dense = Resampling(strands, pixel)

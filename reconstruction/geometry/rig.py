@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -118,7 +119,13 @@ def _named(items: tuple[T, ...], name: str, kind: str) -> T:
     for item in items:
         if item.name == name:
             return item
-    raise KeyError(f"no {kind} {name!r} in this rig; it has {[i.name for i in items]}")
+    raise KeyError(f"no {kind} {name!r} in this rig; {counted([i.name for i in items])}")
+
+
+def counted(names: Sequence[str]) -> str:
+    """How many `names` there are and which, of many the first and the last."""
+    some = names if len(names) <= 12 else [*names[:3], "…", *names[-3:]]
+    return f"its {len(names)} are {', '.join(some)}" if names else "it has none"
 
 
 def _take(table: dict[str, Any], where: str, *fields: str) -> list[Any]:

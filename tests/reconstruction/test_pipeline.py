@@ -332,8 +332,13 @@ def test_what_cannot_be_done_without_is_named(
     few = ReconstructOptions(held_out=("c0", "c72", "c144", "c216"))
     with pytest.raises(CaptureError, match="1 cameras are left, at least 2"):
         reconstruct(unswept, Model(tmp_path), options=few)
+    with pytest.raises(CaptureError, match="1 cameras are left, at least 2"):
+        estimate(unswept, options=few)
+    unknown = ReconstructOptions(held_out=("c9",))
     with pytest.raises(KeyError, match="no camera 'c9'"):
-        reconstruct(unswept, Model(tmp_path), options=ReconstructOptions(held_out=("c9",)))
+        reconstruct(unswept, Model(tmp_path), options=unknown)
+    with pytest.raises(KeyError, match="no camera 'c9'"):
+        estimate(unswept, options=unknown)
     with pytest.raises(ValueError, match="unknown method 'guess'"):
         reconstruct(unswept, Model(tmp_path), method="guess")  # type: ignore[arg-type]
 

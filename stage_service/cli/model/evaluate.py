@@ -158,10 +158,11 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
 
 
 def _demo_results(path: Path) -> dict[str, Any]:
+    from reconstruction.reading import parse_json
     from stage_service.cli.support.tables import figures_of
 
     try:
-        results = json.loads(path.read_text())
+        results = parse_json(path.read_bytes())
     except ValueError as e:
         raise BadArgument(f"{path} is not JSON: {e}; give a demo's results.json") from e
     if not isinstance(results, dict):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 FIELDS = ("none", "turns", "modulation", "additive", "interpolation")
 SIZE, FILM_SIZE = 512, 192
 """Pixels across of a picture and of an animation, where no camera of a rig says."""
+MOST_SIZE = 16_384
 SPP, FILM_SPP = 64, 6
 FRAMES = 24
 
@@ -123,8 +124,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise ValueError("--guide model: for a --camera of the capture, its pose and --light")
     if args.size is not None and args.camera is not None:
         raise ValueError("--size: a --camera's pictures have its own size: leave out one of them")
-    if args.size is not None and args.size < 16:
-        raise ValueError(f"--size {args.size}: expected 16 or more")
+    if args.size is not None and not 16 <= args.size <= MOST_SIZE:
+        raise ValueError(f"--size {args.size}: expected 16 to {MOST_SIZE}")
     capture = Capture(args.capture) if args.capture is not None else None
     if capture is None and (args.camera is not None or args.light):
         raise ValueError("--camera and --light name parts of a rig: say whose with --capture")

@@ -205,13 +205,20 @@ def test_strands_of_no_length_match_nothing() -> None:
     assert scores["precision"] == scores["recall"] == scores["f"] == 0.0
 
 
-def test_strands_in_another_unit_are_refused_before_they_fill_the_memory() -> None:
+def test_strands_in_another_unit_are_refused_before_they_fill_the_memory(front: Camera) -> None:
     huge = Strands(curtain().points * np.float32(1e6), curtain().offsets).subset([0, 1])
     with pytest.raises(ValueError, match=r"longest strand is 60,\d+ m .*in metres"):
         compare_strands(huge, curtain())
     many = Strands.from_list([np.array([[0, 0, 0], [0, 0, 900.0]])] * 400)
     with pytest.raises(ValueError, match=r"360 km long together.*in metres"):
         compare_strands(many, curtain())
+    garbage = curtain().points.copy()
+    garbage[1] = 1e30  # metres, of which no integer counts the millimetres
+    spoilt = Strands(garbage, curtain().offsets)
+    with pytest.raises(ValueError, match=r"km long together.*in metres"):
+        compare_strands(spoilt, curtain())
+    with pytest.raises(ValueError, match=r"km long together.*in metres"):
+        Visibility([front], spoilt)
 
 
 def test_what_hangs_behind_strands_is_hidden(front: Camera) -> None:

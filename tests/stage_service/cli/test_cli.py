@@ -578,6 +578,7 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
         (json.dumps({**damaged, "geometry": 3}), "a figure of another kind"),
         ("[]", "not a JSON object"),
         ("{", "not JSON"),
+        (json.dumps({**damaged, "seed": float("nan")}), "NaN is not a number"),
     ):
         file.write_text(text)
         code, data = run(capsys, "evaluate", "table", file)

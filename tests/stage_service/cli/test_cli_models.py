@@ -250,6 +250,7 @@ def test_other_strands_in_another_unit_are_told(made, capsys, tmp_path):
         (("--recolour", "1,1,1", "--along", "2,3"), "0 <= a < b <= 1"),
         (("--wisp", "0,0,1"), "--recolour"),
         (("--cut", "-1"), "above 0"),
+        (("--cut", "inf"), "a finite length"),
         (("--roughen", "100"), "beta_m"),
         (("--recolour", "2,0,0"), "at most 1"),
         (("--pigment=-1,0",), "0 or more"),
@@ -289,6 +290,7 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     [
         (("--seed", "-1"), "--seed -1: expected 0 or more"),
         (("--spp", "0"), "--spp 0: expected 1 or more"),
+        (("--size", "100000"), "--size 100000: expected 16 to 16384"),
         (("--guide", "none"), "go with --field interpolation"),
         (("--refine",), "go with --field interpolation"),
         (("--frames", "9"), "--frames: of --turntable"),
