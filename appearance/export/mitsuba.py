@@ -36,28 +36,29 @@ class View:
     spp: int = 64
 
 
-def export_mitsuba(groom: Groom, folder: Path, view: View) -> Path:
-    """Write `scene.xml`, its curves, the head and the environment; returns the scene's path.
+def export_mitsuba(groom: Groom, folder: Path, view: View) -> list[Path]:
+    """Write `scene.xml`, its curves, the head and the environment; returns them, the scene first.
 
     Units are centimetres; radiance is ours. A pinhole of square pixels: see `off_by`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shapes = []
+    written, shapes = [folder / "scene.xml"], []
     points, segments = spline_control_points(groom.strands)
     colours, label = _shapes(groom)
     for i, colour in enumerate(colours):
         of_shape = segments[label == i]
         if len(of_shape):
-            name = f"hair_{i:02d}.txt"
-            _write_curves(folder / name, points, of_shape)
-            shapes.append(_hair(name, colour, groom.maps))
+            written.append(folder / f"hair_{i:02d}.txt")
+            _write_curves(written[-1], points, of_shape)
+            shapes.append(_hair(written[-1].name, colour, groom.maps))
     if groom.head is not None:
         scaled = Mesh(groom.head.vertices * SCALE, groom.head.faces)
-        with writing(folder / "head.obj") as part:
+        written.append(folder / "head.obj")
+        with writing(written[-1]) as part:
             write_obj(part, scaled)
         shapes.append(_head(groom.skin))
-    write_exr(folder / "environment.exr", np.asarray(view.environment, np.float32))
-    path = folder / "scene.xml"
+    written.append(folder / "environment.exr")
+    write_exr(written[-1], np.asarray(view.environment, np.float32))
     text = (
         '<scene version="3.0.0">\n <integrator type="path"><integer name="max_depth" value="16"/>'
         '<boolean name="hide_emitters" value="true"/></integrator>\n'
@@ -68,8 +69,8 @@ def export_mitsuba(groom: Groom, folder: Path, view: View) -> Path:
         '  <transform name="to_world"><matrix value="0 0 1 0 1 0 0 0 0 1 0 0 0 0 0 1"/>'
         "</transform></emitter>\n</scene>\n"
     )
-    write_whole(path, text.encode())
-    return path
+    write_whole(written[0], text.encode())
+    return written
 
 
 def off_by(camera: Camera) -> float:

@@ -112,7 +112,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
             )
         if model.has("field.npz"):
             output.note(f"warning: {model} renders with a field, of which exports know nothing")
-        if groom.head is None:
+        if groom.head is None and args.to != "maps":
             output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
         files = _write(args, output, groom, capture, options)
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
@@ -162,4 +162,4 @@ def _write(
                 f"warning: {camera.name} has a lens, or pixels that are not square: Mitsuba's "
                 f"camera has neither, and its pictures are off by up to {off:.1f} pixels"
             )
-    return [export_mitsuba(groom, out, View(camera, environment_map(args.environment or "studio")))]
+    return export_mitsuba(groom, out, View(camera, environment_map(args.environment or "studio")))

@@ -245,7 +245,9 @@ def test_stock_mitsuba_renders_our_picture(which, request, tmp_path):
     camera = Camera.look_at("c", 16, 16, (0.1, -0.5, 0.1), (0, 0, -0.02), 14)
     light = studio()
     groom = Groom.of(model, ExportOptions())
-    path = export_mitsuba(groom, tmp_path, View(camera, light, spp=256))
+    written = export_mitsuba(groom, tmp_path, View(camera, light, spp=256))
+    assert sorted(written) == sorted(tmp_path.iterdir())
+    path = written[0]
     # elsewhere: with one thread, as tests have, Mitsuba waits for itself while it reads an EXR
     subprocess.run([sys.executable, "-c", STOCK, str(path), str(tmp_path / "s.npy")], check=True)
     stock = np.load(tmp_path / "s.npy")
@@ -265,7 +267,7 @@ def test_mitsubas_camera_sees_a_point_where_ours_does(fitted, tmp_path):
     camera = Camera.look_at("c", 64, 48, (0.1, -0.5, 0.1), (0, 0, -0.02), 14)
     camera = replace(camera, K=camera.K + np.array([[0, 0, 9.0], [0, 0, -5.0], [0, 0, 0]]))
     groom = Groom.of(fitted, ExportOptions())
-    path = export_mitsuba(groom, tmp_path, View(camera, np.ones((4, 8, 3), np.float32)))
+    path, *_ = export_mitsuba(groom, tmp_path, View(camera, np.ones((4, 8, 3), np.float32)))
     sensor = re.search(r"<sensor.*</sensor>", path.read_text(), re.DOTALL)
     theirs = mi.load_string(f'<scene version="3.0.0">{sensor[0]}</scene>').sensors()[0]
     for pixel in ([0, 0], [63, 0], [20, 40]):

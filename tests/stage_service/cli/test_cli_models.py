@@ -366,7 +366,8 @@ def test_a_head_without_hair_is_a_scene_for_mitsuba_where_a_camera_is_given(made
     code, found = run(capsys, *words)
     assert (code, "give a camera of the capture's rig" in found["error"]["detail"]) == (3, True)
     code, found = run(capsys, *words, "--capture", made.capture, "--camera", "cam_1")
-    assert (code, found.get("files")) == (0, [str(tmp_path / "scene" / "scene.xml")])
+    written = [str(tmp_path / "scene" / f) for f in ("scene.xml", "environment.exr")]
+    assert (code, found.get("files")) == (0, written)
 
 
 def test_a_file_is_printed_by_the_name_that_it_has(made, capsys, tmp_path):
