@@ -164,12 +164,28 @@ def input_warnings(pred: Strands, true: Strands) -> list[str]:
             f"the predicted strands span {mine:.3g} m and the true ones {theirs:.3g} m: are both "
             "in metres?"
         )
+    elif _y_up(pred, true):
+        out.append(
+            "the predicted strands would lie where the true ones do, were they turned from y up to "
+            "z up, (x, -z, y): are both z up?"
+        )
     elif (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any():
         out.append("the predicted strands lie beside the true ones: are both in one frame?")
     still = int((pred.lengths() == 0).sum())
     if still:
         out.append(f"{still} of {len(pred)} predicted strands have no length, and so no direction")
     return out
+
+
+def _y_up(pred: Strands, true: Strands) -> bool:
+    """Whether `pred`, turned from y up to z up, lies at most half as far from `true`."""
+    mine, theirs = (s.points[:: max(len(s.points) // 5000, 1)] for s in (pred, true))
+    turned = mine[:, (0, 2, 1)] * np.array((1, -1, 1), np.float32)
+    as_it_is, then = (
+        sum(float(cKDTree(a).query(b)[0].mean()) for a, b in ((points, theirs), (theirs, points)))
+        for points in (mine, turned)
+    )
+    return then < 0.5 * as_it_is
 
 
 def root_figures(pred: Strands, true: Strands, head: Mesh | None = None) -> dict[str, Any]:
