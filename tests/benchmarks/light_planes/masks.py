@@ -56,7 +56,13 @@ QUICK = {
 LEAST_SHARE = 0.1
 """Of a pixel that the subject must cover to be in its true mask: less is near a frame's noise."""
 
-DRAWS = option("--draws", "seeds of the reconstruction, for F's spread", type=int, default=1)
+DRAWS = option(
+    "--draws",
+    "seeds of the reconstruction, for F's spread",
+    type=int,
+    choices=range(1, 9),
+    default=1,
+)
 PATHS = option("--paths", "paths a pixel of the frames", type=int, nargs="+", default=[16, 64])
 
 
