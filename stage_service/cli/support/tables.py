@@ -88,12 +88,13 @@ def markdown_table(
                 seeds_of.setdefault(alike, []).append(str(result["seed"]))
         if first:
             table[0][number] = f"{name} [{number}]"
+        if short and first:
+            many = "s" if len(first) > 1 else ""
+            notes.append(f"[{number}] {len(first)} warning{many} of these runs")
+            continue
         for alike, text in first.items():
             of = f" (seed {', '.join(seeds_of[alike])})" if len(results) > 1 else ""
             notes.append(f"[{number}] {text}{of}")
-        if short and first:
-            many = "s" if len(first) > 1 else ""
-            notes[-len(first) :] = [f"[{number}] {len(first)} warning{many} of these runs"]
     figures = [figures_of(results) for results in columns.values()]
     for title, parts in _rows(short).items():
         cells = [" / ".join(_cell(f[title], parts)) if title in f else "–" for f in figures]

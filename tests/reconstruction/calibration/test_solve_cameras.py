@@ -105,8 +105,8 @@ def test_a_kept_lens_keeps_its_skew(board: Board) -> None:
     np.testing.assert_array_equal(found.cameras[0].K, K)
     to_world = found.board_to_world["only"]
     again, _ = found.cameras[0].project(to_world(board.corners))
-    np.testing.assert_allclose(again, seen["only"].pixels, atol=1e-3)
-    np.testing.assert_allclose(found.cameras[0].R @ to_world.rotation, turn, atol=1e-5)
+    np.testing.assert_allclose(again, seen["only"].pixels, atol=1e-9)
+    np.testing.assert_allclose(found.cameras[0].R @ to_world.rotation, turn, atol=1e-9)
 
 
 def test_parallel_poses_leave_the_lens_open(board: Board) -> None:
