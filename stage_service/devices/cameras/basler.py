@@ -108,7 +108,7 @@ class BaslerCamera:
     def arm(self, exposure: float) -> None:
         """Answer the next pulses with `exposure` seconds; returns when the camera waits for them.
 
-        Frames not read are dropped, but counted in the block ids.
+        Frames not read are dropped, but counted in the block ids once they reached the queue.
         """
         doing = f"arming for {exposure:g} s"
         with self._told(doing):
