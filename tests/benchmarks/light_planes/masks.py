@@ -39,7 +39,7 @@ from reconstruction.masks import (
     hair_masks,
 )
 from stage_service.cli.demo import hold_out
-from stage_service.cli.support.commands import rig_path
+from stage_service.cli.support.commands import rig_path, whole
 from stage_service.cli.support.tables import markdown_table
 from stage_service.jobs.records import JobOptions
 from stage_service.jobs.steps import STEPS, StepContext
@@ -63,6 +63,7 @@ DRAWS = option(
     choices=range(1, 9),
     default=1,
 )
+LIGHTS = option("--lights", "of the dome, 24 at least", type=whole(24, 331), default=331)
 PATHS = option("--paths", "paths a pixel of the frames", type=int, nargs="+", default=[16, 64])
 
 
@@ -196,6 +197,9 @@ def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCaptur
         framing = replace(FRAMINGS["curly"], rows=21, coarser=6)
         return {("curly", 16): subject_capture("curly", framing, args.cache, 0.0)}
     rig, data = rig_path("demo").read_text(), data_folder()
+    rig, label = rig.replace("lights = 331", f"lights = {args.lights}"), "masks"
+    if args.lights != 331:
+        label += f"-{args.lights}"
     names = [n for n in SUBJECTS if args.only in (None, n) and (n != "sintel" or data)]
     if not names:
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(SUBJECTS)}")
@@ -205,9 +209,8 @@ def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCaptur
         if name == "sintel" and data:
             subject, head = (str(data / name / f) for f in ("sintel.npz", "sintel_head.obj"))
         for paths in args.paths:
-            label = f"masks-{name}-{paths}"
             out[name, paths] = SimulatedCapture(
-                label, rig, subject, head, spp=paths, seed=args.seed
+                f"{label}-{name}-{paths}", rig, subject, head, spp=paths, seed=args.seed
             )
     return out
 
@@ -249,4 +252,4 @@ def report(results: Mapping[str, Mapping[str, Any]], seed: int) -> str:
     return "\n".join([*text, "", markdown_table(jobs, short=True), ""])
 
 
-BENCHMARK = Benchmark(run, (CACHE, ONLY, PATHS, DRAWS))
+BENCHMARK = Benchmark(run, (CACHE, ONLY, PATHS, LIGHTS, DRAWS))
