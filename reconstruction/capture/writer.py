@@ -57,6 +57,12 @@ class _Stored:
     direct: bool = False
 
 
+def require_vacant(path: Path) -> None:
+    """Raise `CaptureError` where no capture may be begun at `path`: it is neither new nor empty."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise CaptureError(f"{path}: a capture needs a new or empty folder")
+
+
 class CaptureWriter:
     """Writes one capture folder; `write_frame` and `record_missing` may be called from any thread.
 
@@ -96,8 +102,7 @@ class CaptureWriter:
         hair, head and body. Raises `CaptureError`.
         """
         path = Path(path)
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise CaptureError(f"{path}: a capture needs a new or empty folder")
+        require_vacant(path)
         if "steps" not in plan:
             raise CaptureError("plan.json: the field 'steps' is missing")
         steps = [s if isinstance(s, Step) else Step.from_dict(s) for s in plan["steps"]]

@@ -79,8 +79,11 @@ def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigC
     """Conditioning of every camera with every projector on a sphere of `radius` metres.
 
     Self-shadowing is the sphere's own: a point counts where it faces both devices and lies in both
-    pictures. Raises `ValueError` for a rig without projectors, which has nothing to triangulate.
+    pictures. Raises `ValueError` for a rig without projectors, which has nothing to triangulate,
+    and for a radius of 0 or less.
     """
+    if not 0 < radius < np.inf:
+        raise ValueError(f"the sphere's radius must be over 0 m, got {radius:g}")
     if not rig.projectors:
         raise ValueError(f"rig {rig.name}: no projectors, so no planes of light to condition")
     points = dome_positions(4000, radius)

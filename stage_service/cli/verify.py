@@ -88,12 +88,14 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     Read cameras, lights, pictures by the patterns of import.toml, and masks.
     """
     from reconstruction.capture.contact_sheet import contact_sheet
+    from reconstruction.capture.writer import require_vacant
     from reconstruction.images.scene_checks import check_scene
 
     understood, notes = _understood(args)
     for note in notes:
         output.note(note)
     if args.dry_run:
+        require_vacant(args.out)
         out = args.out.resolve()  # "." has a name, too
         sheet = out.with_name(f"{out.name}-contact-sheet.png")
         sheet.parent.mkdir(parents=True, exist_ok=True)

@@ -300,6 +300,9 @@ class JobQueue:
             capture=str(self.path(spec["capture"])),
             model=str(model),
             options=spec["options"],
+            priority=(status.priority or 1) - 1,  # DBOS counts from 1
+            retries=spec["retries"],
+            timeout_s=None if (ms := status.workflow_timeout_ms) is None else ms / 1000,
             progress=read_progress(Model(model), job),
             error=error,
             created=_time(status.created_at) or "",

@@ -106,7 +106,8 @@ class JobError(Strict):
 class Job(BaseModel):
     """One run of a pipeline. `outcome` is set exactly when `state` is `done`; times are UTC.
 
-    `options` are those that were asked for; defaults are left out.
+    `options` are those that were asked for, defaults left out; `priority`, `retries` and
+    `timeout_s` are the request's.
     """
 
     model_config = with_example(
@@ -116,6 +117,8 @@ class Job(BaseModel):
         capture="/data/stage/captures/20261121-093000-1f2e",
         model="/data/stage/models/20261121-093000-1f2e",
         options={"held_out_cameras": ["cam_07"]},
+        priority=5,
+        retries=0,
         progress={
             "step": "reconstruct",
             "steps": ["reconstruct", "evaluate", "results"],
@@ -134,6 +137,9 @@ class Job(BaseModel):
     capture: str
     model: str
     options: dict[str, Any]
+    priority: int
+    retries: int
+    timeout_s: float | None = None
     progress: JobProgress | None = None
     error: JobError | None = None
     created: str

@@ -113,7 +113,7 @@ function jobOf(view, id) {
   }
 
   async function again() {
-    const made = await ask("POST /jobs", { capture: job.capture.split("/").at(-1), model: job.model.split("/").at(-1), pipeline: { name: job.pipeline, options: job.options } });
+    const made = await ask("POST /jobs", { capture: job.capture.split("/").at(-1), model: job.model.split("/").at(-1), pipeline: { name: job.pipeline, options: job.options, priority: job.priority, retries: job.retries, timeout_s: job.timeout_s } });
     await load.jobs();
     location.hash = `#jobs/${made.id}`;
     location.reload();

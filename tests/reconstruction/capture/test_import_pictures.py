@@ -317,7 +317,7 @@ def test_options_that_nothing_would_read_are_refused(folder, tmp_path, capsys, a
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dry_run_draws_beside_a_folder_that_is_not_there(folder, tmp_path, monkeypatch):
+def test_a_dry_run_draws_beside_a_folder_that_is_not_there(folder, tmp_path, monkeypatch, capsys):
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
     assert main(["import", str(folder), "--out", str(tmp_path / "new/out"), "--dry-run"]) == 0
     assert (tmp_path / "new" / "out-contact-sheet.png").is_file()
@@ -325,6 +325,9 @@ def test_a_dry_run_draws_beside_a_folder_that_is_not_there(folder, tmp_path, mon
     monkeypatch.chdir(tmp_path / "here")
     assert main(["import", str(folder), "--out", ".", "--dry-run"]) == 0
     assert (tmp_path / "here-contact-sheet.png").is_file()
+    (tmp_path / "here" / "notes.txt").touch()
+    assert main(["import", str(folder), "--out", ".", "--dry-run"]) == 3
+    assert "needs a new or empty folder" in capsys.readouterr().err
 
 
 def test_a_flat_field_evens_the_lens(folder, tmp_path):

@@ -264,3 +264,6 @@ def test_the_demo_rig_is_well_conditioned() -> None:
     assert result.well_pairs > 0.65
     with pytest.raises(ValueError, match="no projectors"):
         condition(replace(rig, projectors=()))
+    for radius in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="radius must be over 0 m"):
+            condition(rig, radius=radius)

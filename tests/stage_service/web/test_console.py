@@ -474,12 +474,13 @@ def test_what_is_removed_elsewhere_is_shown_no_more(console):
     frames.wait_for_selector(f".list button:has-text({ids[1]!r})")
 
 
-def test_an_open_job_shows_what_its_end_left(console):
+def test_an_open_job_shows_what_its_end_left_and_is_run_again_as_it_was_asked_for(console):
     http, pages = console()
     plan = {"lights": [], "projectors": []}
     capture = http.post("/captures", json={"plan": plan}).json()["id"]
     until(lambda: http.service.capture(capture).outcome == "completed")
-    asked = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "mine"}
+    pipeline = {"name": "reconstruct", "priority": 8, "retries": 2, "timeout_s": 3600.5}
+    asked = {"capture": capture, "pipeline": pipeline, "model": "mine"}
     job = http.post("/jobs", json=asked).json()["id"]
     page = pages.open(f"jobs/{job}")
     page.wait_for_selector(".said:has-text('It waits for a worker.')")
@@ -487,3 +488,7 @@ def test_an_open_job_shows_what_its_end_left(console):
     http.delete(f"/jobs/{job}").raise_for_status()
     page.wait_for_selector("dd:text-is('cancelled')")
     page.wait_for_selector("summary:text-is('Files (1)')")
+    page.click("button:text-is('Run it again')")
+    until(lambda: len(http.get("/jobs").json()) == 2)
+    again = next(one for one in http.get("/jobs").json() if one["id"] != job)
+    assert pipeline.items() <= {"name": again["pipeline"], **again}.items()
