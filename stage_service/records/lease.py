@@ -141,9 +141,10 @@ class FileLock:
             if self._is_there():
                 break
             self._file.close()  # it was released, and removed, in between
-        self._file.truncate(0)
-        self._file.write(f"{text}\n")
-        self._file.flush()
+        # A full disk must not keep a service from starting, which darkens: it only goes unnamed.
+        with suppress(OSError):
+            os.ftruncate(self._file.fileno(), 0)
+            os.pwrite(self._file.fileno(), f"{text}\n".encode(), 0)
 
     def release(self) -> None:
         """Give it up before the process ends."""

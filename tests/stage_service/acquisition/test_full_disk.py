@@ -23,13 +23,39 @@ def on_small_disk(folder: Path, *command: str) -> subprocess.CompletedProcess[st
     )
 
 
-def shoot(folder: Path, reserve: int) -> dict[str, Any]:
+LOCKED = """
+import sys
+from pathlib import Path
+from stage_service.records.lease import RootInUse, RootLock
+
+folder = Path(sys.argv[1])
+with (folder / "filler").open("wb", buffering=0) as filler:
+    try:
+        while filler.write(bytes(4096)):
+            pass
+    except OSError:
+        pass
+lock = RootLock(folder)
+try:
+    RootLock(folder)
+except RootInUse:
+    print("refused")
+lock.release()
+RootLock(folder).release()
+"""
+
+
+def require_small_disk(folder: Path) -> None:
     try:
         possible = on_small_disk(folder, "true")
     except FileNotFoundError as error:
         pytest.skip(f"no file system of our own: {error}")
     if possible.returncode:
         pytest.skip(f"no file system of our own: {possible.stderr.strip()}")
+
+
+def shoot(folder: Path, reserve: int) -> dict[str, Any]:
+    require_small_disk(folder)
     done = on_small_disk(folder, sys.executable, str(SCRIPT), str(folder), str(reserve))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -57,3 +83,10 @@ def test_the_capture_stops_while_there_is_still_room_to_finish_it(tmp_path):
     assert len(out["verify"]) == 2
     assert 0 < out["written"] == out["in_frames"] < 120
     assert (out["resumed"], out["verify_resumed"], out["verify_compressed"]) == ("", [], [])
+
+
+def test_a_full_disk_keeps_no_service_from_its_root_and_none_from_being_refused(tmp_path):
+    """It darkens as it starts: that must not wait for somebody who makes room."""
+    require_small_disk(tmp_path)
+    done = on_small_disk(tmp_path, sys.executable, "-c", LOCKED, str(tmp_path))
+    assert (done.returncode, done.stdout) == (0, "refused\n"), done.stderr
