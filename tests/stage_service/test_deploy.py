@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import ipaddress
 import json
 import re
 import shlex
@@ -48,6 +49,19 @@ def test_units_start_commands_that_there_are(unit):
     assert Path(program).name == "hairstage"
     parsed = build_parser().parse_args(arguments)
     assert str(parsed.root) == "/var/lib/hairstage"
+
+
+def test_the_service_may_look_for_cameras_and_talk_to_them():
+    """GigE Vision finds devices by a broadcast to 255.255.255.255 (GVCP, DISCOVERY_CMD), which
+    answer from the stage's network, or from link-local addresses while nobody gives them others."""
+    unit = (DEPLOY / "systemd" / "hairstage.service").read_text()
+    assert "IPAddressDeny=any" in unit
+    names = {"localhost": "127.0.0.0/8", "link-local": "169.254.0.0/16"}  # systemd's, of IPv4
+    said = " ".join(re.findall(r"^IPAddressAllow=(.*)$", unit, re.MULTILINE)).split()
+    networks = [ipaddress.ip_network(names.get(word, word)) for word in said]
+    for address in ("255.255.255.255", "169.254.3.4", "192.168.3.4", "127.0.0.1"):
+        assert any(ipaddress.ip_address(address) in network for network in networks), address
+    assert not any(ipaddress.ip_address("8.8.8.8") in network for network in networks)
 
 
 def test_containers_start_commands_that_there_are_on_files_that_there_are():
