@@ -59,6 +59,8 @@ class DeviceSet:
         config, rig = rig_file.devices, rig_file.rig
         if config is None:
             raise NoStage(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
+        if not rig.lights:
+            raise RigError(f"{rig_file.path}: no lights, but [devices.lights] has to drive some")
         if isinstance(config.lights, DmxConfig):
             lights: LightBank = DmxLightBank(config.lights, len(rig.lights))
         else:

@@ -8,6 +8,7 @@ import pytest
 
 from reconstruction.geometry.rig import RigError
 from stage_service.config import load_rig_file
+from stage_service.devices.device_set import DeviceSet
 
 RIGS = Path(__file__).resolve().parents[2] / "stage_service" / "rigs"
 SMALL = """
@@ -50,6 +51,12 @@ def test_stage331_is_the_stage_of_the_issue():
     assert {(c.width, c.height) for c in rig.cameras} == {(1300, 1030)}
     assert len(rig.cameras) == 50
     assert [(p.width, p.height) for p in rig.projectors] == [(1024, 768)] * 3
+
+
+def test_a_light_bank_of_no_lamps_is_refused_before_it_is_asked(tmp_path):
+    (path := tmp_path / "rig.toml").write_text(SMALL)
+    with pytest.raises(RigError, match=r"rig.toml: no lights"):
+        DeviceSet.of(load_rig_file(path))
 
 
 def changed(tmp_path: Path, old: str, new: str) -> Path:
