@@ -8,7 +8,8 @@ from typing import Any
 
 from pymodbus import ModbusException
 
-from stage_service.config import OWNER_WORDS, ModbusRtuConfig, ModbusTcpConfig
+from reconstruction.geometry.rig import RigError
+from stage_service.config import OWNER_WORDS, LightRegisters, ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits, modbus_answers
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
@@ -31,9 +32,11 @@ class ModbusLightBank:
 
     After any trouble the link is closed. The next request opens it anew, drains it and identifies
     the bank before anything else is asked, so that no late answer is taken for a later one's.
+    Raises `RigError` where registers lie over each other.
     """
 
     def __init__(self, config: ModbusTcpConfig | ModbusRtuConfig, lamps: int) -> None:
+        _check_apart(config.registers, lamps)
         port = config.port
         place = port if isinstance(config, ModbusRtuConfig) else f"{config.host}:{port}"
         self.name = f"light bank ({place})"
@@ -348,6 +351,21 @@ class ModbusLightBank:
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
         return DeviceError(self.name, doing, expected, received, todo)
+
+
+def _check_apart(registers: LightRegisters, lamps: int) -> None:
+    """Raise `RigError` where two holding registers share an address: the level of lamp 1000,
+    written where the selector is, would be a command."""
+    many = {"levels": lamps, "owner": OWNER_WORDS, "table": 2}
+    found: dict[int, str] = {}
+    for name in ("levels", "selector", "heartbeat", "watchdog", "sequence", "owner", "table"):
+        first = getattr(registers, name)
+        for address in () if first is None else range(first, first + many.get(name, 1)):
+            if (other := found.setdefault(address, name)) != name:
+                raise RigError(
+                    f"devices.lights.registers: {name} lies over {other} at {address}, with "
+                    f"{lamps} lamps: give each addresses of its own, as the bank has them"
+                )
 
 
 def _words(name: str) -> list[int]:

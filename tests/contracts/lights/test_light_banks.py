@@ -238,6 +238,29 @@ def test_more_lamps_than_a_universe_has_channels_are_refused(first, lamps):
     assert DmxLightBank(DmxConfig(kind="dmx_enttec", port="x"), 331).count == 331
 
 
+@pytest.mark.parametrize(
+    ("registers", "lamps", "told"),
+    [
+        ({}, 1001, "selector lies over levels at 1000"),
+        ({"levels": 900, "owner": "none"}, 331, "selector lies over levels at 1000"),
+        ({"heartbeat": 1002}, 331, "watchdog lies over heartbeat at 1002"),
+        ({"owner": 990}, 331, "owner lies over selector at 1000"),
+        ({"levels": 1990}, 331, "table lies over levels at 2000"),
+    ],
+)
+def test_registers_that_lie_over_each_other_are_refused(registers, lamps, told):
+    """By the wire's page, 65535 at the selector puts all lamps on: as a level it is full."""
+    config = ModbusTcpConfig.model_validate({"registers": registers})
+    with pytest.raises(RigError, match=told):
+        ModbusLightBank(config, lamps)
+
+
+def test_as_many_lamps_as_the_default_registers_have_room_for():
+    assert ModbusLightBank(ModbusTcpConfig(), 1000).count == 1000
+    elsewhere = ModbusTcpConfig.model_validate({"registers": {"levels": 20_000}})
+    assert ModbusLightBank(elsewhere, 4000).count == 4000
+
+
 def test_dmx_levels_are_rounded_to_8_bits_and_none_vanishes(bench):
     one = bench("simulated DMX")
     one.driver.all_on()
