@@ -73,10 +73,12 @@ class HardwareRun:
         """
         lights, beams = self._devices.lights, self._devices.projectors
         trigger = self._devices.trigger
-        lit = [_entry(s, self._lamp) for s in self._steps if _gate(s) == "L"]
+        settle = self._devices.config.lights.settle_s
+        begins = zip(self._steps, self.schedule, strict=True)
+        lit = [(s, (at, at + settle + s.exposure)) for s, at in begins if _gate(s) == "L"]
         shown = [_pattern(s) for s in self._steps if _gate(s) == "P"]
         if lit:
-            lights.load_sequence(lit)
+            lights.load_sequence([_entry(s, self._lamp) for s, _ in lit], [t for _, t in lit])
         if shown:
             assert beams is not None
             beams.load_sequence(shown)

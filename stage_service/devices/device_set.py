@@ -44,7 +44,7 @@ class DeviceSet:
     """
 
     config: DevicesConfig
-    lights: LightBank
+    lights: LimitedLightBank
     trigger: TriggerBox
     projectors: ProjectorController | None
     cameras: tuple[CameraDevice, ...]

@@ -67,6 +67,25 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     assert verify(tmp_path / "c") == []
 
 
+def test_the_duty_is_counted_over_captures_that_the_box_clocks(simulated, small_rig, tmp_path):
+    """0.05 s in each capture, and 0.12 s a minute: two captures, and no third."""
+    safety = "[safety]\nmax_duty = 0.002\nduty_window_s = 60.0"
+    rig_file, world = simulated(rig=small_rig.replace("[safety]", safety))
+    plan = CapturePlan(
+        lights=tuple(f"light_{i:03}" for i in range(8)),
+        projectors=(),
+        sentinels=False,
+        exposure={"olat": 0.05},
+        stepping="hardware",
+    )
+    manager = CaptureManager(rig_file, tmp_path / "root")
+    captures = [manager.wait(manager.start(plan), 30) for _ in range(3)]
+    manager.close()
+    assert [c.outcome for c in captures] == ["completed", "completed", "failed"]
+    assert "max_duty in [safety]" in str(captures[-1].error)
+    assert not world.lamps.power().any()
+
+
 def test_the_duty_of_a_lamp_is_counted_over_several_captures(simulated, small_rig, tmp_path):
     """Each capture alone keeps to the limit."""
     safety = "[safety]\nmax_duty = 0.1\nduty_window_s = 2.0"

@@ -24,8 +24,8 @@ class LimitedLightBank:
     A lamp that stays lit too long, or too much of the time, is put off by a thread of this bank.
     From then on every command but `off` raises, heartbeats too, so that a bank that does not obey
     is left to its own watchdog; `connect` begins anew. Sequences that the trigger box clocks are
-    checked entry by entry; how long their lamps are lit follows from the plan. `past` has how long
-    lamps were lit before, and goes on being kept.
+    checked entry by entry, before any is lit. `past` has how long lamps were lit before, and goes
+    on being kept.
     """
 
     def __init__(
@@ -79,6 +79,7 @@ class LimitedLightBank:
         with self._changed:
             self._bank.off()
             self._lit(())
+            self._forget_what_did_not_come()
 
     def set_level(self, level: float) -> None:
         with self._changed:
@@ -104,17 +105,25 @@ class LimitedLightBank:
             self._raise_refusal()
         return self._bank.status()
 
-    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
-        """Check each entry and upload them."""
+    def load_sequence(
+        self, entries: Sequence[tuple[Lit, float]], times: Sequence[tuple[float, float]] = ()
+    ) -> None:
+        """Check each entry and upload them. `times`: from when until when each is to be lit, in
+        seconds from now; it counts as lit then, unless `off` comes before."""
         with self._changed:
             self._raise_refusal()
+            now, spans = self._clock(), []
             for number, (lit, level) in enumerate(entries):
-                lamps = {"all": self.count, "none": 0}.get(lit, 1) if isinstance(lit, str) else 1
+                all_or_none = range(self.count) if lit == "all" else ()
+                lamps = all_or_none if isinstance(lit, str) else (lit,)
                 doing = f"loading entry {number} of a sequence"
-                self._check_lamps(lamps, doing)
-                self._check_power(lamps, level, doing)
+                self._check_lamps(len(lamps), doing)
+                self._check_power(len(lamps), level, doing)
+                spans += [(x, doing, times[number]) for x in lamps if times]
             self._bank.load_sequence(entries)
             self._lit(())
+            if self._limits.max_duty < 1:
+                self._book(spans, now)
 
     def position(self) -> int:
         return self._bank.position()
@@ -163,6 +172,24 @@ class LimitedLightBank:
             for lamp in before.keys() - self._since.keys():
                 self._past.setdefault(lamp, deque()).append((before[lamp], now))
 
+    def _book(self, spans: Iterable[tuple[int, str, tuple[float, float]]], now: float) -> None:
+        """Book what lamps are to be lit. Raises `SafetyRefusal`; then nothing is, and the bank's
+        sequence is left."""
+        for lamp, doing, (begin, end) in spans:
+            self._past.setdefault(lamp, deque()).append((now + begin, now + end))
+            used = self._used(lamp, now + end)
+            if used > self._limits.max_duty * self._limits.duty_window_s:
+                self.off()
+                raise self._too_much(doing, used)
+
+    def _forget_what_did_not_come(self) -> None:
+        now = self._clock()
+        for past in self._past.values():
+            while past and past[-1][1] > now:
+                begin, _ = past.pop()
+                if begin < now:
+                    past.append((begin, now))
+
     def _left(self, lamp: int, now: float) -> float:
         """Seconds that a lit lamp may at least stay lit."""
         limits = self._limits
@@ -171,14 +198,13 @@ class LimitedLightBank:
             left = min(left, limits.max_duty * limits.duty_window_s - self._used(lamp, now))
         return left
 
-    def _used(self, lamp: int, now: float) -> float:
-        """Seconds that the lamp was lit within the last window."""
-        begin = now - self._limits.duty_window_s
-        past = self._past.get(lamp, deque())
-        while past and past[0][1] <= begin:
+    def _used(self, lamp: int, at: float) -> float:
+        """Seconds that the lamp is lit within the window that ends `at`, now or later."""
+        window, past = self._limits.duty_window_s, self._past.get(lamp, deque())
+        while past and past[0][1] <= self._clock() - window:
             past.popleft()
-        spans = [*past, (self._since.get(lamp, now), now)]
-        return sum(end - max(start, begin) for start, end in spans)
+        spans = [*past, (self._since.get(lamp, at), at)]
+        return sum(max(0.0, min(end, at) - max(start, at - window)) for start, end in spans)
 
     def _too_long(self, lamp: int, now: float, doing: str) -> SafetyRefusal:
         limits, on = self._limits, now - self._since.get(lamp, now)
@@ -186,11 +212,14 @@ class LimitedLightBank:
             expected = f"at most {limits.max_on_s:g} s (max_on_s in [safety])"
             todo = "It was put off. Shorten the exposure; a device that answers late keeps it lit."
             return self._error(doing, expected, f"lit for {on:.3g} s", todo)
-        window = limits.duty_window_s
+        return self._too_much(doing, self._used(lamp, now))
+
+    def _too_much(self, doing: str, used: float) -> SafetyRefusal:
+        limits, window = self._limits, self._limits.duty_window_s
         share = f"{limits.max_duty * window:.3g} s of {window:g} s"
         expected = f"at most {share} (max_duty in [safety])"
         todo = "Let the lamp cool, then continue; a lower rate_hz gives it time."
-        return self._error(doing, expected, f"lit for {self._used(lamp, now):.3g} s", todo)
+        return self._error(doing, expected, f"lit for {used:.3g} s", todo)
 
     def _check_lamps(self, lamps: int, doing: str) -> None:
         most = self._limits.max_lamps

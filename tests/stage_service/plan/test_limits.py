@@ -196,6 +196,23 @@ def test_the_duty_counts_within_any_window(limited):
     assert lights.enforce() == pytest.approx(0.5)
 
 
+def test_the_duty_counts_what_the_trigger_box_clocks(limited):
+    _, lights, clock = limited(max_duty=0.5, duty_window_s=10.0)
+    lights.load_sequence([(4, 1.0), (5, 1.0), (4, 1.0)], [(0.0, 3.0), (3.0, 4.0), (4.0, 6.0)])
+    clock.now += 6.0
+    lights.off()
+    with pytest.raises(SafetyRefusal, match=r"at most 5 s of 10 s \(max_duty.*lit for 5 s"):
+        lights.select(4)
+    with pytest.raises(SafetyRefusal, match=r"entry 1 of a sequence.*lit for 5\.5 s"):
+        lights.load_sequence([(5, 1.0), (4, 1.0)], [(0.0, 1.0), (1.0, 1.5)])
+    lights.load_sequence([(4, 1.0)], [(5.0, 7.0)])  # the first 3 s are outside of the window then
+    clock.now += 6.0
+    lights.off()  # of the 2 s, 1 s came
+    clock.now += 2.0
+    lights.select(4)  # 3 s of the last 10
+    assert lights.enforce() == pytest.approx(2.0)
+
+
 def test_lamps_and_power_are_checked_before_anything_lights(limited):
     bank, lights, _ = limited(max_lamps=9)
     with pytest.raises(SafetyRefusal, match=r"at most 9 lamps lit.*10 asked for"):
