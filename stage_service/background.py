@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
 
+T = TypeVar("T")
 END_S = 5.0
 """Whoever closes it waits for so long: what is stuck by then is left to the process."""
 
@@ -29,3 +33,20 @@ class Background(ABC):
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(END_S)
+
+
+def beside(work: Callable[[], T], name: str) -> Future[T]:
+    """What `work` comes to, on a thread of its own where one can be had."""
+    found: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            found.set_result(work())
+        except BaseException as error:
+            found.set_exception(error)
+
+    try:
+        threading.Thread(target=run, name=name, daemon=True).start()
+    except RuntimeError:
+        run()
+    return found

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from stage_service.acquisition.safety import Blackout
+from stage_service.background import beside
 from stage_service.records.audit import AuditLog
 from stage_service.records.lease import Leases
 from stage_service.records.tokens import SCOPES, Scope
@@ -108,7 +109,7 @@ class Control:
         with self._lock:
             self._blackouts = [b for b in self._blackouts if not b.done()]
             if len(self._blackouts) < MOST_BLACKOUTS:
-                self._blackouts.append(_beside(recorded))
+                self._blackouts.append(beside(recorded, "blackout"))
             under_way = self._blackouts[-1]
         over = wait([under_way], ANSWER_S).done
         return under_way.result() if over else LATE.to_dict()
@@ -124,20 +125,3 @@ class Control:
     def _who(self, caller: Caller) -> str:
         holder = self.leases.holder(caller.token)
         return f"{holder} ({caller})" if holder else str(caller)
-
-
-def _beside(work: Callable[[], T]) -> Future[T]:
-    """What `work` comes to, on a thread of its own where one can be had."""
-    found: Future[T] = Future()
-
-    def run() -> None:
-        try:
-            found.set_result(work())
-        except BaseException as error:
-            found.set_exception(error)
-
-    try:
-        threading.Thread(target=run, name="blackout", daemon=True).start()
-    except RuntimeError:
-        run()
-    return found

@@ -9,7 +9,9 @@ import os
 import pwd
 import secrets
 import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,10 +22,15 @@ from reconstruction.capture.writer import utc_now
 from reconstruction.containment import is_file_name, plain_file
 from reconstruction.files.durable import writing
 from reconstruction.reading import read_json
+from stage_service.background import beside
 
 Scope = Literal["read", "steer", "arm", "jobs", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 """See what there is; shoot; answer for flashes and for dark lamps; process; end others' leases."""
+
+
+WAIT_S = 0.5
+"""How long a disk is waited for that does not say whose a token is: nobody is answered then."""
 
 
 class TokenError(ValueError):
@@ -54,7 +61,8 @@ class Tokens:
     """The tokens in `path`; what another process changes there counts at once.
 
     `own` is one more, with every scope, that stands in no file of the service: that of the user who
-    runs it. A file that is there and cannot be read opens nothing.
+    runs it. A file that is there and cannot be read opens nothing. While its disk does not answer
+    it is as it was last seen: whoever asks for darkness waits for no disk.
     """
 
     def __init__(self, path: Path, own: str | None = None) -> None:
@@ -62,6 +70,9 @@ class Tokens:
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
         self._read: tuple[tuple[int, int, int] | None, dict[str, Identity]] = (None, {})
+        self._looking = threading.Lock()
+        self._look: Future[dict[str, Identity]] | None = None
+        self._until = 0.0
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""
@@ -113,6 +124,14 @@ class Tokens:
             yield
 
     def _known(self) -> dict[str, Identity]:
+        with self._looking:
+            if self._look is None or self._look.done():
+                self._look = beside(self._seen, "tokens")
+                self._until = time.monotonic() + WAIT_S
+            look, left = self._look, max(0.0, self._until - time.monotonic())
+        return look.result() if wait([look], left).done else self._read[1]
+
+    def _seen(self) -> dict[str, Identity]:
         try:
             found = self._path.stat()
         except OSError:

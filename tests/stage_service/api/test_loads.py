@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import socket
 import threading
 import time
@@ -21,11 +22,13 @@ from waiting import until
 
 from reconstruction import CaptureWriter, Step
 from stage_service import watching
+from stage_service.api.gate import Access
 from stage_service.captures import control, status_index
 from stage_service.captures import manager as manager_module
 from stage_service.captures.catalogue import Catalogue
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.jobs.slots import WorkerSlot
+from stage_service.records.tokens import Tokens
 
 THREADS = 45
 """More than the 40 that the framework has for all routes that do not say otherwise."""
@@ -207,6 +210,37 @@ def test_while_the_disk_hangs(rig_file, world, tmp_path, monkeypatch):
         assert http.get(f"/captures/{capture}").json()["state"] != "done"
         assert http.post("/captures", json=LONG).status_code == 409
         assert time.monotonic() - start < manager_module.STOP_WITHIN_S
+
+
+class Slow(type(Path())):  # type: ignore[misc]
+    """A path on a disk that does not answer until it is `there`."""
+
+    there = threading.Event()
+
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+        self.there.wait()
+        return super().stat(follow_symlinks=follow_symlinks)
+
+
+def test_nobody_waits_for_a_disk_that_does_not_say_whose_a_token_is(rig_file, world, tmp_path):
+    """One request with a token of the file must not keep another from a blackout."""
+    Slow.there.set()
+    tokens = Tokens(Slow(tmp_path / "tokens.json"), own="mine")
+    hers = {"Authorization": f"Bearer {tokens.make('ada', ('read',))}"}
+    with serving(rig_file, tmp_path, Access(tokens)) as http:
+        assert http.get("/health", headers=hers).json()["lamps"] == "dark"
+        Slow.there.clear()
+        try:
+            flood(http, "GET", "/health", count=1, headers=hers)
+            assert http.get("/health", headers=hers, timeout=10).status_code == 200
+            mine = {"Authorization": "Bearer mine"}
+            world.lit = {5}
+            answer = http.post("/devices/blackout", headers=mine, timeout=10).json()
+            assert (answer["state"], world.lit) == ("dark", set())
+        finally:
+            Slow.there.set()
+        tokens.revoke("ada")
+        until(lambda: http.get("/health", headers=hers).status_code == 401)
 
 
 def test_health_is_told_while_the_root_folder_s_disk_hangs(rig_file, tmp_path, monkeypatch):
