@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import until
 
 from stage_service.captures.manager import CaptureManager
 from stage_service.config import RigFile
@@ -145,3 +146,16 @@ def test_a_lock_leaves_no_file_behind(tmp_path):
         FileLock(path, "two", shared=True)
     first.release()
     FileLock(path, "two").release()
+
+
+def test_a_capture_ends_where_the_bank_was_started_anew(simulated, begin):
+    """Its levels are full from then on, and no link broke that would say so."""
+    rig_file, world = simulated()
+    service = begin(rig_file, "root")
+    capture = service.start(CapturePlan(projectors=(), exposure={"olat": 0.5}))
+    until(lambda: world.lamps.power().any())
+    world.lamps.own(0, [0])
+    found = service.wait(capture, 60)
+    assert found.outcome == "failed"
+    assert "it was started anew" in str(found.error)
+    assert not world.lamps.power().any()

@@ -51,6 +51,7 @@ class ModbusLightBank:
         self.count = lamps
         self._level: int | None = None
         self._armed: int | None = None  # entries; None: not known
+        self._owner = 0
         self._link: ModbusLink | None = None
         self._identified = False
         self._out_of_step = False
@@ -120,8 +121,22 @@ class ModbusLightBank:
         self._write([round(seconds * 1000)], register, doing)
 
     def heartbeat(self) -> None:
+        """Feed the watchdog. Raises where the bank is no longer whose it was: by a power-up, after
+        which levels are full and no sequence is armed, or by another service."""
         doing = "sending a heartbeat"
-        self._write([1], self._required(self._map.heartbeat, doing, "a heartbeat register"), doing)
+        register = self._required(self._map.heartbeat, doing, "a heartbeat register")
+        with self._lock:
+            self._write([1], register, doing)
+            if not self._owner or self._map.owner is None:
+                return
+            (held,) = self._read("read_holding_registers", self._map.owner, 1, doing)
+            if held != self._owner:
+                self._level = self._armed = None
+                expected = f"the bank to be service {self._owner}'s"
+                received = f"that of service {held}" if held else "nobody's: it was started anew"
+                todo = "What was shot since the last heartbeat may be lit at another level: see to "
+                todo += "the bank's supply and to other services, then resume or shoot again."
+                raise self._error(doing, expected, received, todo)
 
     def claim(self, number: int, name: str) -> str | None:
         """Write `number` to the owner register, which refuses it (exception 4) while it holds
@@ -139,6 +154,7 @@ class ModbusLightBank:
                 return _text(words) or f"a service that gave no name ({held})"
             if number:
                 self._exchange(doing, "write_registers", first + 1, _words(name))
+            self._owner = number
         return None
 
     def status(self) -> LightStatus:

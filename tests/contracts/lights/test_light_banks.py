@@ -289,3 +289,26 @@ def test_an_owner_without_a_name_is_one(bank):
     first = bank.driver.config.registers.owner
     bank.driver._exchange("claiming", "write_register", first, 300)
     assert bank.driver.claim(7, "left:123") == "a service that gave no name (300)"
+
+
+def test_a_bank_that_was_started_anew_or_is_another_s_is_told_with_the_next_heartbeat(gated):
+    driver, lamps = gated.driver, gated.lamps
+    driver.heartbeat()  # nobody's as yet
+    assert driver.claim(7, "left:123") is None
+    driver.set_level(0.25)
+    driver.heartbeat()
+    lamps.own(0, [0])  # a power-up, by the wire's page
+    lamps.dim(0, [65535] * driver.count)
+    with pytest.raises(DeviceError, match=r"service 7's, received nobody's: it was started anew"):
+        driver.heartbeat()
+    lamps.own(0, [9])
+    with pytest.raises(DeviceError, match=r"service 7's, received that of service 9"):
+        driver.heartbeat()
+    lamps.own(0, [0])
+    assert driver.claim(7, "left:123") is None
+    driver.heartbeat()
+    driver.set_level(0.25)  # which it was set to before
+    driver.select(3)
+    assert gated.powers()[3] == pytest.approx(0.25, abs=1 / 255)
+    assert driver.claim(0, "") is None
+    driver.heartbeat()
