@@ -20,6 +20,7 @@ from pydantic import Field
 
 from reconstruction.arrays import Bools, Floats
 from reconstruction.files.exr import read_exr
+from reconstruction.files.masks import AS_STORED
 from reconstruction.options import options
 
 Positive = Annotated[float, Field(gt=0)]
@@ -151,7 +152,8 @@ def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
 
 def _avif(path: Path) -> NDArray[Any]:
     """Whole numbers `(H, W, 3)`; OpenCV reads what OpenImageIO's wheels do not."""
-    values = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    how = AS_STORED | cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+    values = cv2.imread(str(path), how)
     if values is None:
         raise PictureError(_broken(path, "OpenCV cannot read it"))
     return np.asarray(values)

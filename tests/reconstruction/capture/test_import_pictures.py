@@ -18,6 +18,7 @@ from reconstruction import Capture, import_folder, verify, write_exr
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
+from reconstruction.files.masks import decode_mask
 from reconstruction.files.pictures import PictureError, Sensor, read_picture
 from reconstruction.images.silhouettes import silhouette
 from stage_service.cli import main
@@ -126,6 +127,31 @@ def test_avif_of_any_depth_is_the_same_light(tmp_path, bits):
     np.testing.assert_allclose(found.light[6:], light[6:], atol=0.02)
     assert found.saturated[:2].all()
     assert not found.saturated[6:].any()
+
+
+HALF_TURN = np.frombuffer(
+    b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0", np.uint8
+)
+"""EXIF whose orientation is 3: a viewer shows the picture upside down."""
+
+
+def test_what_viewers_turn_is_read_as_it_is_stored(folder, tmp_path):
+    """EXIF turned AVIF and masks by a half, and left PNG, TIFF and JPEG as they were."""
+    stored = np.zeros((SIZE, SIZE, 3), np.uint8)
+    stored[4:10, 2:8] = 255
+    for name in ("turned.avif", "turned.png", "turned.jpg"):
+        kinds = [cv2.IMAGE_METADATA_EXIF]
+        cv2.imwriteWithMetadata(str(tmp_path / name), stored, kinds, [HALF_TURN])
+        light = read_picture(tmp_path / name, Sensor(), (SIZE, SIZE)).light
+        np.testing.assert_array_equal(light > 0.5, stored > 0, err_msg=name)
+    everywhere(lambda c, n, x: save(folder / f"images/{c}/light_{n:03d}.png", srgb(x), np.uint8))
+    (folder / "masks").mkdir()
+    (tmp_path / "turned.png").rename(folder / "masks/left.png")
+    hair, _ = Import.of(folder).masks("left")
+    assert hair is not None
+    np.testing.assert_array_equal(hair, stored[..., 0] > 0)
+    again = decode_mask((folder / "masks/left.png").read_bytes(), SIZE, SIZE)
+    np.testing.assert_array_equal(again, hair)
 
 
 def test_brackets_are_merged_and_saturation_is_kept(folder, tmp_path):
