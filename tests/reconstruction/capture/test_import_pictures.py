@@ -129,6 +129,23 @@ def test_avif_of_any_depth_is_the_same_light(tmp_path, bits):
     assert not found.saturated[6:].any()
 
 
+def test_floats_above_1_are_light_and_not_saturated(tmp_path):
+    """A TIFF of floats, merged of exposures or rendered, was saturated wherever it was above .99;
+    EXR of the same numbers was not."""
+    light = 20 * light_of(0, 1)
+    cv2.imwrite(str(tmp_path / "a.tif"), light[..., ::-1])
+    write_exr(tmp_path / "a.exr", light)
+    for name in ("a.tif", "a.exr"):
+        found = read_picture(tmp_path / name, Sensor(), (SIZE, SIZE))
+        np.testing.assert_allclose(found.light, light, rtol=1e-6)
+        assert not found.saturated.any(), name
+        assert found.full == np.inf
+        full = read_picture(tmp_path / name, Sensor(white=10.0), (SIZE, SIZE))
+        bright = light.max(axis=-1)
+        assert full.saturated[bright > 10].all()
+        assert not full.saturated[bright < 9.8].any()
+
+
 HALF_TURN = np.frombuffer(
     b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0", np.uint8
 )
