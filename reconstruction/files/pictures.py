@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from reconstruction.arrays import Bools, Floats
-from reconstruction.files.exr import read_exr
+from reconstruction.files.exr import OtherChannels, read_exr
 from reconstruction.files.masks import AS_STORED
 from reconstruction.options import options
 
@@ -184,6 +184,8 @@ def _broken(path: Path, error: object) -> str:
 def _exr(path: Path, sensor: Sensor) -> Picture:
     try:
         image, attributes = read_exr(path)
+    except OtherChannels as error:
+        raise PictureError(str(error)) from error
     except ValueError as error:
         raise PictureError(_broken(path, error)) from error
     if not np.isfinite(image).all():

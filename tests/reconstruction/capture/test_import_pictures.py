@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import OpenImageIO as oiio
 import pytest
 from dng_writer import BLACK, BLUE, GREEN, RED, WHITE, write_dng
@@ -144,6 +145,19 @@ def test_floats_above_1_are_light_and_not_saturated(tmp_path):
         bright = light.max(axis=-1)
         assert full.saturated[bright > 10].all()
         assert not full.saturated[bright < 9.8].any()
+
+
+def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
+    """Blender's multilayer files have no plain R, G and B: copying them anew was no help."""
+    path, layer = tmp_path / "a.exr", np.ones((SIZE, SIZE), np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channels = {f"ViewLayer.Combined.{c}": layer for c in "RGB"}
+    OpenEXR.File(header, channels).write(str(path))
+    with pytest.raises(
+        PictureError, match=r"there are ViewLayer\.Combined.*: write .* as RGB"
+    ) as told:
+        read_picture(path, Sensor(), (SIZE, SIZE))
+    assert "copy it anew" not in str(told.value)
 
 
 HALF_TURN = np.frombuffer(
