@@ -160,6 +160,19 @@ def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
     assert "copy it anew" not in str(told.value)
 
 
+def test_a_camera_whose_folder_is_a_link_has_its_pictures(folder, tmp_path):
+    """They lie on another disk; all its frames were missing. A link to what holds it ends."""
+    disk = tmp_path / "disk"
+    everywhere(lambda c, n, x: save(disk / c / f"light_{n:03d}.png", x, np.uint16))
+    (folder / "images").mkdir()
+    (disk / "left").rename(folder / "images/left")
+    (folder / "images/right").symlink_to(disk / "right", target_is_directory=True)
+    (disk / "right/back").symlink_to(folder, target_is_directory=True)
+    seen = Import.of(folder)
+    assert seen.missing == []
+    assert seen.counts()["frames"] == len(CAMERAS) * len(LIGHTS)
+
+
 HALF_TURN = np.frombuffer(
     b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0", np.uint8
 )
