@@ -56,7 +56,7 @@ from reconstruction.capture.import_tables import (
 from reconstruction.capture.likely_lights import LIKELY, likely_strength
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
-from reconstruction.files.masks import check_alpha, half_grey
+from reconstruction.files.masks import AS_STORED, check_alpha, half_grey
 from reconstruction.files.pictures import PictureError, picture_size, read_picture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
@@ -434,7 +434,8 @@ def _mask(path: Path, camera: Camera) -> Bools:
         found = picture_size(path)
     except PictureError as error:
         raise ImportProblem(str(error)) from error
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if found == expected else None
+    how = AS_STORED | cv2.IMREAD_GRAYSCALE
+    image = cv2.imread(str(path), how) if found == expected else None
     if image is None:
         raise ImportProblem(f"{path}: expected a PNG of {expected} pixels, got {found}")
     try:

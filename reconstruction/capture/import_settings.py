@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections import defaultdict
@@ -136,8 +137,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     Raises `ImportProblem`: a pattern that cannot be used, no picture of a single light, two files
     for one frame, rows that cannot be placed between tracking frames.
     """
-    files = sorted(p for p in folder.rglob("*") if p.is_file())
-    names = {p.relative_to(folder).as_posix(): p for p in files}
+    names = {p.relative_to(folder).as_posix(): p for p in _files(folder)}
     patterns, reader = settings.pictures, _Names(rig, settings)
     matches: dict[str, list[_Match]] = {}
     used: set[Path] = set()
@@ -186,6 +186,21 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
         tuple(left), (*bare, *_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
+
+
+def _files(folder: Path) -> list[Path]:
+    """All files below `folder`, in order; folders that are links are looked into, each once."""
+    found: list[Path] = []
+    seen: set[str] = set()
+    for at, below, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(at)
+        if real in seen:
+            below.clear()
+            continue
+        seen.add(real)
+        below.sort()
+        found += [Path(at, n) for n in names]
+    return sorted(p for p in found if p.is_file())
 
 
 def _check_order(patterns: Patterns, matches: Mapping[str, Sequence[_Match]]) -> None:

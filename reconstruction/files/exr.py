@@ -16,6 +16,10 @@ from reconstruction.files.durable import PAGE, writing
 Attributes = Mapping[str, float | str]
 
 
+class OtherChannels(ValueError):
+    """A file that is whole, but not of R, G and B."""
+
+
 def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
     """Read R, G and B `(H, W, 3)` and the header attributes that `write_exr` was given.
 
@@ -27,7 +31,11 @@ def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
         together = channels["RGB"] if "RGB" in channels else channels["RGBA"]
         pixels = together.pixels[..., :3]
     except KeyError:
-        raise ValueError(f"{path}: expected the channels R, G and B") from None
+        there = ", ".join(sorted(channels))
+        raise OtherChannels(
+            f"{path}: expected the channels R, G and B, there are {there}: write the picture "
+            "alone, as RGB, without layers"
+        ) from None
     except Exception as error:  # the binding raises bare RuntimeError and MemoryError alike
         raise ValueError(f"{path}: cannot be read as OpenEXR ({error})") from error
     attributes = {k: v for k, v in file.header().items() if isinstance(v, float | str)}

@@ -16,6 +16,8 @@ _LENGTH = struct.Struct(">I")
 _SIZE = struct.Struct(">II")
 _COLOUR_TYPE = 25  # where a PNG says what its pixels are
 _MAYBE_TRANSPARENT = (3, 4, 6)  # a palette, grey or colour with alpha
+AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION
+"""Cameras are those of the pixels as a file has them: EXIF says how viewers turn them."""
 ALIKE = 0.9
 """Of the pixels of either that are of both, where two masks are one: soft edges differ."""
 
@@ -47,7 +49,7 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
         end += 12 + _LENGTH.unpack_from(data, end)[0]  # a chunk's own three words, and its data
     image: NDArray[np.uint8] | None = None
     if end <= len(data):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), AS_STORED | cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape != (height, width):
         raise ValueError(f"{expected}, got one that is damaged")
     mask = half_grey(image)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from reconstruction.arrays import Bools, Floats
-from reconstruction.files.exr import read_exr
+from reconstruction.files.exr import OtherChannels, read_exr
+from reconstruction.files.masks import AS_STORED
 from reconstruction.options import options
 
 Positive = Annotated[float, Field(gt=0)]
@@ -52,8 +53,8 @@ class Sensor:
     `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: "srgb" for 8 bits,
     JPEG and AVIF, "linear" for all else. `black` and `white` in the file's own numbers: without
     light, and where a channel is full; None: what a RAW file says, 0 and the largest of its type (1
-    in EXR, which never saturates unless its attribute `fullScale` or `white` says so). `bayer`: the
-    colours of the first two rows of a picture that is a sensor's mosaic.
+    of floats, which never saturate unless `white`, or EXR's attribute `fullScale`, says so).
+    `bayer`: the colours of the first two rows of a picture that is a sensor's mosaic.
     """
 
     response: Literal["linear", "srgb"] | Positive | None = None
@@ -151,7 +152,8 @@ def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
 
 def _avif(path: Path) -> NDArray[Any]:
     """Whole numbers `(H, W, 3)`; OpenCV reads what OpenImageIO's wheels do not."""
-    values = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    how = AS_STORED | cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+    values = cv2.imread(str(path), how)
     if values is None:
         raise PictureError(_broken(path, "OpenCV cannot read it"))
     return np.asarray(values)
@@ -182,6 +184,8 @@ def _broken(path: Path, error: object) -> str:
 def _exr(path: Path, sensor: Sensor) -> Picture:
     try:
         image, attributes = read_exr(path)
+    except OtherChannels as error:
+        raise PictureError(str(error)) from error
     except ValueError as error:
         raise PictureError(_broken(path, error)) from error
     if not np.isfinite(image).all():
@@ -215,14 +219,15 @@ def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
     if not np.isfinite(numbers).all():
         raise PictureError(f"{path}: has pixels that are not finite numbers")
     share = (numbers.astype(np.float32) - np.float32(black)) / np.float32(white - black)
-    saturated = np.asarray((share >= FULL).any(axis=-1))
+    full = np.float32(FULL if whole or sensor.white else np.inf)
+    saturated = np.asarray((share >= full).any(axis=-1))
     gamma = sensor.response
     if gamma is None:
         gamma = "srgb" if values.dtype == np.uint8 else "linear"
     light = _decoded(share, gamma)
     step = np.float32(1 / (white - black)) if whole else np.float32(0)
     quantum = _decoded(share + step, gamma) - light if gamma != "linear" else step
-    return Picture(light, saturated, float(_decoded(np.float32(FULL), gamma)), quantum)
+    return Picture(light, saturated, float(_decoded(full, gamma)), quantum)
 
 
 def _raw(path: Path, sensor: Sensor) -> Picture:

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import OpenImageIO as oiio
 import pytest
 from dng_writer import BLACK, BLUE, GREEN, RED, WHITE, write_dng
@@ -18,6 +19,7 @@ from reconstruction import Capture, import_folder, verify, write_exr
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
+from reconstruction.files.masks import decode_mask
 from reconstruction.files.pictures import PictureError, Sensor, read_picture
 from reconstruction.images.silhouettes import silhouette
 from stage_service.cli import main
@@ -126,6 +128,74 @@ def test_avif_of_any_depth_is_the_same_light(tmp_path, bits):
     np.testing.assert_allclose(found.light[6:], light[6:], atol=0.02)
     assert found.saturated[:2].all()
     assert not found.saturated[6:].any()
+
+
+def test_floats_above_1_are_light_and_not_saturated(tmp_path):
+    """A TIFF of floats, merged of exposures or rendered, was saturated wherever it was above .99;
+    EXR of the same numbers was not."""
+    light = 20 * light_of(0, 1)
+    cv2.imwrite(str(tmp_path / "a.tif"), light[..., ::-1])
+    write_exr(tmp_path / "a.exr", light)
+    for name in ("a.tif", "a.exr"):
+        found = read_picture(tmp_path / name, Sensor(), (SIZE, SIZE))
+        np.testing.assert_allclose(found.light, light, rtol=1e-6)
+        assert not found.saturated.any(), name
+        assert found.full == np.inf
+        full = read_picture(tmp_path / name, Sensor(white=10.0), (SIZE, SIZE))
+        bright = light.max(axis=-1)
+        assert full.saturated[bright > 10].all()
+        assert not full.saturated[bright < 9.8].any()
+
+
+def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
+    """Blender's multilayer files have no plain R, G and B: copying them anew was no help."""
+    path, layer = tmp_path / "a.exr", np.ones((SIZE, SIZE), np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channels = {f"ViewLayer.Combined.{c}": layer for c in "RGB"}
+    OpenEXR.File(header, channels).write(str(path))
+    with pytest.raises(
+        PictureError, match=r"there are ViewLayer\.Combined.*: write .* as RGB"
+    ) as told:
+        read_picture(path, Sensor(), (SIZE, SIZE))
+    assert "copy it anew" not in str(told.value)
+
+
+def test_a_camera_whose_folder_is_a_link_has_its_pictures(folder, tmp_path):
+    """They lie on another disk; all its frames were missing. A link to what holds it ends."""
+    disk = tmp_path / "disk"
+    everywhere(lambda c, n, x: save(disk / c / f"light_{n:03d}.png", x, np.uint16))
+    (folder / "images").mkdir()
+    (disk / "left").rename(folder / "images/left")
+    (folder / "images/right").symlink_to(disk / "right", target_is_directory=True)
+    (disk / "right/back").symlink_to(folder, target_is_directory=True)
+    seen = Import.of(folder)
+    assert seen.missing == []
+    assert seen.counts()["frames"] == len(CAMERAS) * len(LIGHTS)
+
+
+HALF_TURN = np.frombuffer(
+    b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0", np.uint8
+)
+"""EXIF whose orientation is 3: a viewer shows the picture upside down."""
+
+
+def test_what_viewers_turn_is_read_as_it_is_stored(folder, tmp_path):
+    """EXIF turned AVIF and masks by a half, and left PNG, TIFF and JPEG as they were."""
+    stored = np.zeros((SIZE, SIZE, 3), np.uint8)
+    stored[4:10, 2:8] = 255
+    for name in ("turned.avif", "turned.png", "turned.jpg"):
+        kinds = [cv2.IMAGE_METADATA_EXIF]
+        cv2.imwriteWithMetadata(str(tmp_path / name), stored, kinds, [HALF_TURN])
+        light = read_picture(tmp_path / name, Sensor(), (SIZE, SIZE)).light
+        np.testing.assert_array_equal(light > 0.5, stored > 0, err_msg=name)
+    everywhere(lambda c, n, x: save(folder / f"images/{c}/light_{n:03d}.png", srgb(x), np.uint8))
+    (folder / "masks").mkdir()
+    (tmp_path / "turned.png").rename(folder / "masks/left.png")
+    hair, _ = Import.of(folder).masks("left")
+    assert hair is not None
+    np.testing.assert_array_equal(hair, stored[..., 0] > 0)
+    again = decode_mask((folder / "masks/left.png").read_bytes(), SIZE, SIZE)
+    np.testing.assert_array_equal(again, hair)
 
 
 def test_brackets_are_merged_and_saturation_is_kept(folder, tmp_path):
