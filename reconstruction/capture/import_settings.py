@@ -189,17 +189,20 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
 
 
 def _files(folder: Path) -> list[Path]:
-    """All files below `folder`, in order; folders that are links are looked into, each once."""
+    """All files below `folder`, in order; folders that are links are looked into, each once, after
+    those that are not."""
     found: list[Path] = []
     seen: set[str] = set()
-    for at, below, names in os.walk(folder, followlinks=True):
-        real = os.path.realpath(at)
-        if real in seen:
-            below.clear()
-            continue
-        seen.add(real)
-        below.sort()
-        found += [Path(at, n) for n in names]
+    roots = [folder]
+    for root in roots:  # which links are added to
+        for at, below, names in os.walk(root):
+            real = os.path.realpath(at)
+            if real in seen:
+                below.clear()
+                continue
+            seen.add(real)
+            roots += [link for n in sorted(below) if (link := Path(at, n)).is_symlink()]
+            found += [Path(at, n) for n in names]
     return sorted(p for p in found if p.is_file())
 
 

@@ -161,13 +161,15 @@ def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
 
 
 def test_a_camera_whose_folder_is_a_link_has_its_pictures(folder, tmp_path):
-    """They lie on another disk; all its frames were missing. A link to what holds it ends."""
+    """They lie on another disk; all its frames were missing. Links to what holds them end, and
+    those beside a folder do not take its place."""
     disk = tmp_path / "disk"
     everywhere(lambda c, n, x: save(disk / c / f"light_{n:03d}.png", x, np.uint16))
     (folder / "images").mkdir()
     (disk / "left").rename(folder / "images/left")
     (folder / "images/right").symlink_to(disk / "right", target_is_directory=True)
     (disk / "right/back").symlink_to(folder, target_is_directory=True)
+    (folder / "another").symlink_to(folder / "images", target_is_directory=True)
     seen = Import.of(folder)
     assert seen.missing == []
     assert seen.counts()["frames"] == len(CAMERAS) * len(LIGHTS)
