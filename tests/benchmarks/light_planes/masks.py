@@ -197,9 +197,8 @@ def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCaptur
         framing = replace(FRAMINGS["curly"], rows=21, coarser=6)
         return {("curly", 16): subject_capture("curly", framing, args.cache, 0.0)}
     rig, data = rig_path("demo").read_text(), data_folder()
-    rig, label = rig.replace("lights = 331", f"lights = {args.lights}"), "masks"
-    if args.lights != 331:
-        label += f"-{args.lights}"
+    rig = rig.replace("lights = 331", f"lights = {args.lights}")
+    rig = rig.replace("busy_s = 3600.0", "busy_s = 86400.0")  # frames of 256 paths take hours
     names = [n for n in SUBJECTS if args.only in (None, n) and (n != "sintel" or data)]
     if not names:
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(SUBJECTS)}")
@@ -209,8 +208,9 @@ def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCaptur
         if name == "sintel" and data:
             subject, head = (str(data / name / f) for f in ("sintel.npz", "sintel_head.obj"))
         for paths in args.paths:
+            label = f"masks-{name}-{paths}-of-{args.lights}"
             out[name, paths] = SimulatedCapture(
-                f"{label}-{name}-{paths}", rig, subject, head, spp=paths, seed=args.seed
+                label, rig, subject, head, spp=paths, seed=args.seed
             )
     return out
 
