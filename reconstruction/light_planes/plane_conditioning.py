@@ -83,7 +83,7 @@ def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigC
     and for a radius of 0 or less.
     """
     if not 0 < radius < np.inf:
-        raise ValueError(f"the sphere's radius must be over 0 m, got {radius:g}")
+        raise ValueError(f"a sphere needs radius > 0 m, got {radius:g}")
     if not rig.projectors:
         raise ValueError(f"rig {rig.name}: no projectors, so no planes of light to condition")
     points = dome_positions(4000, radius)

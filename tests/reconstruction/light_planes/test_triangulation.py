@@ -265,5 +265,5 @@ def test_the_demo_rig_is_well_conditioned() -> None:
     with pytest.raises(ValueError, match="no projectors"):
         condition(replace(rig, projectors=()))
     for radius in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="radius must be over 0 m"):
+        with pytest.raises(ValueError, match="a sphere needs radius > 0 m"):
             condition(rig, radius=radius)
