@@ -29,9 +29,9 @@ class Stage:
     """All who connect to the devices outside a capture go through here, one after the other.
 
     `lit()` says whether a capture has the devices now. Constructing connects to nothing; raises
-    `StageInUse` while another process on this machine has the stage, `take_over` says that one
-    on another machine has it no more. A blackout that could not be verified is latched (`latch`),
-    which is recorded in `audit`.
+    `RigError` for devices that cannot be, and `StageInUse` while another process on this machine
+    has the stage, `take_over` says that one on another machine has it no more. A blackout that
+    could not be verified is latched (`latch`), which is recorded in `audit`.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Stage:
         self._rig_file, self._audit, self._events, self._lit = rig_file, audit, events, lit
         self._ownership = None
         if rig_file.devices is not None:
-            self._ownership = Ownership(rig_file.devices.lights, root, take_over)
+            self._ownership = Ownership(self.devices.config.lights, root, take_over)
         self.latch = Latch(root / "unsafe.json")
         self._last: Blackout | None = None
         self._learning = threading.Lock()

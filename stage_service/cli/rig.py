@@ -25,11 +25,14 @@ def run_check(args: argparse.Namespace, output: Output) -> None:
     """
     from reconstruction.light_planes.plane_conditioning import condition
     from stage_service.config import load_rig_file
+    from stage_service.devices.device_set import DeviceSet
     from stage_service.plan.capture_plan import CapturePlan
     from stage_service.plan.resolved import resolve
 
     rig_file = load_rig_file(args.file)
     rig = rig_file.rig
+    if rig_file.devices is not None:
+        DeviceSet.of(rig_file)  # raises what a service would; connects to nothing
     data: dict[str, Any] = {
         "rig": rig.name,
         "cameras": len(rig.cameras),

@@ -11,6 +11,7 @@ from stage_service.config import (
     BaslerConfig,
     DevicesConfig,
     DmxConfig,
+    LightBankConfig,
     RigFile,
 )
 from stage_service.devices.cameras.basler import BaslerCamera
@@ -61,10 +62,10 @@ class DeviceSet:
             raise NoStage(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
         if not rig.lights:
             raise RigError(f"{rig_file.path}: no lights, but [devices.lights] has to drive some")
-        if isinstance(config.lights, DmxConfig):
-            lights: LightBank = DmxLightBank(config.lights, len(rig.lights))
-        else:
-            lights = ModbusLightBank(config.lights, len(rig.lights))
+        try:
+            lights = _light_bank(config.lights, len(rig.lights))
+        except RigError as error:
+            raise RigError(f"{rig_file.path}: {error}") from error
         if isinstance(config.cameras, BaslerConfig):
             cameras: list[CameraDevice] = [BaslerCamera(config.cameras, c) for c in rig.cameras]
         else:
@@ -171,6 +172,12 @@ class DeviceSet:
     def _all(self) -> tuple[Device, ...]:
         beams = (self.projectors,) if self.projectors is not None else ()
         return (self.lights, *beams, self.trigger, *self.cameras)
+
+
+def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
+    if isinstance(config, DmxConfig):
+        return DmxLightBank(config, lamps)
+    return ModbusLightBank(config, lamps)
 
 
 def _powers(rig_file: RigFile, config: DevicesConfig) -> tuple[PjLinkProjector, ...]:

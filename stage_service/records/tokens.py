@@ -30,7 +30,7 @@ SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 
 WAIT_S = 0.5
-"""How long a disk is waited for that does not say whose a token is: nobody is answered then."""
+"""How long everybody waits for a disk that does not say whose a token is."""
 
 
 class TokenError(ValueError):

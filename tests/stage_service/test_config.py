@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 
 from reconstruction.geometry.rig import RigError
+from stage_service.captures.manager import CaptureManager
+from stage_service.cli import main
 from stage_service.config import load_rig_file
 from stage_service.devices.device_set import DeviceSet
+from stage_service.records.lease import RootLock
 
 RIGS = Path(__file__).resolve().parents[2] / "stage_service" / "rigs"
 SMALL = """
@@ -57,6 +60,23 @@ def test_a_light_bank_of_no_lamps_is_refused_before_it_is_asked(tmp_path):
     (path := tmp_path / "rig.toml").write_text(SMALL)
     with pytest.raises(RigError, match=r"rig.toml: no lights"):
         DeviceSet.of(load_rig_file(path))
+
+
+def test_devices_that_cannot_be_are_refused_once_and_leave_the_root_to_others(tmp_path, capsys):
+    """By `rig check`, and as a service starts: before it has the stage, which it gave up with a
+    traceback."""
+    bad = tmp_path / "bad.toml"
+    text = (RIGS / "demo.toml").read_text()
+    assert text.count('kind = "modbus_tcp"') == 1
+    bad.write_text(
+        text.replace('kind = "modbus_tcp"', 'kind = "modbus_tcp"\nregisters = {levels = 900}')
+    )
+    assert main(["rig", "check", str(bad)]) == 3
+    told = f"{bad}: devices.lights.registers: selector lies over levels at 1000"
+    assert told in capsys.readouterr().err
+    with pytest.raises(RigError, match="selector lies over levels"):
+        CaptureManager(load_rig_file(bad), tmp_path / "root")
+    RootLock(tmp_path / "root").release()
 
 
 def changed(tmp_path: Path, old: str, new: str) -> Path:

@@ -372,7 +372,7 @@ class ModbusLightBank:
 def _check_apart(registers: LightRegisters, lamps: int) -> None:
     """Raise `RigError` where two holding registers share an address: the level of lamp 1000,
     written where the selector is, would be a command."""
-    many = {"levels": lamps, "owner": OWNER_WORDS, "table": 2}
+    many = {"levels": lamps, "owner": OWNER_WORDS, "table": 2 * TABLE_ENTRIES}
     found: dict[int, str] = {}
     for name in ("levels", "selector", "heartbeat", "watchdog", "sequence", "owner", "table"):
         first = getattr(registers, name)

@@ -197,8 +197,12 @@ def _captures(args: argparse.Namespace) -> dict[tuple[str, int], SimulatedCaptur
         framing = replace(FRAMINGS["curly"], rows=21, coarser=6)
         return {("curly", 16): subject_capture("curly", framing, args.cache, 0.0)}
     rig, data = rig_path("demo").read_text(), data_folder()
-    rig = rig.replace("lights = 331", f"lights = {args.lights}")
-    rig = rig.replace("busy_s = 3600.0", "busy_s = 86400.0")  # frames of 256 paths take hours
+    for old, new in (
+        ("lights = 331", f"lights = {args.lights}"),
+        ("busy_s = 3600.0", "busy_s = 86400.0"),  # frames of 256 paths take hours
+    ):
+        assert rig.count(old) == 1, f"the demo's rig has no {old!r}"
+        rig = rig.replace(old, new)
     names = [n for n in SUBJECTS if args.only in (None, n) and (n != "sintel" or data)]
     if not names:
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(SUBJECTS)}")

@@ -246,6 +246,7 @@ def test_more_lamps_than_a_universe_has_channels_are_refused(first, lamps):
         ({"heartbeat": 1002}, 331, "watchdog lies over heartbeat at 1002"),
         ({"owner": 990}, 331, "owner lies over selector at 1000"),
         ({"levels": 1990}, 331, "table lies over levels at 2000"),
+        ({"levels": 10_191}, 331, "table lies over levels at 10191"),  # the last of 4096 entries
     ],
 )
 def test_registers_that_lie_over_each_other_are_refused(registers, lamps, told):

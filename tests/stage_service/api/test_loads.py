@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any
 
 import httpx
@@ -212,7 +212,7 @@ def test_while_the_disk_hangs(rig_file, world, tmp_path, monkeypatch):
         assert time.monotonic() - start < manager_module.STOP_WITHIN_S
 
 
-class Slow(type(Path())):  # type: ignore[misc]
+class Slow(PosixPath):
     """A path on a disk that does not answer until it is `there`."""
 
     there = threading.Event()
