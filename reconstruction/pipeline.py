@@ -48,6 +48,7 @@ from reconstruction.masks import MaskedCapture, hair_masks, report_agreement, us
 from reconstruction.methods import METHODS, Method
 from reconstruction.model import Model
 from reconstruction.reconstruct_options import ReconstructOptions
+from reconstruction.report.progress import ToldReport, part_of
 from reconstruction.report.report import Progress, Report, Stage, silent
 from reconstruction.tangents.estimate import Measured, measure_tangents
 
@@ -57,6 +58,17 @@ HEAD_OF_HAIR = 100_000 * 40e-6
 LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
 FINE_PIXEL = 1e-3  # metres: line stereo finds next to nothing on pixels twice as wide
 SPACING = 2e-3  # metres between a strand's points as it is written
+
+_SEEN, _GROWN = ("envelope", "orientation"), ("field", "strands", "refinement", "roots")
+_LINES = ("lightcodes", "depth", "segments", "connection")
+STAGES: dict[str, tuple[str, ...]] = {
+    "light_planes": ("triangulation", "masks", *_SEEN, "surface", *_GROWN),
+    "fused": ("triangulation", "masks", *_SEEN, "surface", *_LINES, *_GROWN),
+    "photometric": ("triangulation", "masks", *_LINES, "strands"),
+    "lmvs": ("triangulation", "masks", *_LINES, "strands"),
+    "hull": ("masks", *_SEEN, *_GROWN),
+}
+"""What each method goes through, as far as it is known before: for the progress."""
 
 
 def reconstruct(
@@ -81,13 +93,16 @@ def reconstruct(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
-    stages = _Stages(model.create(), options, progress, Report())
+    expected = STAGES[method_for(capture) if method == "auto" else method]
+    report = ToldReport(progress, expected)
+    stages = _Stages(model.create(), options, report.progress, report)
     with frames_kept(capture, model.path) as kept:
         _run(stages, kept, method, motion)
-    if not any(stage.name == "head" for stage in stages.report.stages):
+    if not any(stage.name == "head" for stage in report.stages):
         model.remove("head.obj")  # an earlier reconstruction's: this one has the capture's, or none
-    model.write_report(stages.report)
-    return stages.report
+    model.write_report(report)
+    progress("strands reconstructed", 1.0)
+    return report
 
 
 def _run(stages: _Stages, capture: Capture, method: Method, motion: Motion | None) -> None:
@@ -200,7 +215,7 @@ class _Stages:
 
     def _triangulated(self, capture: Capture, motion: Motion | None, stage: Stage) -> PointCloud:
         tell, asked = self.progress, self.options.motion
-        peaks = sweep_peaks(capture, tell)
+        peaks = sweep_peaks(capture, part_of(tell, 0.0, 0.8))
         if motion is None:
             first = triangulate(capture, peaks=peaks, stage=(told := Stage(stage.name)))
             with self.report.stage("motion") as solving:
@@ -461,7 +476,7 @@ class _Stages:
             if why is not None:
                 stage.leave_out("refinement", why, "this stage; strands stay as they were grown")
                 return strands
-            self.progress("refining strands", 0.8)
+            self.progress("refining strands", 0.0)
             surfaces = [(camera, depths[camera.name]) for camera in cameras]
             strands, figures = refine(strands, lines, o, surfaces)
             stage.figures.update(figures)

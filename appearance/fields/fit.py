@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from appearance.fields.validation import GROUPS, Data, Folds, Verdict, cross_val
 from appearance.render.harmonics import harmonics
 from reconstruction import Progress, silent
 from reconstruction.arrays import Bools, Floats
+from reconstruction.report.progress import part_of
 
 MOST_CLAMPED = 0.01
 """Share of the samples that a modulation may make darker than black before they are left out."""
@@ -104,11 +104,6 @@ def fit_pictures(
     return _Fit(views, places, scale, options or FieldOptions(), monitor or Monitor()).run()
 
 
-def within(progress: Progress, first: float, part: float, what: str, share: float) -> None:
-    """Tell `progress` of a `share` of the `part` that begins at `first`."""
-    progress(what, first + part * share)
-
-
 class _Fit:
     def __init__(
         self,
@@ -181,13 +176,9 @@ class _Fit:
             checkpoint = self.monitor.checkpoint
             if checkpoint is not None and k:
                 checkpoint = checkpoint.with_name(f"{k}-{checkpoint.name}")
-            first, part = 0.3 + 0.6 * k / len(each), 0.6 / len(each)
-            verdict = cross_validated(
-                data,
-                self.folds,
-                checkpoint,
-                partial(within, self.monitor.progress, first, part),
-            )
+            first, last = (0.3 + 0.6 * i / len(each) for i in (k, k + 1))
+            tell = part_of(self.monitor.progress, first, last)
+            verdict = cross_validated(data, self.folds, checkpoint, tell)
             found.append((verdict, data))
         best, self.data = max(found, key=lambda one: one[0].gain[0])
         return best

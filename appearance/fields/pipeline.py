@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from appearance.bsdf.maps import MappedStrands
 from appearance.fields.anchors import Grid, Places
-from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures, within
+from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures
 from appearance.fields.hits import RECORD, HitOptions, find_hits
 from appearance.fields.options import FieldRequest, Kind
 from appearance.fields.pictures import Pictures
@@ -28,6 +27,7 @@ from appearance.scene.hair_scene import HairScene
 from reconstruction import Capture, Light, Model, ModelError, Progress
 from reconstruction.arrays import Floats, Ints
 from reconstruction.files.durable import writing
+from reconstruction.report.progress import part_of
 from reconstruction.report.report import free_memory
 
 
@@ -92,8 +92,8 @@ def fit_field(
     places, fits = Places.of(rendered.mapped.root_uv), []
     for k, kind in enumerate(kinds):
         options = replace(request.fit, kind=kind, beta_m=rendered.beta_m)
-        first, part = 0.7 + 0.3 * k / len(kinds), 0.3 / len(kinds)
-        monitor = Monitor(partial(within, progress, first, part), folder / f"{kind}.checkpoint.npz")
+        first, last = (0.7 + 0.3 * i / len(kinds) for i in (k, k + 1))
+        monitor = Monitor(part_of(progress, first, last), folder / f"{kind}.checkpoint.npz")
         fits.append(fit_pictures(views, places, rendered.scale, options, monitor))
     return better(fits)
 

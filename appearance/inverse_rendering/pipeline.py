@@ -26,6 +26,7 @@ from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, Strands, silent
 from reconstruction.arrays import Array
+from reconstruction.report.progress import part_of
 from reconstruction.report.report import Series, free_memory, resident_memory
 
 FILES = "hair_maps.npz", LIGHTS_FILE
@@ -213,14 +214,10 @@ class _Fit:
         options: InverseRenderingOptions,
         maps: HairMaps,
         lights: LightDeviations | None,
-        part: tuple[float, float],
+        share: tuple[float, float],
     ) -> Outcome:
-        """Fit from `maps` and `lights`; `part` is what it is of the progress."""
-        begin, end = part
-        monitor = Monitor(
-            lambda what, share: self.progress(what, begin + (end - begin) * share),
-            self.model.checkpoint(options.variant),
-        )
+        """Fit from `maps` and `lights`; `share` is what it is of the progress."""
+        monitor = Monitor(part_of(self.progress, *share), self.model.checkpoint(options.variant))
         outcome = run(self.problem, maps, lights, options=options, monitor=monitor, seed=self.seed)
         measured = "weighted mean squared difference, noise taken off"
         series = Series(f"inverse rendering, {options.variant}", measured)

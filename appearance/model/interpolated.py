@@ -36,6 +36,7 @@ from reconstruction import (
 )
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats
 from reconstruction.options import options
+from reconstruction.report.progress import part_of
 
 ROWS = 16
 """Rows of what an environment map becomes, one far light from each cell: 11°, as the lamps of a
@@ -90,7 +91,7 @@ def interpolation_of(
     }
     folder = model.file("samples")
     exposure = fitted.appearance.exposure.scale
-    field = gather(training, masks, exposure, folder=folder, progress=progress)
+    field = gather(training, masks, exposure, folder=folder, progress=part_of(progress, 0.0, 0.5))
     if not field.views:
         raise ModelError(f"{model}: the hair masks of the cameras are all empty")
     scene = fitted.scene()
@@ -106,10 +107,10 @@ def interpolation_of(
         stage.warn("too few lights to leave one out: standard interpolation")
         return found
     names = [field.lights[int((i + 0.5) * count / most)].name for i in range(most)]
-    search = searched(found, names, progress=progress)
+    search = searched(found, names, progress=part_of(progress, 0.5, 0.8))
     search.tell(stage)
     found = replace(found, model=search.best)
-    return refined(found, progress) if options.refine else found
+    return refined(found, part_of(progress, 0.8, 1.0)) if options.refine else found
 
 
 @dataclass(frozen=True, eq=False)

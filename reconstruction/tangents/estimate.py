@@ -148,7 +148,7 @@ def measure_tangents(
     scores = np.zeros((len(points), CANDIDATES), np.float32)
     evidences, observations, left_out = [], [], Saturation()
     for k, camera in enumerate(cameras):  # one's frames at a time: they are what takes memory
-        progress("texture", k / len(cameras))
+        progress("texture", 0.6 * k / len(cameras))
         mask = masked.masks[camera.name].hair
         answers = read_answers(capture, camera, names)
         left_out.add(answers, mask)
@@ -168,7 +168,7 @@ def measure_tangents(
             "the second half of this stage; directions come from texture alone",
         )
     else:
-        progress("reflection", 0.0)
+        progress("reflection", 0.6)
         near = pool(points, options.reflection_radius, options.neighbours)
         texture_only, scores = tangents, near @ scores
         for _ in range(ROUNDS):

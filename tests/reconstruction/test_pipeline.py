@@ -97,9 +97,18 @@ def unswept(shoot: Callable[..., Capture], around: list[Camera]) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def model(unswept: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
+def told() -> list[tuple[str, float]]:
+    """What the progress of `model` said."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def model(
+    unswept: Capture, tmp_path_factory: pytest.TempPathFactory, told: list[tuple[str, float]]
+) -> tuple[Path, Report]:
     folder = tmp_path_factory.mktemp("model")
-    return folder, reconstruct(unswept, Model(folder), options=QUICK)
+    tell = lambda *args: told.append(args)  # noqa: E731
+    return folder, reconstruct(unswept, Model(folder), options=QUICK, progress=tell)
 
 
 def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera]) -> None:
@@ -132,6 +141,18 @@ def runs_down(strands: Strands, within_deg: float = 7, mostly: float = 0.8) -> N
     turned = np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))
     assert np.median(turned) < within_deg
     assert (turned < 20).mean() > mostly
+
+
+def test_the_progress_of_all_stages_goes_from_nothing_to_all_once(
+    model: tuple[Path, Report], told: list[tuple[str, float]]
+) -> None:
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0, 1)
+    names = [s.name for s in model[1].stages]
+    assert [what for what, _ in told if what in names] == names
+    begun = dict(reversed(told))  # where each was told of first
+    assert 0.1 < begun["orientation"] < begun["strands"] < begun["refinement"] < 0.9
 
 
 def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:

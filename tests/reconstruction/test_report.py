@@ -11,6 +11,7 @@ import pytest
 
 from reconstruction import Report, Stage, silent
 from reconstruction.report.plots import plot_geometry, plot_report
+from reconstruction.report.progress import ToldReport
 from reconstruction.report.report import LeftOut, Series
 
 
@@ -51,6 +52,19 @@ def test_a_stage_that_fails_is_timed_too() -> None:
     with pytest.raises(RuntimeError, match="boom"):
         fail()
     assert 0.02 <= report["a"].seconds < 1
+
+
+def test_a_stage_that_was_not_expected_or_does_not_come_takes_no_progress_back() -> None:
+    told: list[float] = []
+    report = ToldReport(lambda _, share: told.append(share), ["masks", "depth", "field", "roots"])
+    for name in ("masks", "lightcodes", "field", "roots"):
+        with report.stage(name):
+            for share in (0.5, 0.2, 1.0):
+                report.progress("doing it", share)
+    assert told == sorted(told)
+    ends = told[3::4]
+    assert all(np.diff([0, *ends]) > 0)
+    assert ends[-1] == 1
 
 
 def test_read_back(report: Report, tmp_path: Path) -> None:

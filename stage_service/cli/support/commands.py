@@ -98,14 +98,16 @@ def progress_bar(title: str) -> Iterator[Progress]:
 
 
 def _lines(title: str) -> Progress:
-    last = [float("-inf")]
+    told, at = float("-inf"), 0.0
 
     def show(what: str, share: float) -> None:
+        nonlocal told, at
         now = time.monotonic()
-        if now - last[0] >= LINE_EVERY_S or share >= 1:
+        if now - told >= LINE_EVERY_S or share >= 1 > at:
             per_cent = math.floor(100 * share)  # 100 is the end
             print(f"{title}: {per_cent:3d}% {what}", file=sys.stderr, flush=True)
-            last[0] = now if share < 1 else float("inf")
+            told = now
+        at = share
 
     return show
 

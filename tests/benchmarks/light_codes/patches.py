@@ -83,7 +83,7 @@ def run_patch(
     `thinner` also runs `photometric` with fewer cameras and with fewer lights, and `study`. Models
     are left in `OUT/<method>`, figures in `OUT/patch.json` as they come.
     """
-    folder, truth_folder = here.capture.make(cache, progress)
+    folder, truth_folder = here.capture.make(cache, within(progress, "capture", 0.0, 0.4))
     capture = Capture(folder)
     write_hair_masks(capture, truth_folder)
     truth = StrandTruth(capture, truth_folder, here.ball, samples)
@@ -95,11 +95,11 @@ def run_patch(
         for n in LIGHTS:
             runs.append((f"photometric, {n} lights", "photometric", part_of(capture, lights=n)))
     results: dict[str, Any] = {"variants": {}}
-    part = 1 / (len(runs) + 1)
+    part = 0.6 / (len(runs) + 1)
     for k, (name, method, some) in enumerate(runs):
         model = Model(out / name.replace(", ", "_").replace(" ", "_"))
         begin = time.perf_counter(), time.process_time()
-        tell = within(progress, name, k * part, part)
+        tell = within(progress, name, 0.4 + k * part, part)
         report = reconstruct(some, model, method=method, options=options, progress=tell)
         results["variants"][name] = {
             **truth.score(model.strands()),

@@ -33,7 +33,12 @@ from simulators.subject.grooms import GROOMS
 from stage_service.cli import build_parser, main
 from stage_service.cli.stage.processes import SUBJECTS
 from stage_service.cli.support.children import Children
-from stage_service.cli.support.commands import CommandError, rig_path, run_command
+from stage_service.cli.support.commands import (
+    CommandError,
+    progress_bar,
+    rig_path,
+    run_command,
+)
 
 RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 
@@ -68,6 +73,14 @@ def test_every_command_says_what_it_does_and_speaks_json():
         assert len(parser.description or "") > 12, name
         assert len(parser.format_help().splitlines()) > 5, name
         assert "(default: None)" not in parser.format_help(), name
+
+
+def test_where_no_terminal_is_a_line_says_each_end_that_is_reached(capsys):
+    with progress_bar("bench") as progress:
+        for what, share in [("one", 0.0), ("one", 1.0), ("one", 1.0), ("two", 0.5), ("two", 1.0)]:
+            progress(what, share)
+    told = capsys.readouterr().err.splitlines()
+    assert told == ["bench:   0% one", "bench: 100% one", "bench: 100% two"]
 
 
 def test_the_version_is_told(capsys):
