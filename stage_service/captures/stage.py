@@ -25,6 +25,23 @@ def unknown(detail: str, latched: str | None) -> dict[str, Any]:
     return {**state, "latched": latched, "accepted": False}
 
 
+def put_off(rig_file: RigFile, root: Path, *, take_over: bool = False) -> str:
+    """Put a stage off whose service cannot have its `root`; what came of it, in words.
+
+    Raises `StageInUse`, and touches nothing, where another service has the stage.
+    """
+    if rig_file.devices is None:
+        return "the rig file names no devices"
+    devices = DeviceSet.of(rig_file)
+    ownership = Ownership(devices.config.lights, root, take_over)
+    try:
+        ownership.claim(devices.lights)
+        return blackout(devices, attempts=1).detail
+    finally:
+        devices.close()
+        ownership.release(devices.lights)
+
+
 class Stage:
     """All who connect to the devices outside a capture go through here, one after the other.
 

@@ -90,8 +90,10 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     """
     log_to_stderr(args.log_json)
     from stage_service.api.app import Endpoint, serve
+    from stage_service.captures.stage import put_off
     from stage_service.config import load_rig_file
     from stage_service.devices.ownership import StageInUse
+    from stage_service.records.lease import RootInUse
     from stage_service.service import Service
 
     exit_on_sigterm()
@@ -119,6 +121,14 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
         service.take_stage()
     except StageInUse as error:
         raise CommandError(str(error), UNREACHABLE, "StageInUse") from error
+    except RootInUse:
+        raise
+    except OSError as error:  # a disk that went read-only, say: lamps may be on all the same
+        off = put_off(rig_file, args.root, take_over=args.take_over)
+        raise CommandError(
+            f"--root {args.root}: {error}. There can be no service without it. Lamps and "
+            f"projectors, put off at once: {off}"
+        ) from error
 
     def ready(url: str) -> None:
         text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"

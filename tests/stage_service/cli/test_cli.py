@@ -39,6 +39,7 @@ from stage_service.cli.support.commands import (
     rig_path,
     run_command,
 )
+from stage_service.records.lease import RootLock
 
 RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 
@@ -598,6 +599,27 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
         assert code == 3
         assert str(file) in data["error"]["detail"]
         assert said in data["error"]["detail"]
+
+
+def test_lamps_are_put_off_where_the_service_cannot_have_its_root(
+    capsys, rig_file, world, tmp_path
+):
+    (tmp_path / "file").touch()
+    world.lit, world.show = {1, 2}, "ON 65535"
+    code, data = run(
+        capsys, "serve", "--rig", rig_file.path, "--root", tmp_path / "file" / "root", "--port", "0"
+    )
+    assert (code, world.lit, world.show) == (1, set(), "OFF")
+    assert "Not a directory" in data["error"]["detail"]
+    assert "every lamp and projector was read back dark" in data["error"]["detail"]
+    world.lit = {1, 2}  # that root has a service already: what it does with the stage is its own
+    lock = RootLock(tmp_path)
+    try:
+        code, data = run(capsys, "serve", "--rig", rig_file.path, "--root", tmp_path, "--port", "0")
+    finally:
+        lock.release()
+    assert (code, world.lit) == (3, {1, 2})
+    assert "is in use by the service" in data["error"]["detail"]
 
 
 def test_a_service_from_the_command_line(capsys, rig_file, world, tmp_path):
