@@ -129,7 +129,7 @@ class Roughness:
         if d is not None and d.degrees >= d.most:
             said.append(
                 "pixels beside each other differ by more than strands turned by "
-                f"{d.most:g}° do: β_M {self.beta_m:.2g} may be too large"
+                f"{d.most:g}° do, the most that are told apart: β_M {self.beta_m:.2g} is uncertain"
             )
         if self.misfit > WORST_MISFIT:
             said.append(
