@@ -250,13 +250,14 @@ class Import:
             masks=self._undistorted(masks), head=self.head,
             subjects=self._undistorted(subjects),
         )  # fmt: skip
-        frames = [(s, c) for s in self.found.steps for c in self.shot]
+        frames, light = [(s, c) for s in self.found.steps for c in self.shot], False
         try:
             if self.scalp is not None:
                 write_whole(out / "scalp.obj", self.scalp.encode())
             for k, (step, camera) in enumerate(frames):
                 if bracket := self.found.frames.get((step.index, camera)):
                     merged = self.frame(bracket, camera)
+                    light |= step.kind != "dark" and bool((merged.radiance > 0).any())
                     plate = self.found.plates.get((step.light, camera))
                     if plate is not None and step.kind == "olat" and camera in subjects:
                         behind = ~subjects[camera][..., None] * self.frame(plate, camera).radiance
@@ -267,6 +268,11 @@ class Import:
                 else:
                     writer.record_missing(step, camera, reason="no file is called after it")
                 progress("importing pictures", (k + 1) / len(frames))
+            if not light:
+                raise ImportProblem(
+                    f"{self.folder}: no pixel of any picture is above black: are these the right "
+                    "files, and is `black` right?"
+                )
             writer.finish("completed", {"imported_from": self.folder.name})
         except BaseException:
             writer.close()

@@ -23,23 +23,23 @@ class OtherChannels(ValueError):
 def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
     """Read R, G and B `(H, W, 3)` and the header attributes that `write_exr` was given.
 
-    Raises `ValueError` that names the file when it is missing, broken or not RGB.
+    Luminance alone (Y) is grey. Raises `ValueError` that names the file when it is missing, broken
+    or has other channels.
     """
     try:
-        file = OpenEXR.File(str(path))
-        channels = file.channels()
-        together = channels["RGB"] if "RGB" in channels else channels["RGBA"]
-        pixels = together.pixels[..., :3]
-    except KeyError:
-        there = ", ".join(sorted(channels))
-        raise OtherChannels(
-            f"{path}: expected the channels R, G and B, there are {there}: write the picture "
-            "alone, as RGB, without layers"
-        ) from None
+        file = OpenEXR.File(str(path), separate_channels=True)  # or those of other types fail
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # the binding raises bare RuntimeError and MemoryError alike
         raise ValueError(f"{path}: cannot be read as OpenEXR ({error})") from error
+    colours = "YYY" if set(channels) - {"A"} == {"Y"} else "RGB"
+    if not set(colours) <= set(channels) or len({channels[c].shape for c in colours}) > 1:
+        there = ", ".join(sorted(channels))
+        raise OtherChannels(
+            f"{path}: expected the channels R, G and B of one size, there are {there}: write the "
+            "picture alone, as RGB, without layers"
+        )
     attributes = {k: v for k, v in file.header().items() if isinstance(v, float | str)}
-    return np.ascontiguousarray(pixels, dtype=np.float32), attributes
+    return np.stack([channels[c] for c in colours], axis=-1, dtype=np.float32), attributes
 
 
 def write_exr(

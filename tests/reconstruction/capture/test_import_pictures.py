@@ -160,6 +160,29 @@ def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
     assert "copy it anew" not in str(told.value)
 
 
+def test_an_exr_of_grey_or_of_channels_of_several_types_is_read(tmp_path):
+    path, light = tmp_path / "a.exr", light_of(0, 0)
+    red, green, blue = (light[..., k].copy() for k in range(3))
+    half = red.astype(np.float16)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for channels, expected in (
+        ({"Y": green}, [green] * 3),
+        ({"Y": green, "A": np.ones_like(green)}, [green] * 3),
+        ({"R": half, "G": green, "B": blue}, [half, green, blue]),
+        ({"R": red, "G": green, "B": blue, "A": half}, [red, green, blue]),
+    ):
+        OpenEXR.File(header, channels).write(str(path))
+        found = read_picture(path, Sensor(), (SIZE, SIZE))
+        np.testing.assert_array_equal(found.light, np.stack(expected, axis=-1))
+
+
+def test_pictures_without_light_are_refused(folder, tmp_path):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"light_{n:03d}.png", 0 * x, np.uint8))
+    with pytest.raises(ImportProblem, match="no pixel of any picture is above black"):
+        import_folder(folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_camera_whose_folder_is_a_link_has_its_pictures(folder, tmp_path):
     """They lie on another disk; all its frames were missing. Links to what holds them end, and
     those beside a folder do not take its place."""
