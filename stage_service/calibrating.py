@@ -150,12 +150,15 @@ class Calibrating:
         with self._lock:
             if self._process is not process:  # it was ended, by the next one or by the service
                 return
-            if process.returncode == 0:
-                for suffix in (".report.json", ".json"):
-                    made.with_suffix(suffix).replace(self.rig.with_suffix(suffix))
-                update: dict[str, Any] = {"state": "done"}
-            else:
-                update = {"state": "failed", "error": self._why(answer)}
+            update: dict[str, Any] = {"state": "done"}
+            try:
+                if process.returncode != 0:
+                    update = {"state": "failed", "error": self._why(answer)}
+                else:
+                    for suffix in (".report.json", ".json"):
+                        made.with_suffix(suffix).replace(self.rig.with_suffix(suffix))
+            except OSError as error:  # of the disk: the rig that was there is what there is
+                update = {"state": "failed", "error": str(error)}
             self._view = self._view.model_copy(update=update)
         self._events.publish("calibration.state", {"state": update["state"]})
 

@@ -18,7 +18,10 @@ from waiting import gone, orphan, until
 from reconstruction import Camera, Light, Rig, Step
 from reconstruction.calibration.boards import Board
 from simulators.subject.props import PropResponder, board_pose
+from stage_service.calibrating import Calibrating
 from stage_service.config import load_rig_file
+from stage_service.records.events import EventLog
+from stage_service.service_models import CalibrationRequest
 
 BOARD = Board()
 STEPS = [Step(0, "dark", 0.02, 0.0), Step(1, "all_on", 0.02, 0.5)]
@@ -114,6 +117,17 @@ def test_the_rig_that_comes_of_it_and_why_none_does(truth, http, tmp_path):
     view = until(lambda: v if (v := ask.get("/calibration").json())["state"] == "failed" else None)
     assert "cam_0: sees 8 or more corners of the board in 1" in view["error"]
     assert view["rig"], "that of before is still there"
+
+
+def test_one_whose_rig_cannot_be_put_in_its_place_has_failed(nominal, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.executable", "/bin/true")  # ends well, and leaves nothing behind
+    (tmp_path / "nominal.json").write_text(json.dumps(nominal.to_dict()))
+    rig_file = load_rig_file(tmp_path / "nominal.json")
+    one = Calibrating(tmp_path / "calibration", rig_file, EventLog())
+    one.begin(CalibrationRequest(boards=["pose"]), lambda _: tmp_path)
+    until(lambda: one.view().state != "running")
+    assert one.view().state == "failed"
+    assert "next.report.json" in (one.view().error or "")
 
 
 def test_one_that_runs_ends_with_a_service_that_is_killed(nominal, tmp_path):
