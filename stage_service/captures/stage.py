@@ -14,7 +14,7 @@ from stage_service.captures.latch import Latch
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.last_seen import LastSeen
-from stage_service.devices.ownership import Ownership
+from stage_service.devices.ownership import Ownership, StageInUse
 from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
 
@@ -28,15 +28,20 @@ def unknown(detail: str, latched: str | None) -> dict[str, Any]:
 def put_off(rig_file: RigFile, root: Path, *, take_over: bool = False) -> str:
     """Put a stage off whose service cannot have its `root`; what came of it, in words.
 
-    Raises `StageInUse`, and touches nothing, where another service has the stage.
+    Touches nothing where another service has the stage.
     """
     if rig_file.devices is None:
         return "the rig file names no devices"
     devices = DeviceSet.of(rig_file)
-    ownership = Ownership(devices.config.lights, root, take_over)
+    try:
+        ownership = Ownership(devices.config.lights, root, take_over)
+    except StageInUse as error:
+        return f"left as they are: {error}"
     try:
         ownership.claim(devices.lights)
         return blackout(devices, attempts=1).detail
+    except StageInUse as error:
+        return f"left as they are: {error}"
     finally:
         devices.close()
         ownership.release(devices.lights)

@@ -107,7 +107,10 @@ def model(
     unswept: Capture, tmp_path_factory: pytest.TempPathFactory, told: list[tuple[str, float]]
 ) -> tuple[Path, Report]:
     folder = tmp_path_factory.mktemp("model")
-    tell = lambda *args: told.append(args)  # noqa: E731
+
+    def tell(what: str, share: float) -> None:
+        told.append((what, share))
+
     return folder, reconstruct(unswept, Model(folder), options=QUICK, progress=tell)
 
 

@@ -126,8 +126,8 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     except OSError as error:  # a disk that went read-only, say: lamps may be on all the same
         off = put_off(rig_file, args.root, take_over=args.take_over)
         raise CommandError(
-            f"--root {args.root}: {error}. There can be no service without it. Lamps and "
-            f"projectors, put off at once: {off}"
+            f"--root {args.root}: {error}: give another, or free this one. As no service can run, "
+            f"lamps and projectors were to be put off: {off}"
         ) from error
 
     def ready(url: str) -> None:

@@ -39,6 +39,7 @@ from stage_service.cli.support.commands import (
     rig_path,
     run_command,
 )
+from stage_service.devices.ownership import Ownership
 from stage_service.records.lease import RootLock
 
 RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
@@ -612,6 +613,17 @@ def test_lamps_are_put_off_where_the_service_cannot_have_its_root(
     assert (code, world.lit, world.show) == (1, set(), "OFF")
     assert "Not a directory" in data["error"]["detail"]
     assert "every lamp and projector was read back dark" in data["error"]["detail"]
+    world.lit = {1, 2}
+    other = Ownership(rig_file.devices.lights, tmp_path / "other")
+    try:
+        code, data = run(
+            capsys, "serve", "--rig", rig_file.path, "--root", tmp_path / "file" / "root"
+        )
+    finally:
+        other._lock.release()
+    assert (code, world.lit) == (1, {1, 2})
+    assert "left as they are" in data["error"]["detail"]
+    assert "held by" in data["error"]["detail"]
     world.lit = {1, 2}  # that root has a service already: what it does with the stage is its own
     lock = RootLock(tmp_path)
     try:
