@@ -66,6 +66,7 @@ class Sequencer:
     ) -> None:
         self.devices = devices
         self.error: str | None = None
+        self.trouble: str | None = None  # what does not answer while the run is paused
         self.faults: list[str] = []  # the names of devices that failed
         self.by_device: defaultdict[str, Counter[str]] = defaultdict(Counter)
         for camera in devices.cameras:
@@ -413,13 +414,25 @@ class Sequencer:
         with self._changed:
             if self.state == "pausing":
                 self._move("hold")
-            self._changed.wait_for(lambda: self._abort_asked or not self._pause_asked)
+            while not self._changed.wait_for(
+                lambda: self._abort_asked or not self._pause_asked, self.devices.config.heartbeat_s
+            ):
+                self._say_trouble(beats)
+            self.trouble = None
         if self._abort_asked:
             raise Cancelled("aborted while paused")
         check_interlocks(self.devices)
         with self._changed:
             if self.state == "paused":
                 self._move("resume")
+
+    def _say_trouble(self, beats: Sequence[Heartbeat]) -> None:
+        """Tell of a device that no longer answers, or answers again; resuming fails meanwhile."""
+        failed = [str(beat.error).rstrip(".") for beat in beats if beat.error]
+        now = f"{'; '.join(failed)}. Mend it before you resume." if failed else None
+        told, self.trouble = self.trouble, now
+        if (told is None) != (self.trouble is None):
+            self._say_state()
 
     def _black_out(self) -> None:
         self.blackout = blackout(self.devices)
@@ -443,5 +456,8 @@ class Sequencer:
     def _move(self, action: str) -> None:
         with self._changed:
             self._machine.do(action)
-        state = {"state": self.state, "outcome": self.outcome, "error": self.error}
+        self._say_state()
+
+    def _say_state(self) -> None:
+        state = {"state": self.state, "outcome": self.outcome, "error": self.error or self.trouble}
         self._notify("capture.state", state)

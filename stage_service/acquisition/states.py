@@ -105,6 +105,7 @@ class Progress(BaseModel):
 class CaptureStatus(BaseModel):
     """One capture: `state` says where it is, `outcome` how it ended (None while it is not done).
 
+    `error` is what went wrong; while it is paused, which device does not answer.
     `step` counts steps done of `steps`; `frames_missing` counts frames given up after all
     retries; `request` is what was given to `CaptureManager.start` as `extra`; `progress` is there
     while it is shot.

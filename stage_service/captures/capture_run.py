@@ -58,7 +58,7 @@ class CaptureRun:
             update={
                 "state": sequencer.state,
                 "outcome": sequencer.outcome if sequencer.state == "done" else None,
-                "error": sequencer.error,
+                "error": sequencer.error or sequencer.trouble,
                 "step": progress.step,
                 "progress": None if sequencer.state == "done" else progress,
                 "frames_written": written,

@@ -12,15 +12,16 @@ from stage_service.devices.projectors.interface import ProjectorController
 class Heartbeat:
     """A context in which the device gets a heartbeat every `interval_s` seconds.
 
-    One failed beat is tried again at the next; `check` raises it as long as the newest failed. Each
-    device needs its own: one that does not answer must not keep the others waiting.
+    One failed beat is tried again at the next; `error` is the newest's, None where it did not fail,
+    and `check` raises it. Each device needs its own: one that does not answer must not keep the
+    others waiting.
     """
 
     def __init__(self, device: LightBank | ProjectorController, interval_s: float) -> None:
         self._device = device
         self._interval = interval_s
         self._stop = threading.Event()
-        self._error: Exception | None = None
+        self.error: Exception | None = None
         name = f"heartbeat of {device.name}"
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
@@ -35,13 +36,13 @@ class Heartbeat:
 
     def check(self) -> None:
         """Raise the newest beat's error, if it failed."""
-        if self._error is not None:
-            raise self._error
+        if self.error is not None:
+            raise self.error
 
     def _run(self) -> None:
         while not self._stop.wait(self._interval):
             try:
                 self._device.heartbeat()
-                self._error = None
+                self.error = None
             except Exception as error:  # whatever it is, the thread goes on and `check` tells
-                self._error = error
+                self.error = error

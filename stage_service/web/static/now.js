@@ -109,7 +109,7 @@ export function open(view) {
     if (busy()) {
       word.className = "big";
       say(word, { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" }[c.state]);
-      say(said, SAID[c.state]);
+      say(said, SAID[c.state], c.error ? h("b.bad", ` ${c.error}`) : "");
       return;
     }
     const { headline: text, tone } = lampWords(S.health);

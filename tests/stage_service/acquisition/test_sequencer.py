@@ -194,6 +194,31 @@ def test_pause_is_dark_and_resume_goes_on(rig_file, world, tmp_path):
     assert seen == [(True, 4)]
 
 
+def test_while_paused_a_bank_that_dies_is_told_and_one_that_is_mended_goes_on(
+    rig_file, world, tmp_path
+):
+    told: list[str | None] = []
+    run = sequencer(rig_file, tmp_path / "c")
+
+    def notify(kind: str, data: dict[str, Any]) -> None:
+        if kind == "capture.step" and data["steps_done"] == 4:
+            run.pause()
+        if kind == "capture.state" and data["state"] == "paused":
+            told.append(data["error"])
+            world.deaf_lights = len(told) == 1
+            if len(told) == 3:
+                run.resume()
+
+    run._notify = notify
+    assert run.run() == "completed"
+    assert [text is not None for text in told] == [False, True, False]
+    assert told[1] is not None
+    assert told[1].startswith("light bank")
+    assert told[1].endswith("off. Mend it before you resume.")
+    assert run.error is None
+    assert verify(tmp_path / "c") == []
+
+
 def test_abort_keeps_what_is_finished_and_reopening_shoots_the_rest(rig_file, world, tmp_path):
     run = sequencer(rig_file, tmp_path / "c")
     run._notify = lambda kind, data: run.abort() if data.get("steps_done") == 5 else None

@@ -102,11 +102,11 @@ def test_heartbeats_come_while_it_runs_and_trouble_is_kept(stage, world, monkeyp
             raise DeviceUnreachable("bank", "beating", expected="a", received="b", todo="c")
 
         monkeypatch.setattr(stage.lights, "heartbeat", unreachable)
-        until(lambda: heartbeat._error is not None)
+        until(lambda: heartbeat.error is not None)
         with pytest.raises(DeviceUnreachable, match="beating"):
             heartbeat.check()
         monkeypatch.undo()
-        until(lambda: heartbeat._error is None)
+        until(lambda: heartbeat.error is None)
     seen = world.heartbeats
     assert threading.Event().wait(0.05) is False
     assert world.heartbeats == seen

@@ -431,6 +431,28 @@ def test_a_page_that_is_opened_in_a_pause_shows_the_capture_that_is_paused(conso
     until(lambda: http.service.capture(older).outcome == "aborted")
 
 
+def test_a_bank_that_dies_in_a_pause_is_told_and_one_that_is_mended_goes_on(
+    rig_file, world, tmp_path, browser
+):
+    with serving(rig_file, tmp_path / "root") as http:
+        pages = Pages(browser, str(http.base_url).rstrip("/"))
+        id_ = http.post("/captures", json={"plan": PACED}).json()["id"]
+        page = pages.open()
+        page.click("button:text-is('Pause')")
+        says(page, "Paused")
+        world.deaf_lights = True
+        page.wait_for_selector(".said b.bad:has-text('Mend it before you resume.')")
+        assert "light bank" in http.get(f"/captures/{id_}").json()["error"]
+        world.deaf_lights = False
+        page.wait_for_selector(".said b.bad", state="detached")
+        page.click("button:text-is('Resume')")
+        says(page, "Shooting")
+        page.keyboard.press("F8")
+        says(page, "Dark, verified")
+        pages.close()
+    assert pages.complaints == []
+
+
 def test_a_question_that_is_lost_is_asked_again(console):
     _, pages = console()
     page = pages.open()
