@@ -41,8 +41,8 @@ class SurfaceOptions:
     """
 
     apart: float = 1.25e-3
-    step: float = 0.4
-    spacing: float = 0.4
+    step: float = 0.7
+    spacing: float = 0.6
     longest: float = 0.3
     shortest: float = 2.4
     smooth: float = 1.0

@@ -41,7 +41,7 @@ pictures would take hours."""
 SEGMENT_WEIGHT = 4.0
 """Of a segment's confidence, in an orientation field that it shares with measured tangents."""
 
-TRACING = SurfaceOptions(apart=6e-4, step=0.7, spacing=0.6, shortest=5.0, smooth=2.0)
+TRACING = SurfaceOptions(apart=6e-4, shortest=5.0, smooth=2.0)
 
 
 def build_views(
