@@ -22,7 +22,6 @@ from reconstruction.files.exr import read_exr, write_exr
 from reconstruction.report.report import Progress, silent
 
 ATTRIBUTES = ("exposureTime", "fullScale", "countScale")
-_NAMES = (".exr", ".zip.exr")
 POLL_S = 0.2
 TOGETHER = 4
 """Frames that are compressed at the same time: while one waits for the disk, others go on."""
@@ -71,8 +70,14 @@ def _compress(
     capture: Capture, records: Sequence[FrameRecord], journal: FileIO, pool: ThreadPoolExecutor
 ) -> int:
     """Compress some frames, or end what a crash interrupted; returns the bytes saved."""
-    files = [(r, *(capture.file_of(r).with_name(r.camera + s) for s in _NAMES)) for r in records]
-    todo = [(r, old, new) for r, old, new in files if capture.file_of(r) != new]
+    todo: list[tuple[FrameRecord, Path, Path]] = []
+    for record in records:
+        current = capture.file_of(record)
+        old, new = (current.with_name(record.camera + s) for s in (".exr", ".zip.exr"))
+        if current == new:
+            old.unlink(missing_ok=True)
+        else:
+            todo.append((record, old, new))
     size = sum(old.stat().st_size for _, old, _ in todo)
     require_free(capture.path, size, reserve=0)  # less is needed soon
     running = [pool.submit(_compressed, capture, *each) for each in todo]
@@ -85,8 +90,8 @@ def _compress(
         raise
     append_lines(journal, made)
     saved = size - sum(new.stat().st_size for _, _, new in todo)
-    for _, old, _ in files:
-        old.unlink(missing_ok=True)
+    for _, old, _ in todo:
+        old.unlink()
     return saved
 
 
