@@ -32,9 +32,9 @@ def compress(path: str | Path, progress: Progress = silent) -> int:
 
     `TOGETHER` frames at a time get new names, then journal lines, and only then are the old files
     removed, so a crash leaves the capture whole; run it again to go on, and to remove what the
-    crash left over.
-    Waits while somebody else writes or compresses the capture. Raises `CaptureError` for a frame
-    whose checksum is wrong (compression must not make damage look sound), `DiskFull`.
+    crash left over. Waits while somebody else writes or compresses the capture. Raises
+    `CaptureError` for a frame whose checksum is wrong (compression must not make damage look
+    sound), `DiskFull`.
     """
     path = Path(path)
     _finished(path)

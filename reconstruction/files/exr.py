@@ -29,8 +29,10 @@ def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
     """
     try:
         with suppress(Exception):  # what else there is, is told below, or read
-            file = OpenEXR.File(str(path))  # twice as fast; channels of several types fail
-            return file.channels()["RGB"].pixels.astype(np.float32, copy=False), _own(file)
+            file = OpenEXR.File(str(path))  # faster; channels of several types fail
+            found = file.channels()
+            pixels = found["RGBA" if "RGBA" in found else "RGB"].pixels
+            return np.ascontiguousarray(pixels[..., :3], np.float32), _own(file)
         file = OpenEXR.File(str(path), separate_channels=True)
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # the binding raises bare RuntimeError and MemoryError alike

@@ -428,7 +428,7 @@ class Sequencer:
 
     def _say_trouble(self, beats: Sequence[Heartbeat]) -> None:
         """Tell of a device that no longer answers, or answers again; resuming fails meanwhile."""
-        failed = [str(beat.error).rstrip(".") for beat in beats if beat.error]
+        failed = [str(error).rstrip(".") for beat in beats if (error := beat.error)]
         now = f"{'; '.join(failed)}. Mend it before you resume." if failed else None
         told, self.trouble = self.trouble, now
         if (told is None) != (self.trouble is None):
