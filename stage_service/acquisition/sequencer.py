@@ -30,6 +30,7 @@ from stage_service.plan.stepping import SHORTEST_RUN
 Notify = Callable[[str, dict[str, Any]], None]
 ORDERLY_S = 0.5
 """How long whoever darkens a run waits for it to do so itself."""
+WHILE_PAUSED = "Mend it first: while this lasts, resuming fails the capture, whose frames are kept."
 MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
 
 
@@ -429,7 +430,7 @@ class Sequencer:
     def _say_trouble(self, beats: Sequence[Heartbeat]) -> None:
         """Tell of a device that no longer answers, or answers again; resuming fails meanwhile."""
         failed = [str(error).rstrip(".") for beat in beats if (error := beat.error)]
-        now = f"{'; '.join(failed)}. Mend it before you resume." if failed else None
+        now = f"{'; '.join(failed)}. {WHILE_PAUSED}" if failed else None
         told, self.trouble = self.trouble, now
         if (told is None) != (self.trouble is None):
             self._say_state()

@@ -214,7 +214,7 @@ def test_while_paused_a_bank_that_dies_is_told_and_one_that_is_mended_goes_on(
     assert [text is not None for text in told] == [False, True, False]
     assert told[1] is not None
     assert told[1].startswith("light bank")
-    assert told[1].endswith("off. Mend it before you resume.")
+    assert "lamps off. Mend it first: while this lasts, resuming fails the capture" in told[1]
     assert run.error is None
     assert verify(tmp_path / "c") == []
 

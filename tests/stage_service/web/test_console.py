@@ -441,7 +441,7 @@ def test_a_bank_that_dies_in_a_pause_is_told_and_one_that_is_mended_goes_on(
         page.click("button:text-is('Pause')")
         says(page, "Paused")
         world.deaf_lights = True
-        page.wait_for_selector(".said b.bad:has-text('Mend it before you resume.')")
+        page.wait_for_selector(".said b.bad:has-text('Mend it first')")
         assert "light bank" in http.get(f"/captures/{id_}").json()["error"]
         world.deaf_lights = False
         page.wait_for_selector(".said b.bad", state="detached")
