@@ -106,7 +106,7 @@ class Roughness:
         if self.low <= least * 1.001 or self.high >= most / 1.001:
             said.append(
                 f"β_M {self.beta_m:.2g} is known to lie in {either} only, which reaches an end of "
-                f"the range that was rendered, {least:g} to {most:g}"
+                f"the range that was rendered, {least:.2g} to {most:.2g}"
             )
         elif self.high > WIDEST * self.low:
             said.append(f"β_M {self.beta_m:.2g} is uncertain: the highlight fits {either}")
