@@ -351,10 +351,11 @@ def report(result: dict[str, Any]) -> str:
         "β_M off",
         "β_N off",
         "most σ off",
+        "σ along hair off",
         "CPU s",
         "GB",
     ]
-    errors = ("beta_m_error", "beta_n_error", "sigma_a_error")
+    errors = ("beta_m_error", "beta_n_error", "sigma_a_error", "sigma_a_along_hair_error")
     lines = []
     for name, variants in result["subjects"].items():
         cells = []
@@ -370,7 +371,8 @@ def report(result: dict[str, Any]) -> str:
         for name, found in variants.items():
             sd = f" ± {found['sd']:.2f}" if "sd" in found else ""
             mean, count = f"{found['mean']:.2f}", found["seeds"]
-            lines.append(f"- ({subject}), {name}: {mean}{sd} dB over {count} seeds")
+            seeds = "one seed" if count == 1 else f"{count} seeds"
+            lines.append(f"- ({subject}), {name}: {mean}{sd} dB over {seeds}")
     for case, variants in result.get("recovery", {}).items():
         for variant, found in variants.items():
             off = found.get("lights_off")

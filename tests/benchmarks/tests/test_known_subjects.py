@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from benchmarks.appearance.ablations import QUICK, SMALL, from_afar, recovery, report
 from benchmarks.appearance.known_subjects import bent, dyed, known_subject
-from benchmarks.appearance.table import GROUPS, Table
+from benchmarks.appearance.table import GROUPS, Table, absorption_of_hair
 from benchmarks.subjects import Subject
 
 from appearance import HairAppearance
-from appearance.bsdf.maps import scalp_coordinates
+from appearance.bsdf.maps import HairMaps, scalp_coordinates
 from reconstruction import Strands
 
 HAIR = HairAppearance((0.1, 0.2, 0.4), 0.28, 0.3)
@@ -58,6 +58,19 @@ def test_a_subjects_table_has_baselines_fits_and_the_truth_which_wins(captured):
     clean = {k: v[GROUPS[1]]["psnr_clean"] for k, v in rows.items()}
     assert clean["truth, fresh numbers"] > max(clean["mean colour"], clean["three nearest"])
     assert "| HairInverse |" in report({"subjects": {"a": rows}})
+    original = rows["original"]
+    assert original["sigma_a_along_hair_error"] <= original["sigma_a_error"]  # of the worst channel
+    true = rows["truth, fresh numbers"]
+    assert true["sigma_a_error"] == true["sigma_a_along_hair_error"] == 0
+
+
+def test_absorption_is_judged_where_hair_is():
+    maps = HairMaps.of(HAIR, (2, 2, 1))
+    maps.sigma_a[1] *= 3
+    maps.sigma_a[:, 1] = 1e9  # no root
+    of_hair = absorption_of_hair(maps, np.array([[0.0, 0.0], [0.4, 1.0]]), points=3)
+    want = np.outer((1, 2, 3), HAIR.sigma_a)[:, None]
+    np.testing.assert_allclose(of_hair, np.repeat(want, 2, axis=1))
 
 
 @pytest.mark.slow

@@ -126,7 +126,8 @@ def test_our_uncompressed_file_is_the_reference_writers(
 
 BY_MITSUBA = """
 import sys
-import mitsuba, numpy as np
+import drjit, mitsuba, numpy as np
+drjit.set_thread_count(2)  # of one Mitsuba waits for ever
 mitsuba.set_variant("scalar_rgb")
 np.save(sys.argv[2], np.array(mitsuba.Bitmap(sys.argv[1])))
 """
