@@ -55,6 +55,7 @@ def test_without_steps_too(plain, tufted, original):
     assert seen == sorted(seen)
 
 
+@pytest.mark.slow
 def test_a_volume_is_coloured_before_it_gets_correctives(plain, original):
     options = replace(original, gauss_newton=True, variant="correctives", shape=(2, 2, 2))
     seen = []
@@ -96,7 +97,9 @@ def test_a_fit_that_was_interrupted_goes_on_where_it_was(plain, original, tmp_pa
     assert other.steps == 1
 
 
-@pytest.mark.parametrize(("variant", "left"), [("original", 0), ("correctives", 1)])
+@pytest.mark.parametrize(
+    ("variant", "left"), [("original", 0), pytest.param("correctives", 1, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_fit_does_not_begin_again(plain, original, tmp_path, variant, left):
     """Nearly all of its time goes into what comes before the first step, if there is one at all."""
     options = replace(original, gauss_newton=True, variant=variant, shape=(2, 2, 2))

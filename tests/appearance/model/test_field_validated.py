@@ -115,7 +115,7 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
         fitted.with_field_of(model, "additive")
 
 
-@pytest.mark.parametrize("weak", ["turns", "modulation"])
+@pytest.mark.parametrize("weak", ["turns", pytest.param("modulation", marks=pytest.mark.slow)])
 def test_the_kind_stays_whose_left_out_pictures_gain_more(own, monkeypatch, weak):
     """The other is held at 0 by its ridge, so that nothing is gained by it."""
     capture, model = own

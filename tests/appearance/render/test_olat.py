@@ -200,7 +200,7 @@ def test_same_seed_same_bytes(tufted):
     assert (a != other).any()
 
 
-@pytest.mark.parametrize("spp", [3, 6])
+@pytest.mark.parametrize("spp", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_pixels_of_a_rendering_have_independent_noise(tufted, spp):
     """Differences of two runs are noise: that of a pixel and of its copy do not go together."""
     scene, camera, lights = tufted

@@ -11,6 +11,7 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
+from appearance.sun_fit import roughness_and_colour
 from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
@@ -111,7 +112,8 @@ def test_fit_reports_what_it_did(made, fitted):
     assert made[1].report().to_dict() == report.to_dict()
 
 
-def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path):
+def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 1)
     capture, model = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)
@@ -305,8 +307,9 @@ def test_an_appearance_of_an_earlier_version_is_fitted_again(tmp_path):
         assert not FittedAppearance.is_of(model, LEFT_OUT)
 
 
-def test_hair_pixels_that_lie_apart_tell_of_no_disorder(made, tmp_path):
+def test_hair_pixels_that_lie_apart_tell_of_no_disorder(made, tmp_path, monkeypatch):
     """Every third diagonal: no two are two or four apart in a row or a column."""
+    monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 1)
     capture, model = made
     lone = Model(tmp_path / "model").create()
     lone.write_strands(model.strands())

@@ -156,7 +156,11 @@ def test_points_that_are_no_head_are_a_capture_error(capture: Capture, tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("file", "above"), [("lee_perry_smith.obj", None), ("makehuman_base.obj", 6.0)]
+    ("file", "above"),
+    [
+        ("lee_perry_smith.obj", None),
+        pytest.param("makehuman_base.obj", 6.0, marks=pytest.mark.slow),
+    ],
 )
 def test_the_users_head_is_a_template(
     file: str,

@@ -140,7 +140,7 @@ def around(size: int) -> list[Camera]:
     return [Camera.look_at(f"c{k}", size, size, p, (0, 0, 0), 18.0) for k, p in enumerate(places)]
 
 
-@pytest.mark.parametrize("size", [160, 400])
+@pytest.mark.parametrize("size", [160, pytest.param(400, marks=pytest.mark.slow)])
 def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -> None:
     """Finer pixels than the hull's voxels are averaged, and find the same."""
     capture = Shaded(head, around(size), LIGHTS)

@@ -33,6 +33,7 @@ def test_depths_are_true_below_a_pixel(fibres: Any, method: type[DepthSearch]) -
     assert np.median(off) < 8
 
 
+@pytest.mark.slow
 def test_fine_pictures_are_searched_in_fine_steps(make_fibres: Any, fibre_cameras: Any) -> None:
     """Pixels of 0.13 mm: by steps of 0.5 mm, 0.82 of the depths are right within two of them."""
     stage = make_fibres(cameras=fibre_cameras(8, 576))
