@@ -33,10 +33,19 @@ _WIDE = 0.02
 
 
 def absorption_of_cells(
-    problem: FitProblem, raw: Raw, gain: Array, effort: Effort, *, rounds: int = 12, seed: int = 0
+    problem: FitProblem,
+    raw: Raw,
+    gain: Array,
+    effort: Effort,
+    *,
+    rounds: int = 12,
+    whole: int = 4,
+    seed: int = 0,
 ) -> HairMaps:
     """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
 
+    The first `whole` rounds take the whole step, those after them a half, a third and so on: the
+    mean of what they would say, as each of them has its own noise (Robbins and Monro 1951).
     The light is the mean of the valid single lights of each pixel. A round costs what 100,000 paths
     do, however many pixels and lights there are: at most a quarter of `effort`'s paths a pixel,
     at least one.
@@ -59,7 +68,8 @@ def absorption_of_cells(
                 _add(total, cells[i], values)
         ratio = _smoothed(sums[0]) / np.maximum(_smoothed(sums[1]), 1e-12)
         step = np.clip(np.maximum(ratio, 1e-6), 0.4, 2.5)
-        colour = np.clip(colour * step, 1e-6, 0.995)
+        share = 1 / max(1, 2 + k - whole)
+        colour = np.clip(colour * step**share, 1e-6, 0.995)
     return replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
 
 

@@ -220,24 +220,40 @@ class _Fit:
 
     def _add_piece(self, state: State, number: int) -> None:
         what, piece = self._pieces[number]
-        count, before = len(self._pieces), self.series[-1][2]
+        count, left_open = len(self._pieces), state.left_open
 
         def progress(what: str, share: float) -> None:
             self.monitor.progress(what, 0.5 * (number + share) / count)
 
+        before = self._error_so_far(number)
         raw, gain = piece(state, progress)
         error = self._record(raw, gain, what, 0.5 * (number + 1) / count)
-        if what != "correctives" or error < before:
+        if self._is_taken(number, error, before):
             state.raw, state.average, state.first = raw, _copied(raw), _copied(raw)
             state.tables["gain"] = gain
+        else:
+            state.left_open = left_open
         state.pieces = number + 1
+
+    def _is_taken(self, number: int, error: float, before: float) -> bool:
+        """The first of its kind is; one that comes again, and correctives, where it is better."""
+        what, *others = (name for name, _ in self._pieces[number::-1])
+        return error < before or not (what == "correctives" or what in others)
+
+    def _error_so_far(self, number: int) -> float:
+        """Of what was taken of the start and the first `number` pieces, as they were recorded."""
+        held, *errors = (error for *_, error in self.series[: number + 1])
+        for k, error in enumerate(errors):
+            held = error if self._is_taken(k, error, held) else held
+        return held
 
     def _coloured(
         self, rounds: int, number: int, state: State, progress: Progress
     ) -> tuple[Raw, Array]:
         effort, seed = self.options.effort, (self.seed << 4) + number
+        whole = 0 if number else 4
         maps = absorption_of_cells(
-            self.problem, state.raw, state.gain, effort, rounds=rounds, seed=seed
+            self.problem, state.raw, state.gain, effort, rounds=rounds, whole=whole, seed=seed
         )
         return self._raw(maps), state.gain
 

@@ -122,6 +122,24 @@ def test_an_interrupted_fit_does_not_begin_again(plain, original, tmp_path, vari
     assert len(resumed.history) == len(whole.history)
 
 
+def test_what_comes_again_and_spoils_what_was_found_is_not_taken(
+    plain, tufted, original, monkeypatch
+):
+    options = replace(original, gauss_newton=True, variant="spatial", shape=(2, 2, 2))
+    right, calls = loop.absorption_of_cells, []
+
+    def black_later(*given, **how):
+        calls.append(how)
+        maps = right(*given, **how)
+        return maps if len(calls) == 1 else replace(maps, sigma_a=np.full((2, 2, 2, 3), 9.0))
+
+    monkeypatch.setattr(loop, "absorption_of_cells", black_later)
+    found = run(plain, START, options=options)
+    assert len(calls) == 3
+    assert found.error < 0.5 * found.start_error
+    assert far(found.maps, tufted.truth) < 0.4
+
+
 def test_a_fit_from_the_truth_does_not_leave_it_for_noise(plain, tufted, original):
     few = replace(tufted.quick, pixels=20, spp=1, gradient_spp=1)
     found = run(plain, HairMaps.of(tufted.truth), options=replace(original, steps=10, effort=few))
