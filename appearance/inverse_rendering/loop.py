@@ -209,11 +209,11 @@ class _Fit:
         solves = self.solves if one_colour or "gain" in self.solves else []
         out: list[tuple[str, _Piece]] = []
         if cells:
-            out.append(("cells", partial(self._coloured, 12, 0)))
+            out.append(("cells", partial(self._coloured, 0)))
         for k in range((_ALTERNATIONS if cells else 1) if solves else 0):
             out.append(("global parameters", partial(self._solved, solves, k)))
             if cells:
-                out.append(("cells", partial(self._coloured, _MORE_ROUNDS, 1 + k)))
+                out.append(("cells", partial(self._coloured, 1 + k)))
         if self.turns and not self.start.rotation.any():
             out.append(("correctives", self._turned))
         return out
@@ -247,13 +247,15 @@ class _Fit:
             held = error if self._is_taken(k, error, held) else held
         return held
 
-    def _coloured(
-        self, rounds: int, number: int, state: State, progress: Progress
-    ) -> tuple[Raw, Array]:
-        effort, seed = self.options.effort, (self.seed << 4) + number
-        whole = 0 if number else 4
+    def _coloured(self, number: int, state: State, progress: Progress) -> tuple[Raw, Array]:
+        more = {"rounds": _MORE_ROUNDS, "whole": 0} if number else {}
         maps = absorption_of_cells(
-            self.problem, state.raw, state.gain, effort, rounds=rounds, whole=whole, seed=seed
+            self.problem,
+            state.raw,
+            state.gain,
+            self.options.effort,
+            seed=(self.seed << 4) + number,
+            **more,
         )
         return self._raw(maps), state.gain
 

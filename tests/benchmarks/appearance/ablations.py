@@ -413,6 +413,9 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     subject = simulated(args.rig, args.subject, args.head, args.seed)
     if args.size in AT_SIZE and not args.quick:
         runs = Ladders(args.ladders.split(","), args.seeds, args.strands, args.capture)
+        known = (*SUBJECTS, RECONSTRUCTED, "cycles")
+        if unknown := [name for name in runs.subjects if name not in known]:
+            raise ValueError(f"--ladders: no {', '.join(unknown)}; name some of {', '.join(known)}")
         return run_at_size(args.out, subject, args.size, runs, seed=args.seed, progress=progress)
     effort: dict[str, Any] = {"options": QUICK, "rig": SMALL} if args.quick else {}
     seeds = min(args.seeds, 1) if args.quick else args.seeds
