@@ -192,8 +192,9 @@ def test_a_job_whose_enqueuing_was_lost_is_enqueued_at_the_next_start(rig_file, 
 
 
 def test_steering_a_capture(http, world):
-    capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
-    paused = http.post(f"/captures/{capture}/pause")
+    with world.held():
+        capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+        paused = http.post(f"/captures/{capture}/pause")
     assert paused.status_code == 200
     until(lambda: http.get(f"/captures/{capture}").json()["state"] == "paused")
     assert not world.lit
@@ -612,9 +613,10 @@ def test_a_frame_that_is_gone_or_cut_is_damage_not_a_fault(http, server):
     problem(http.post("/jobs", json=asked), "damaged-capture")
 
 
-def test_jobs_need_a_capture_that_completed_and_a_model_of_their_own(http, server, head):
-    aborted = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
-    http.post(f"/captures/{aborted}/abort")
+def test_jobs_need_a_capture_that_completed_and_a_model_of_their_own(http, world, server, head):
+    with world.held():
+        aborted = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+        http.post(f"/captures/{aborted}/abort")
     until(lambda: http.get(f"/captures/{aborted}").json()["state"] == "done")
     asked = {"capture": aborted, "pipeline": {"name": "reconstruct"}}
     assert "aborted" in problem(http.post("/jobs", json=asked), "not-finished")["detail"]

@@ -44,19 +44,20 @@ def audit(http: Client) -> list[tuple[str, str, str]]:
     return [(re.sub(r":\d+", "", a["who"]), a["action"], a["result"]) for a in entries]
 
 
-def test_without_a_lease_anybody_steers_and_with_one_its_holder(http):
+def test_without_a_lease_anybody_steers_and_with_one_its_holder(http, world):
     assert http.get("/lease").json() == {"holder": None, "expires": None}
-    capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
-    granted = http.post("/lease", json={"holder": "Ada", "seconds": 60}).json()
-    mine = {"Hairstage-Lease": granted["token"]}
-    assert http.get("/lease").json() == {"holder": "Ada", "expires": granted["expires"]}
-    for other in ({}, {"Hairstage-Lease": "guessed"}):
-        for path in ("/captures", f"/captures/{capture}/pause", f"/captures/{capture}/resume"):
-            problem = refused(http.post(path, headers=other, json={}), "leased")
-            assert (problem["holder"], problem["expires"]) == ("Ada", granted["expires"])
-    refused(http.post("/lease", json={"holder": "Eve"}), "leased")
-    assert http.post(f"/captures/{capture}/pause", headers=mine).is_success
-    assert http.post(f"/captures/{capture}/abort").is_success, "anybody may abort"
+    with world.held():
+        capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+        granted = http.post("/lease", json={"holder": "Ada", "seconds": 60}).json()
+        mine = {"Hairstage-Lease": granted["token"]}
+        assert http.get("/lease").json() == {"holder": "Ada", "expires": granted["expires"]}
+        for other in ({}, {"Hairstage-Lease": "guessed"}):
+            for path in ("/captures", f"/captures/{capture}/pause", f"/captures/{capture}/resume"):
+                problem = refused(http.post(path, headers=other, json={}), "leased")
+                assert (problem["holder"], problem["expires"]) == ("Ada", granted["expires"])
+        refused(http.post("/lease", json={"holder": "Eve"}), "leased")
+        assert http.post(f"/captures/{capture}/pause", headers=mine).is_success
+        assert http.post(f"/captures/{capture}/abort").is_success, "anybody may abort"
     assert done(http, capture)["outcome"] == "aborted"
     assert http.post("/devices/blackout").json()["state"] == "dark"
 

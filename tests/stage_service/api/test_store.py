@@ -166,14 +166,15 @@ def test_a_job_that_was_just_enqueued_under_the_key_is_that_one(http, monkeypatc
     assert (again.status_code, again.json().get("id")) == (202, job)
 
 
-def test_who_may_remove(rig_file, tmp_path):
+def test_who_may_remove(rig_file, world, tmp_path):
     tokens = Tokens(tmp_path / "tokens.json", "own")
     steers = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'steer'))}"}
     with serving(rig_file, tmp_path / "root", Access(tokens)) as http:
         http.headers["Authorization"] = "Bearer own"
         whole = shot(http)["id"]
-        stopped = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
-        http.post(f"/captures/{stopped}/abort")
+        with world.held():
+            stopped = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
+            http.post(f"/captures/{stopped}/abort")
         until(lambda: http.get(f"/captures/{stopped}").json()["state"] == "done")
         for ask in (
             lambda: http.delete(f"/captures/{whole}", headers=steers),
