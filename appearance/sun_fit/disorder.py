@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -47,37 +47,51 @@ As far as a lens's blur and a filter do not mix them; twice, for what changes wi
 DARK = 0.1
 """Of the mean answer of all pixels, what a pixel's counts as at least."""
 TOLD_DEG = 8.0
-"""Degrees, with the error off, from which on turns are told: smaller ones hardly show, and orderly
-hair reads 0 to 13 with about as large an error."""
+"""Degrees from which on turns are told, where surely no less: smaller ones hardly show."""
 LEAST_OFF = 0.005
 """What a likeness is off by at least: as much as draws of turned strands differ by."""
 _APART = (0, *BESIDE)
 _WAVE = 0.06  # metres of strand: about the pitch of wavy hair
+_SQUARES = 2001  # that a belief is computed at
+_BELIEVED = 100  # that stand for it
 
 
 @dataclass(frozen=True)
 class Disorder:
-    """By how much single strands turn beyond those that are there.
+    """What is known of by how much single strands turn beyond those that are there.
 
-    `degrees`, root mean square, with its standard error, `least` less that, up to `most`: what was
-    tried.
+    `squares (K,)` of the turn, degrees² root mean square, one as likely as another, ascending, up
+    to that of `most`, what was tried; `beyond` says that pixels differ by more than even that does.
     """
 
-    degrees: float
-    error: float
-    least: float
+    squares: tuple[float, ...]
     most: float
+    beyond: bool = False
+
+    @property
+    def degrees(self) -> float:
+        """By how much, root mean square over what is believed."""
+        return float(np.mean(self.squares)) ** 0.5
+
+    @property
+    def low(self) -> float:
+        """The lower end of an interval of 95 %, degrees."""
+        return float(np.percentile(self.squares, 2.5)) ** 0.5
+
+    @property
+    def high(self) -> float:
+        """The upper end of that interval."""
+        return float(np.percentile(self.squares, 97.5)) ** 0.5
 
     @property
     def told(self) -> bool:
         """Whether single hairs surely turn: the fibres' β_M is less than the one to render with."""
-        return self.least > TOLD_DEG
+        return self.low > TOLD_DEG
 
-    @property
-    def trust(self) -> float:
-        """How much of what it changes is believed, 0 to 1: of d² - δ, the share d⁴ / (d⁴ + δ²)."""
-        square, error = self.degrees**2, self.degrees**2 - self.least**2
-        return square**2 / (square**2 + error**2) if square > 0 else 0.0
+    def figures(self) -> dict[str, Any]:
+        """Those of a report."""
+        names = ("degrees", "low", "high", "most", "beyond")
+        return {name: getattr(self, name) for name in names}
 
 
 def disordered(strands: Strands, angle: float, seed: int) -> Strands:
@@ -202,14 +216,15 @@ def direct_share(direct: Highlight, whole: Highlight) -> float:
 def match_disorder(
     captured: Likeness, turned: Iterable[tuple[float, Likeness]], share: float = 1.0
 ) -> Disorder | None:
-    """The disorder, degrees, of strands whose pixels are as alike as the `captured` ones.
+    """The disorder of strands whose pixels are as alike as the `captured` ones.
 
     Of what the `turned` are unlike, `share` is left in pictures (`direct_share`). Between the
-    `turned`, which ascend from 0, likeness falls linearly with the square: 0 where the capture is
-    more alike than strands as they are. The error says how far off the square may be on either side
-    for the likeness's own, which is the jackknife's over parts of the hair, or what the views'
-    differ by: small turns hardly show. None where too few pixels lie `BESIDE` each other, and
-    nothing is computed then, or where turns make pixels no less alike.
+    `turned`, which ascend from 0, likeness falls linearly with the square of the turn. What is
+    believed follows by Bayes' rule from the captured likeness, whose error is the jackknife's over
+    parts of the hair, or what the views' differ by. Beforehand hair turns no more than its strands
+    as likely as not, and any square up to the last is as likely as another if it does. None where
+    too few pixels lie `BESIDE` each other, and nothing is computed then, or where turns make pixels
+    no less alike.
     """
     if captured.told.sum() < FEWEST_PAIRS:
         return None
@@ -219,21 +234,16 @@ def match_disorder(
     falling = np.minimum.accumulate([likeness for _, likeness in found])
     if falling[-1, 0] >= falling[0, 0]:
         return None
-    last = (falling[-1] - falling[-2]) / (squares[-1] - squares[-2])
-    most, beyond = squares[-1], 4 * squares[-1]
-    falling = np.concatenate([falling, [falling[-1] + (beyond - most) * last]])
-    squares = np.append(squares, beyond)
-
-    def degrees_of(likeness: float) -> float:
-        return float(np.interp(-likeness, -falling[:, 0], squares)) ** 0.5
-
-    seen = captured.of(chosen)
-    alike = min(float(seen[0]), float(falling[0, 0]))
-    square = degrees_of(alike) ** 2
-    off = max(errors(seen - [np.interp(square, squares, curve) for curve in falling.T], left_out))
-    low, high = (degrees_of(alike + sign * max(off, LEAST_OFF)) for sign in (1, -1))
-    answer, least = (float(min(degrees, most**0.5)) for degrees in (square**0.5, low))
-    return Disorder(answer, max(high - answer, answer - least), least, float(most**0.5))
+    seen, expected = captured.of(chosen), falling[:, 0]
+    nearest = np.interp(-seen[0], -expected, squares)
+    off = max(errors(seen - [np.interp(nearest, squares, curve) for curve in falling.T], left_out))
+    each = np.linspace(0, squares[-1], _SQUARES)
+    unlike = (seen[0] - np.interp(each, squares, expected)) / max(off, LEAST_OFF)
+    likelihood = np.exp(0.5 * ((unlike**2).min() - unlike**2))
+    belief = np.cumsum(likelihood / len(each) + np.where(each == 0, likelihood[0], 0))
+    believed = np.interp((np.arange(_BELIEVED) + 0.5) / _BELIEVED * belief[-1], belief, each)
+    beyond = bool(seen[0] < expected[-1])
+    return Disorder(tuple(believed.tolist()), float(squares[-1] ** 0.5), beyond)
 
 
 def beside(observed: Observed, apart: int) -> Ints:

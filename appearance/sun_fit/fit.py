@@ -23,6 +23,7 @@ from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.disorder import (
+    TOLD_DEG,
     Disorder,
     Likeness,
     PixelPairs,
@@ -145,7 +146,7 @@ def fit(
     made = (colours.hair, colours.colour, colours.skin, exposure)
     variances = float(variance_of_roughness(beta_m)), found.plain.v, found.printed
     fibres = found.fibres
-    turns = () if (d := fibres.disorder) is None else (d.degrees, d.error)
+    turns = () if (d := fibres.disorder) is None else (d.degrees, d.low, d.high)
     known = Fibres(fibres.beta_m, fibres.error, fibres.low, fibres.high, *turns)
     model.forget_appearance()
     FittedAppearance(*made, *variances, held_out, known, (red, green, blue)).save(model)
@@ -255,13 +256,11 @@ class SunFit:
             if disorder is None:
                 off = DISORDER * as_are.tangents_deg
             else:
-                most = min(disorder.degrees + disorder.error, disorder.most)
-                off = disorder.degrees if disorder.told else most
+                # in the midst of the squares that change most, so that little is extrapolated
+                middle = np.hypot(disorder.degrees, disorder.high) / 2**0.5
+                off = max(float(middle), TOLD_DEG)
             turned = matched(self.disordered(float(np.radians(off)), 0), np.unique(nearer))
-            if disorder is None or disorder.told:
-                fibres = turned.after(as_are, disorder)
-            else:
-                fibres = as_are.or_less(turned, disorder)
+            fibres = as_are.of_fibres(turned, off, disorder)
         stage.figures |= {
             "samples": count,
             "pairs_of_lights": int(captured.pairs.sum()),
@@ -272,7 +271,8 @@ class SunFit:
             "sun_beta_m_as_printed": float(roughness_of_variance(printed)),
             "lobe_residual": plain.residual,
             "rendered_beta_m": as_are.beta_m,
-            **asdict(fibres),
+            **asdict(replace(fibres, disorder=None)),
+            "disorder": None if fibres.disorder is None else fibres.disorder.figures(),
             "range": list(fibres.range),
             "views": list(fibres.views),
             "correlation_deg": float(np.degrees(captured.angle())),

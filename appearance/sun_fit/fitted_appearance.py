@@ -25,7 +25,7 @@ class Fibres:
 
     `error` is the standard error of log β_M, `low` and `high` the ends of an interval of about
     95 %. `disorder_deg` is by how much single hairs turn beyond the model's strands, root mean
-    square, `disorder_error_deg` its standard error; None where that was not measured.
+    square, and the next two the ends of its interval; None where that was not measured.
     """
 
     beta_m: float
@@ -33,7 +33,8 @@ class Fibres:
     low: float
     high: float
     disorder_deg: float | None = None
-    disorder_error_deg: float | None = None
+    disorder_low_deg: float | None = None
+    disorder_high_deg: float | None = None
 
 
 def absorption_warnings(sigma_a: Sequence[float], errors: Sequence[float | None]) -> list[str]:

@@ -14,12 +14,13 @@ as the hair is (`disorder`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from appearance.bsdf.longitudinal import roughness_of_variance, variance_of_roughness
 from appearance.sun_fit.disorder import Disorder
 from appearance.sun_fit.hair_parts import FEWEST_PAIRS, errors, leaving_out
 from appearance.sun_fit.highlights import INNER, SHIFTS, Highlight
@@ -28,7 +29,9 @@ from reconstruction.arrays import Array
 WIDEST = 1.5
 """Ratio of the interval's ends above which a roughness is called uncertain."""
 SURE = 0.87
-"""Of a roughness, how low it may be for turns that do not show without a warning."""
+"""Of a roughness, how low it may be without a warning that turns do not show."""
+UNMEASURED = 1.5
+"""Over the square of the turn that the tangents' error makes likely: how much it may be."""
 LARGEST_ERROR = 0.1
 WORST_MISFIT = 3.0
 _FLOOR = 0.02  # what a mean of a bin is off by at least, of the mean over bins
@@ -62,48 +65,63 @@ class Roughness:
     systematic: float = 0.0
     disorder: Disorder | None = None
 
-    def after(self, other: Roughness, disorder: Disorder | None) -> Roughness:
-        """This one, of strands of that `disorder`, with `other`, of the strands as they are.
+    def of_fibres(self, turned: Roughness, degrees: float, disorder: Disorder | None) -> Roughness:
+        """That of the fibres of hair in `disorder`, of this one, by the strands as they are.
 
-        What lies between the two answers grows with the square of the disorder. Of it as much is
-        taken as the disorder is known, three quarters where that was not measured: the mean of what
-        it may be, if none is as likely beforehand as what was measured. Its spread joins the error.
-        The tangents' error and the misfit are those of `other`: strands that wave by themselves fit
-        a highlight less well than those that stand where the hair is.
+        `turned` is the answer of strands that are turned by so many `degrees`. What a turn adds to
+        the lobe's variance grows with its square; the answer is the mean of log β_M over the
+        squares that are believed, the interval holds 95 % of them and what either answer is off by.
+        Turns that leave fibres less than the least roughness that was rendered are not believed.
+        Where no disorder was measured, any square up to 1.5 times that of `degrees` is as likely.
+        The tangents' error and the misfit are those of the strands as they are: such that wave by
+        themselves fit a highlight less well than those that stand where the hair is.
         """
-        trust = 0.75 if disorder is None else disorder.trust
-        change = float(np.log(self.beta_m / other.beta_m))
-        systematic = abs(change) * (1 - trust) ** 0.5
-        back = float(np.exp((trust - 1) * change))
-        wider = np.exp(np.hypot(self.error, systematic) * 2 - self.error * 2)
+        if disorder is None:
+            share = np.linspace(0, UNMEASURED, 100)
+        else:
+            share = np.array(disorder.squares) / degrees**2
+        least, most = turned.range
+        own, other = variance_of_roughness(np.array([self.beta_m, turned.beta_m]))
+        v = own + (other - own) * share
+        possible = v >= variance_of_roughness(least)
+        v = v[possible] if possible.any() else variance_of_roughness([least])
+        log_beta = np.log(roughness_of_variance(v))
+        answer, systematic = float(log_beta.mean()), float(log_beta.std())
+        weight = float(np.clip(share[possible].mean(), 0, 1)) if possible.any() else 1.0
+
+        def mean(of: Callable[[Roughness], float]) -> float:
+            return (1 - weight) * of(self) + weight * of(turned)
+
+        low, high = (answer - np.percentile(log_beta, q) for q in (2.5, 97.5))
+        low = np.hypot(low, mean(lambda r: np.log(r.beta_m / r.low)))
+        high = np.hypot(high, mean(lambda r: np.log(r.high / r.beta_m)))
+        nearer = turned if weight > 0.5 else self
+        to_low, to_high = nearer.ends()
+        beta_m = float(np.exp(answer))
         return replace(
             self,
-            beta_m=back * self.beta_m,
-            error=float(np.hypot(self.error, systematic)),
-            low=float(max(back * self.low / wider, self.range[0])),
-            high=float(min(back * self.high * wider, self.range[1])),
-            tangents_deg=other.tangents_deg,
-            tangents_error_deg=other.tangents_error_deg,
-            misfit=other.misfit,
+            beta_m=beta_m,
+            error=float(np.hypot(mean(lambda r: r.error), systematic)),
+            low=least
+            if to_low or possible.mean() < 0.5
+            else float(max(beta_m * np.exp(-low), least)),
+            high=most if to_high else float(min(beta_m * np.exp(high), most)),
+            range=turned.range,
+            parts=mean(lambda r: r.parts),
+            views=tuple(view * beta_m / self.beta_m for view in self.views),
             systematic=systematic,
             disorder=disorder,
         )
 
-    def or_less(self, turned: Roughness, disorder: Disorder) -> Roughness:
-        """This one, of strands as they are, where hair may be more disordered, which is not told.
-
-        `turned` is the answer of strands as disordered as the hair may be: how low this one may be.
-        """
-        low = min(self.low, turned.beta_m)
-        error = max(self.error, 0.5 * float(np.log(self.beta_m / low)))
-        systematic = float(np.sqrt(error**2 - self.error**2))
-        return replace(self, low=low, error=error, systematic=systematic, disorder=disorder)
+    def ends(self) -> tuple[bool, bool]:
+        """Whether the interval reaches the lower and the upper end of what was rendered."""
+        return self.low <= self.range[0] * 1.001, self.high >= self.range[1] / 1.001
 
     def warnings(self) -> list[str]:
         """What a user has to know before believing it, a sentence each."""
         said, either = [], f"{self.low:.2g} to {self.high:.2g}"
         least, most = self.range
-        if self.low <= least * 1.001 or self.high >= most / 1.001:
+        if any(self.ends()):
             said.append(
                 f"β_M {self.beta_m:.2g} is known to lie in {either} only, which reaches an end of "
                 f"the range that was rendered, {least:.2g} to {most:.2g}"
@@ -113,20 +131,18 @@ class Roughness:
         if np.sqrt(self.error**2 - self.systematic**2) > max(2 * self.parts, LARGEST_ERROR):
             views = ", ".join(f"{beta:.2g}" for beta in self.views)
             said.append(f"views disagree about β_M by more than their noise: {views}")
-        d = self.disorder
+        d, turns = self.disorder, "single hairs turn more than the strands"
         if d is not None and d.told:
             said.append(
-                f"single hairs turn by {d.degrees:.0f}° (at least {d.least:.0f}°) more than the "
-                "strands, by what pixels beside each other tell: the fibres' β_M, "
-                f"{self.beta_m:.2g} ({either}), stands on that"
+                f"{turns}, by {d.low:.0f} to {d.high:.0f}°, by what pixels beside each other tell: "
+                f"the fibres' β_M, {self.beta_m:.2g} ({either}), stands on that"
             )
         elif d is not None and self.low < SURE * self.beta_m:
             said.append(
-                f"pixels beside each other do not tell whether single hairs turn by up to "
-                f"{min(d.degrees + d.error, d.most):.0f}° more than the strands: the fibres' β_M, "
-                f"{self.beta_m:.2g}, may be as low as {self.low:.2g}"
+                f"pixels beside each other hardly tell by how much {turns}, {d.low:.0f} to "
+                f"{d.high:.0f}°: the fibres' β_M, {self.beta_m:.2g}, may be {either}"
             )
-        if d is not None and d.degrees >= d.most:
+        if d is not None and d.beyond:
             said.append(
                 "pixels beside each other differ by more than strands turned by "
                 f"{d.most:g}° do, the most that are told apart: β_M {self.beta_m:.2g} is uncertain"

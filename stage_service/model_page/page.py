@@ -185,9 +185,9 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
     if fibres:
         said = [element("b", f"β_M {fibres['beta_m']:.2f}")]
         said.append(f", {fibres['low']:.2f} to {fibres['high']:.2f} at about 95 %")
-        if fibres["disorder_deg"] is not None:
-            turns = "single hairs turn by {disorder_deg:.0f}° ± {disorder_error_deg:.0f}° more"
-            said.append(f"; {turns.format(**fibres)} than these strands")
+        if fibres.get("disorder_low_deg") is not None:
+            turns = "{disorder_low_deg:.0f} to {disorder_high_deg:.0f}°".format(**fibres)
+            said.append(f"; single hairs turn more than these strands, by {turns}")
     else:
         said = ["not known"]
     yield "of the fibres", said

@@ -7,7 +7,7 @@ import pytest
 
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
-from appearance.sun_fit.disorder import Disorder
+from appearance.sun_fit.disorder import Disorder, Likeness, match_disorder
 from appearance.sun_fit.hair_parts import SIDE
 from appearance.sun_fit.highlights import EDGES, WINDOW, Highlight, LightPairs
 from appearance.sun_fit.light_correlation import match_roughness
@@ -130,34 +130,88 @@ def test_too_few_pairs_are_an_error_that_says_what_to_do(family):
         match_roughness(few, family)
 
 
-def test_a_disorder_that_is_hardly_known_changes_the_roughness_half_way(family):
-    """5 ± 5°: its square, 25 less 25, is as uncertain as it is large."""
-    smooth, rough = (match_roughness(highlight(beta), family) for beta in (0.2, 0.3))
-    found = smooth.after(rough, Disorder(5, 5, 0, 24))
-    assert found.beta_m == pytest.approx((smooth.beta_m * rough.beta_m) ** 0.5)
-    assert found.low < 0.2 < found.beta_m < 0.3 < found.high
-    sure = smooth.after(rough, Disorder(5, 0.0, 5, 24))
-    assert (sure.beta_m, sure.error) == pytest.approx((smooth.beta_m, smooth.error))
-    assert smooth.after(rough, Disorder(0, 1.0, 0, 24)).beta_m == pytest.approx(rough.beta_m)
+def turned_hair(turn_deg, beta=0.3, seed=3):
+    """What is seen of pixels of two fibres each, which turn by `turn_deg` RMS."""
+    rng = np.random.default_rng(1)
+    deviation = rng.uniform(-WINDOW, WINDOW, (VIEWS, LIGHTS, PIXELS))
+    turns = np.radians(turn_deg) * np.random.default_rng(seed).normal(size=(2, PIXELS))
+    v, out = float(variance_of_roughness(beta)), []
+    for d in deviation:
+        half = [0.5 * d + turn for turn in turns]
+        value = np.mean([longitudinal(x, x, v) for x in half], axis=0)
+        value = value + 0.1 * float(longitudinal(0.0, 0.0, v))
+        out.append(pairs(d).highlight(value, value))
+    return Highlight.joined(out)
 
 
-def test_more_disorder_than_was_tried_is_a_warning(family):
+def surely(degrees):
+    return Disorder((degrees**2,) * 100, 24)
+
+
+@pytest.mark.parametrize(("turn_deg", "rendered_deg"), [(4, 8), (8, 8), (8, 12), (12, 8)])
+def test_the_fibres_roughness_is_found_under_turns_that_are_known(family, turn_deg, rendered_deg):
+    """Where strands were turned by as much for the renderings, and where by more or less."""
+    captured = turned_hair(turn_deg)
+    rough = match_roughness(captured, family)
+    rendered = [(beta, turned_hair(rendered_deg, beta, seed=9)) for beta in BETAS]
+    found = rough.of_fibres(match_roughness(captured, rendered), rendered_deg, surely(turn_deg))
+    assert found.beta_m == pytest.approx(0.3, rel=0.08)
+    assert abs(found.beta_m - 0.3) < 0.5 * abs(rough.beta_m - 0.3)
+
+
+def alike(unlike):
+    """Pixels of `J` parts of the hair, of which a share `unlike (J,)` answers as strangers do."""
+    one = np.tile(np.linspace(1, 0, len(EDGES) - 1), (len(unlike), 1))
+    two = one - 0.8 * np.reshape(unlike, (-1, 1)) * (one - one.mean())
+    products = np.stack([one, two, two], axis=1)
+    return Likeness(1000 * products, np.full(products.shape, 1000.0))
+
+
+def test_what_is_known_little_better_changes_the_roughness_little(family):
+    """From pixels that are alike to such as tell of 21° of turns, surely: no answer jumps."""
+    rough, smooth = (match_roughness(highlight(beta), family) for beta in (0.3, 0.15))
+    turned = [(d, alike(np.full(SIDE**2, d**2 / 24**2))) for d in (0.0, 12.0, 24.0)]
+    scatter = 0.3 * np.random.default_rng(0).normal(size=SIDE**2)
+    found = []
+    for share in np.linspace(0, 0.8, 33):
+        disorder = match_disorder(alike(share + scatter - scatter.mean()), turned)
+        found.append((disorder.told, rough.of_fibres(smooth, 24.0, disorder).beta_m))
+    told, betas = zip(*found, strict=True)
+    assert (told[0], told[-1]) == (False, True)
+    assert betas[0] > 0.28
+    assert betas[-1] < 0.21
+    steps = np.diff(np.log(betas))
+    assert steps.max() < 0
+    assert steps.min() > 3 * steps.mean()
+
+
+def test_turns_at_the_end_of_what_was_tried_are_a_warning(family):
     about = match_roughness(highlight(0.3, 20, seed=4), family)
-    found = about.after(about, Disorder(24, 5, 22, 24))
+    found = about.of_fibres(about, 24, replace(surely(24), beyond=True))
     assert any("turned by 24°" in w for w in found.warnings())
+    assert found.warnings() != about.of_fibres(about, 24, surely(24)).warnings()
 
 
-def test_turns_that_may_be_there_and_do_not_show_are_in_the_interval(family):
-    smooth, rough = (match_roughness(highlight(beta), family) for beta in (0.2, 0.3))
-    found = rough.or_less(smooth, Disorder(10, 10, 0, 24))
-    assert found.beta_m == rough.beta_m
-    assert (found.low, found.high) == (pytest.approx(smooth.beta_m), rough.high)
-    assert found.error == pytest.approx(0.5 * np.log(rough.beta_m / smooth.beta_m))
-    assert any("up to 20°" in w and "as low as 0.2" in w for w in found.warnings())
-    same = rough.or_less(rough, Disorder(0, 3, 0, 24))
-    assert (same.low, same.high) == (rough.low, rough.high)
-    assert same.error == pytest.approx(rough.error)
+def test_turns_that_may_be_there_and_do_not_show_are_told(family):
+    rough, smooth = (match_roughness(highlight(beta), family) for beta in (0.3, 0.2))
+    halves = Disorder((0.0,) * 50 + (400.0,) * 50, 24)
+    found = rough.of_fibres(smooth, 20, halves)
+    assert found.beta_m == pytest.approx((rough.beta_m * smooth.beta_m) ** 0.5)
+    assert found.low < smooth.beta_m * 1.01
+    assert found.high > rough.beta_m * 0.99
+    assert found.error == pytest.approx(0.5 * np.log(1.5), abs=0.02)
+    assert any("0 to 20°" in w and "may be 0.2 to 0.3" in w for w in found.warnings())
+    same = rough.of_fibres(smooth, 20, surely(0))
+    assert (same.beta_m, same.low, same.high) == pytest.approx(
+        (rough.beta_m, rough.low, rough.high)
+    )
     assert same.warnings() == rough.warnings()
+
+
+def test_roughnesses_at_the_ends_of_what_was_rendered_are_told_of_fibres_too(family):
+    rough = match_roughness(highlight(0.99, 5, 0.3), family)
+    found = rough.of_fibres(replace(rough, beta_m=0.8, low=0.75), 12, surely(4))
+    assert any("end of the range" in w for w in found.warnings())
 
 
 def test_a_light_tells_nothing_of_hair_beside_its_beam():
