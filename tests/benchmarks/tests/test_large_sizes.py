@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from benchmarks.importing.large_sizes import SIZES
 from benchmarks.importing.painted import NOISE, PaintedCapture
 from scipy.spatial import cKDTree
@@ -14,6 +15,7 @@ from reconstruction.light_planes import triangulate
 from simulators.subject.subject import make_subject
 
 
+@pytest.mark.slow
 def test_painted_frames_show_the_subject_where_it_is(tmp_path):
     rig = replace(SIZES["small"], cameras=2, lights=6, scaled=0.1, sweep=True).rig()
     rig = replace(rig, projectors=rig.projectors[:1])
