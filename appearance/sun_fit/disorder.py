@@ -236,13 +236,14 @@ def match_disorder(
         return None
     seen, expected = captured.of(chosen), falling[:, 0]
     nearest = np.interp(-seen[0], -expected, squares)
-    off = max(errors(seen - [np.interp(nearest, squares, curve) for curve in falling.T], left_out))
+    unlike = seen - [np.interp(nearest, squares, curve) for curve in falling.T]
+    off = max(*errors(unlike, left_out), LEAST_OFF)
     each = np.linspace(0, squares[-1], _SQUARES)
-    unlike = (seen[0] - np.interp(each, squares, expected)) / max(off, LEAST_OFF)
-    likelihood = np.exp(0.5 * ((unlike**2).min() - unlike**2))
+    chi2 = ((seen[0] - np.interp(each, squares, expected)) / off) ** 2
+    likelihood = np.exp(0.5 * (chi2.min() - chi2))
     belief = np.cumsum(likelihood / len(each) + np.where(each == 0, likelihood[0], 0))
     believed = np.interp((np.arange(_BELIEVED) + 0.5) / _BELIEVED * belief[-1], belief, each)
-    beyond = bool(seen[0] < expected[-1])
+    beyond = bool(seen[0] + 2 * off < expected[-1])
     return Disorder(tuple(believed.tolist()), float(squares[-1] ** 0.5), beyond)
 
 

@@ -71,7 +71,8 @@ class Roughness:
         `turned` is the answer of strands that are turned by so many `degrees`. What a turn adds to
         the lobe's variance grows with its square; the answer is the mean of log β_M over the
         squares that are believed, the interval holds 95 % of them and what either answer is off by.
-        Turns that leave fibres less than the least roughness that was rendered are not believed.
+        Turns that leave fibres less than the least roughness that was rendered are not believed;
+        where pixels differ by more than those that were tried do, the interval reaches down to it.
         Where no disorder was measured, any square up to 1.5 times that of `degrees` is as likely.
         The tangents' error and the misfit are those of the strands as they are: such that wave by
         themselves fit a highlight less well than those that stand where the hair is.
@@ -82,34 +83,35 @@ class Roughness:
             share = np.array(disorder.squares) / degrees**2
         least, most = turned.range
         own, other = variance_of_roughness(np.array([self.beta_m, turned.beta_m]))
-        v = own + (other - own) * share
+        v = np.minimum(own + (other - own) * share, variance_of_roughness(most))
         possible = v >= variance_of_roughness(least)
         v = v[possible] if possible.any() else variance_of_roughness([least])
         log_beta = np.log(roughness_of_variance(v))
-        answer, systematic = float(log_beta.mean()), float(log_beta.std())
+        answer = float(log_beta.mean())
         weight = float(np.clip(share[possible].mean(), 0, 1)) if possible.any() else 1.0
 
         def mean(of: Callable[[Roughness], float]) -> float:
             return (1 - weight) * of(self) + weight * of(turned)
 
-        low, high = (answer - np.percentile(log_beta, q) for q in (2.5, 97.5))
-        low = np.hypot(low, mean(lambda r: np.log(r.beta_m / r.low)))
-        high = np.hypot(high, mean(lambda r: np.log(r.high / r.beta_m)))
-        nearer = turned if weight > 0.5 else self
-        to_low, to_high = nearer.ends()
-        beta_m = float(np.exp(answer))
+        down, up = (abs(answer - np.percentile(log_beta, q)) for q in (2.5, 97.5))
+        low = answer - np.hypot(down, mean(lambda r: np.log(r.beta_m / r.low)))
+        high = answer + np.hypot(up, mean(lambda r: np.log(r.high / r.beta_m)))
+        to_low, to_high = (turned if weight > 0.5 else self).ends()
+        if to_low or possible.mean() < 0.5 or (disorder is not None and disorder.beyond):
+            low = np.log(least)
+        low, high = max(low, np.log(least)), np.log(most) if to_high else min(high, np.log(most))
+        alone = mean(lambda r: r.error)
+        error = float(max(np.hypot(alone, log_beta.std()), 0.5 * (answer - low)))
         return replace(
             self,
-            beta_m=beta_m,
-            error=float(np.hypot(mean(lambda r: r.error), systematic)),
-            low=least
-            if to_low or possible.mean() < 0.5
-            else float(max(beta_m * np.exp(-low), least)),
-            high=most if to_high else float(min(beta_m * np.exp(high), most)),
+            beta_m=float(np.exp(answer)),
+            error=error,
+            low=float(np.exp(low)),
+            high=float(np.exp(high)),
             range=turned.range,
             parts=mean(lambda r: r.parts),
-            views=tuple(view * beta_m / self.beta_m for view in self.views),
-            systematic=systematic,
+            views=tuple(view * float(np.exp(answer)) / self.beta_m for view in self.views),
+            systematic=float(np.sqrt(error**2 - alone**2)),
             disorder=disorder,
         )
 

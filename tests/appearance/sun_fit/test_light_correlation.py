@@ -189,6 +189,7 @@ def test_turns_at_the_end_of_what_was_tried_are_a_warning(family):
     about = match_roughness(highlight(0.3, 20, seed=4), family)
     found = about.of_fibres(about, 24, replace(surely(24), beyond=True))
     assert any("turned by 24°" in w for w in found.warnings())
+    assert any("an end of the range" in w for w in found.warnings())
     assert found.warnings() != about.of_fibres(about, 24, surely(24)).warnings()
 
 
