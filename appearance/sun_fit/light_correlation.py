@@ -122,24 +122,25 @@ class Roughness:
     def warnings(self) -> list[str]:
         """What a user has to know before believing it, a sentence each."""
         said, either = [], f"{self.low:.2g} to {self.high:.2g}"
-        least, most = self.range
+        (least, most), d = self.range, self.disorder
+        unsure = d is not None and not d.told and self.low < SURE * self.beta_m
         if any(self.ends()):
             said.append(
                 f"β_M {self.beta_m:.2g} is known to lie in {either} only, which reaches an end of "
                 f"the range that was rendered, {least:.2g} to {most:.2g}"
             )
-        elif self.high > WIDEST * self.low:
+        elif self.high > WIDEST * self.low and not unsure:
             said.append(f"β_M {self.beta_m:.2g} is uncertain: the highlight fits {either}")
         if np.sqrt(self.error**2 - self.systematic**2) > max(2 * self.parts, LARGEST_ERROR):
             views = ", ".join(f"{beta:.2g}" for beta in self.views)
             said.append(f"views disagree about β_M by more than their noise: {views}")
-        d, turns = self.disorder, "single hairs turn more than the strands"
+        turns = "single hairs turn more than the strands"
         if d is not None and d.told:
             said.append(
                 f"{turns}, by {d.low:.0f} to {d.high:.0f}°, by what pixels beside each other tell: "
                 f"the fibres' β_M, {self.beta_m:.2g} ({either}), stands on that"
             )
-        elif d is not None and self.low < SURE * self.beta_m:
+        elif d is not None and unsure:
             said.append(
                 f"pixels beside each other hardly tell by how much {turns}, {d.low:.0f} to "
                 f"{d.high:.0f}°: the fibres' β_M, {self.beta_m:.2g}, may be {either}"

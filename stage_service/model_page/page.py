@@ -187,7 +187,7 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
         said.append(f", {fibres['low']:.2f} to {fibres['high']:.2f} at about 95 %")
         if fibres.get("disorder_low_deg") is not None:
             turns = "{disorder_low_deg:.0f} to {disorder_high_deg:.0f}°".format(**fibres)
-            said.append(f"; single hairs turn more than these strands, by {turns}")
+            said.append(f"; single hairs turn by {turns} more than these strands")
     else:
         said = ["not known"]
     yield "of the fibres", said

@@ -84,8 +84,7 @@ def test_everything_that_is_known_stands_on_the_page(model):
     text = Page(model_page(model)).text
     for said in (
         *("2 of 4 points", "0 m in all; a strand 100 mm, median", "50 µm"),
-        *("β_M 0.33", "β_M 0.30, 0.28 to 0.39 at about 95 %; single hairs turn more than"),
-        "these strands, by 12 to 16°",
+        *("β_M 0.33", "β_M 0.30, 0.28 to 0.39 at about 95 %; single hairs turn by 12 to 16° more"),
         *("σ_a 0.1 ± 5%, 0.2 ± 6%, 0.4"),
         *("growth of strands look here", "voxels", "no hair", "3 of 4"),
         *("off mm0.5 (0.25 to 1.5: 10 to 90 %)", "50.0 / 25.0 / 33.3", "hull + vertical"),
