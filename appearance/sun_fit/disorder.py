@@ -61,7 +61,7 @@ class Disorder:
     """What is known of by how much single strands turn beyond those that are there.
 
     `squares (K,)` of the turn, degrees² root mean square, one as likely as another, ascending, up
-    to that of `most`, what was tried; `beyond` says that pixels differ by more than even that does.
+    to that of `most`, what was tried; `beyond`: pixels surely differ by more than those turned so.
     """
 
     squares: tuple[float, ...]
