@@ -155,7 +155,7 @@ def run_at_size(
             table = Table(captured, options, progress=within(progress, f"({name})"), seed=seed + k)
             variants = table.run()
             found.append(_final(variants))
-            result["subjects"][f"{name}, seed {seed + k}"] = variants
+            result["subjects"][f"{name}, seed of the fit {seed + k}"] = variants
             result["cpu_seconds"] = time.process_time() - begun
             save(out / f"appearance_{size}.json", result)
         result.setdefault("seeds", {})[name] = {n: spread([f[n] for f in found]) for n in found[0]}
