@@ -211,6 +211,26 @@ def test_turns_that_may_be_there_and_do_not_show_are_told(family):
     assert same.warnings() == rough.warnings()
 
 
+def test_turns_that_leave_fibres_no_roughness_are_not_believed(family):
+    """Of the lobe's variance 20° are 0.045 of 0.085: 48° would be 0.26."""
+    rough, smooth = (match_roughness(highlight(beta), family) for beta in (0.3, 0.22))
+    found = rough.of_fibres(smooth, 20, Disorder((0.0,) * 60 + (48.0**2,) * 40, 48))
+    assert found.beta_m == pytest.approx(0.3, rel=0.02)
+    assert found.low > 0.25
+    none_left = rough.of_fibres(smooth, 20, surely(48))
+    assert none_left.beta_m == pytest.approx(BETAS[0])
+    assert any("end of the range" in w for w in none_left.warnings())
+
+
+def test_turns_that_were_not_measured_may_be_none_or_more_than_the_tangents_say(family):
+    rough, smooth = (match_roughness(highlight(beta), family) for beta in (0.3, 0.2))
+    found = rough.of_fibres(smooth, 12, None)
+    # three quarters of the way in variance is 0.232; a mean of logarithms is less
+    assert 0.2 < found.beta_m < 0.232
+    assert found.low < 0.17
+    assert found.high > 0.29
+
+
 def test_roughnesses_at_the_ends_of_what_was_rendered_are_told_of_fibres_too(family):
     rough = match_roughness(highlight(0.99, 5, 0.3), family)
     found = rough.of_fibres(replace(rough, beta_m=0.8, low=0.75), 12, surely(4))

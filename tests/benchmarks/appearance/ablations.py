@@ -143,9 +143,9 @@ def run_at_size(
         if name == "cycles":
             captured = captured_by_cycles(cycles_folder(runs.capture), seed)
         elif name == RECONSTRUCTED:
-            frames = frames or known_subject("b", subject, rig, seed)
             if runs.strands is None:
                 raise LeftOut("subject r needs --strands, which a reconstruction of it made")
+            frames = frames or known_subject("b", subject, rig, seed)
             captured = on_reconstructed(frames, read_strands(runs.strands), subject)
         else:
             captured = known_subject(name, subject, rig, seed, frames)
