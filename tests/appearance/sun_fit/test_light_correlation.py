@@ -148,14 +148,19 @@ def surely(degrees):
     return Disorder((degrees**2,) * 100, 24)
 
 
-@pytest.mark.parametrize(("turn_deg", "rendered_deg"), [(4, 8), (8, 8), (8, 12), (12, 8)])
-def test_the_fibres_roughness_is_found_under_turns_that_are_known(family, turn_deg, rendered_deg):
+@pytest.mark.parametrize(
+    ("turn_deg", "rendered_deg", "within"),
+    [(4, 8, 0.015), (8, 8, 0.01), (8, 12, 0.08), (12, 8, 0.06)],
+)
+def test_the_fibres_roughness_is_found_under_turns_that_are_known(
+    family, turn_deg, rendered_deg, within
+):
     """Where strands were turned by as much for the renderings, and where by more or less."""
     captured = turned_hair(turn_deg)
     rough = match_roughness(captured, family)
     rendered = [(beta, turned_hair(rendered_deg, beta, seed=9)) for beta in BETAS]
     found = rough.of_fibres(match_roughness(captured, rendered), rendered_deg, surely(turn_deg))
-    assert found.beta_m == pytest.approx(0.3, rel=0.08)
+    assert found.beta_m == pytest.approx(0.3, rel=within)
     assert abs(found.beta_m - 0.3) < 0.5 * abs(rough.beta_m - 0.3)
 
 
