@@ -55,7 +55,7 @@ OWNER_WORDS = 17
 
 
 class LightRegisters(Strict):
-    """`[devices.lights.registers]`: Modbus addresses; the defaults are those of docs/wire.md.
+    """`[devices.lights.registers]`: Modbus addresses, by default those of docs/reference/wire.md.
 
     Holding registers, then input registers; `levels`, `coils`, `table` and `owner` are the first of
     many. Without `owner` services of several machines do not see each other.

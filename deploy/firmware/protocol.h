@@ -1,4 +1,4 @@
-/* The trigger box: its line protocol (docs/wire.md) and the table that it clocks.
+/* The trigger box: its line protocol (docs/reference/wire.md) and the table that it clocks.
  *
  * Portable C99 without an operating system: no heap, no stdio, no clock of its own. The board hands
  * in time, inputs and received bytes, and puts out what `tb_poll` returns:

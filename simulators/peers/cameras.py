@@ -1,4 +1,4 @@
-"""The cameras' side of the camera link (docs/wire.md): JSON requests and frames over TCP."""
+"""The cameras' side of the camera link (docs/reference/wire.md): JSON and frames over TCP."""
 
 from __future__ import annotations
 

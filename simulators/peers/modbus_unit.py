@@ -1,4 +1,4 @@
-"""The light bank as a Modbus unit: its register map (docs/wire.md) and the functions it knows.
+"""The light bank as a Modbus unit: its registers (docs/reference/wire.md) and functions.
 
 Written from the Modbus Application Protocol Specification 1.1b3; it carries no framing.
 `DisturbedUnit` is the same behind a wire with faults.

@@ -1,4 +1,4 @@
-"""The projector controller's side of its serial protocol (docs/wire.md), and what is shown."""
+"""The projector controller: its serial protocol (docs/reference/wire.md) and what it shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trigger box's side of its serial protocol (docs/wire.md)."""
+"""The trigger box's side of its serial protocol (docs/reference/wire.md)."""
 
 from __future__ import annotations
 

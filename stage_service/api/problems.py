@@ -49,7 +49,7 @@ PAGE = "/docs/errors.md"
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of problem: its anchor in docs/errors.md, its status, and what to do about it."""
+    """One kind of problem: its anchor in the errors page, its status, and what to do about it."""
 
     slug: str
     status: int
@@ -60,8 +60,8 @@ class Kind:
 TABLE = """
 unauthorized 401 Who asks is not known
     Every request but those for /docs and /openapi.json carries `Authorization: Bearer TOKEN`, or
-    the cookie that `POST /login` sets. `hairstage token` makes tokens; docs/safety.md says who may
-    do what.
+    the cookie that `POST /login` sets. `hairstage token` makes tokens; docs/how-to/safety.md says
+    who may do what.
 forbidden 403 This token does not allow that
     `scope` is what it lacks. Abort and blackout are open to every token.
 foreign-origin 403 A web page of another site asked
@@ -84,7 +84,7 @@ no-stage 409 The rig file names no devices
     `[devices]`, or with `--devices`.
 flash-rate 422 A living subject would see flashes of 3 to 30 Hz
     `problems` has the ways out: a slower plan, or recorded consent that somebody at the stage
-    arms. docs/safety.md says why. No lamp was touched.
+    arms. docs/how-to/safety.md says why. No lamp was touched.
 unsafe 409 Nobody knows whether the lamps are off
     The last blackout could not be verified. Look at the stage, put `detail` right, then `POST
     /devices/blackout`; where the link cannot read back, `POST /devices/acknowledge`.
@@ -195,7 +195,7 @@ EXTRA = ("problems", "running", "state", "holder", "expires", "scope")
 
 
 class Problem(BaseModel):
-    """An error as RFC 9457 has it; `type` leads to the paragraph of docs/errors.md about it."""
+    """An error as RFC 9457 has it; `type` leads to its paragraph of the errors page."""
 
     model_config = ConfigDict(
         extra="allow",
@@ -239,7 +239,7 @@ def problem_response(
 
 
 def errors_page() -> str:
-    """The text of docs/errors.md."""
+    """The text of docs/reference/errors.md."""
     parts = ["# Errors of the HTTP API", ""]
     parts += [
         "Every error is a problem document (RFC 9457, `application/problem+json`) with `type`,",

@@ -1,1 +1,1 @@
-"""Drivers for the stage's devices; `docs/wire.md` is the protocol."""
+"""Drivers for the stage's devices; `docs/reference/wire.md` is the protocol."""

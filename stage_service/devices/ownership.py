@@ -30,8 +30,9 @@ class Ownership:
 
     On this machine it is a lock file, named for the bank's address, which the kernel frees when the
     process dies. For services on other machines it is the bank's owner register, where it has one
-    (docs/wire.md), which outlives the process: who finds the name of a dead process of its own
-    machine there takes its place, and `take_over` says that the one of another machine is dead.
+    (docs/reference/wire.md), which outlives the process: who finds the name of a dead process of
+    its own machine there takes its place, and `take_over` says that the one of another machine is
+    dead.
     Making one raises `StageInUse` where the lock is held.
     """
 

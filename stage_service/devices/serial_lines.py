@@ -87,7 +87,7 @@ class SerialLines:
             todo = "Close the interlock and release the emergency stop at the stage."
             raise self._error(SafetyRefusal, doing, expected, received, todo)
         expected = f"an answer to {request!r} like {reply!r}"
-        todo = "Check that the device follows docs/wire.md and that nobody else uses the port."
+        todo = "Check that the device follows docs/reference/wire.md and has the port to itself."
         raise self._error(DeviceError, doing, expected, repr(line), todo)
 
     def echo(self, request: str, doing: str) -> None:

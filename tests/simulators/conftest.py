@@ -1,4 +1,4 @@
-"""A small stage on the real wires, and the clients' side of each, written from docs/wire.md."""
+"""A small stage on real wires, and the clients' side of each, from docs/reference/wire.md."""
 
 from __future__ import annotations
 

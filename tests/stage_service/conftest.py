@@ -1,4 +1,4 @@
-"""A tiny stage on real wires: the device side of docs/wire.md, with faults to script."""
+"""A tiny stage on real wires: the device side of docs/reference/wire.md, with faults to script."""
 
 from __future__ import annotations
 

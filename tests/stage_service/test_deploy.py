@@ -87,7 +87,9 @@ def test_serial_ports_belong_to_a_group_that_a_container_has_too():
     service = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["service"]
     assert set(re.findall(r'GROUP="(\w+)"', rules)) == set(service["group_add"]) == {"dialout"}
     assert "--groups dialout" in (DEPLOY / "Containerfile").read_text()
-    assert "adduser hairstage dialout" in (DEPLOY.parent / "docs" / "deployment.md").read_text()
+    assert (
+        "adduser hairstage dialout" in (DEPLOY.parent / "docs" / "how-to" / "deploy.md").read_text()
+    )
 
 
 def test_rig_files_use_the_ports_that_the_udev_rules_name():

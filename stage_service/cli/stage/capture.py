@@ -101,7 +101,11 @@ def _costed(cost: dict[str, Any]) -> str:
         if cost["stepping"]["hardware"]
         else f"the service clocks every step: {cost['stepping_why']}",
         f"flashes at {flash['hz']:.1f} Hz ({flash['band']})"
-        + (": needs consent, or rate_hz; see docs/safety.md" if flash["needs_consent"] else ""),
+        + (
+            ": needs consent, or rate_hz; see docs/how-to/safety.md"
+            if flash["needs_consent"]
+            else ""
+        ),
         f"light: {cost['lamp_seconds']:.1f} lamp seconds, "
         f"{', '.join(f'{d:.3g}' for d in cost['dose'])} J/m² (R, G, B) at the head",
     ]

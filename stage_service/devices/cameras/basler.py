@@ -1,4 +1,4 @@
-"""A Basler camera through pylon, triggered by wire; see `docs/wire.md`.
+"""A Basler camera through pylon, triggered by wire; see `docs/reference/wire.md`.
 
 What a camera can do is asked of its node map, not of its model's name.
 """

@@ -1,4 +1,4 @@
-"""A camera on the camera link: length-prefixed JSON and counts; see `docs/wire.md`."""
+"""A camera on the camera link: length-prefixed JSON and counts; see `docs/reference/wire.md`."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class LinkCamera:
             if status == "empty":
                 return None
             if status != "busy":
-                todo = "Check that the camera follows docs/wire.md."
+                todo = "Check that the camera follows docs/reference/wire.md."
                 raise self._error(doing, "the status frame, busy or empty", repr(status), todo)
             if time.monotonic() > deadline:
                 todo = "Check the camera, or raise busy_s in [devices.cameras]."
@@ -130,7 +130,7 @@ class LinkCamera:
     def _number(self, answer: dict[str, Any], field: str, doing: str) -> Any:
         value = answer.get(field)
         if not isinstance(value, int | float) or isinstance(value, bool):
-            todo = "Check that the camera follows docs/wire.md."
+            todo = "Check that the camera follows docs/reference/wire.md."
             raise self._error(doing, f"a number {field!r}", repr(value), todo)
         return value
 

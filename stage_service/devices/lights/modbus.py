@@ -1,4 +1,4 @@
-"""A light bank on Modbus, TCP or RTU; `docs/wire.md` has its register map."""
+"""A light bank on Modbus, TCP or RTU; `docs/reference/wire.md` has its register map."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Power and lamp hours of a projector on PJLink class 1; never a part of a capture's timing.
 
 Source: PJLink Specifications, version 1.04 (10 December 2013), JBMIA: the commands POWR and LAMP
-and the authentication. `docs/wire.md` has what is used of it.
+and the authentication. `docs/reference/wire.md` has what is used of it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The projector controller on a serial port; `docs/wire.md` has its lines."""
+"""The projector controller on a serial port; `docs/reference/wire.md` has its lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our hair BSDF beside Mitsuba's stock `hair`: tables and pictures of docs/bsdf.md.
+"""Our hair BSDF beside Mitsuba's stock `hair`: tables and pictures of docs/explanation/bsdf.md.
 
 Leaves `bsdf.json`, `bsdf.md`, `bsdf_sheet.png` and `bsdf_furnace.png`; a test holds both BSDFs to
 what the tables say.

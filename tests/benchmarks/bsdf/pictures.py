@@ -1,4 +1,4 @@
-"""Pictures of the hair BSDF for docs/bsdf.md: a sheet of its looks, and white furnaces.
+"""Pictures of the hair BSDF for docs/explanation/bsdf.md: a sheet of its looks, and white furnaces.
 
 `python -m benchmarks.bsdf.pictures FOLDER` writes `bsdf_sheet.png` and `bsdf_furnace.png`.
 """

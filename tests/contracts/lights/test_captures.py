@@ -16,7 +16,7 @@ from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
-WIRE_PAGE = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
+WIRE_PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "wire.md"
 DMX = """[devices.lights]
 kind = "dmx_enttec"
 port = "lights"

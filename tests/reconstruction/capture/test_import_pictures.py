@@ -620,7 +620,7 @@ def test_rows_that_nothing_places_between_tracking_frames(beamed):
 
 
 def test_the_documented_example_places_rows_between_tracking_frames(beamed):
-    text = (Path(__file__).parents[3] / "docs" / "importing.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "how-to" / "import.md").read_text()
     said = dict(re.findall(r"^(tracking|scanline) = (.*)$", text, re.MULTILINE))
     for camera in CAMERAS:
         for name in ("track_00001", "proj_0_00002_2", "proj_0_00003_3", "track_00004"):

@@ -277,7 +277,7 @@ def test_the_head_hides_where_the_true_strands_do_not_reach(front: Camera) -> No
 
 @pytest.mark.slow
 def test_a_hundred_thousand_strands_are_scored_in_half_a_gigabyte() -> None:
-    """20 million points on both sides: docs/evaluation.md tells the figures."""
+    """20 million points on both sides: docs/explanation/evaluation.md tells the figures."""
     code = """
 import re
 import time

@@ -81,7 +81,7 @@ def test_a_failure_while_finishing_wins():
 
 
 def test_the_documentation_has_the_same_transitions():
-    text = (Path(__file__).resolve().parents[3] / "docs" / "capture.md").read_text()
+    text = (Path(__file__).resolve().parents[3] / "docs" / "explanation" / "capture.md").read_text()
     for state, actions in TRANSITIONS.items():
         cell = ", ".join(f"{action} → {after}" for action, after in actions.items())
         assert f"- **{state}**: {cell}\n" in text

@@ -552,7 +552,7 @@ def test_every_route_of_the_api_is_there_and_documented(http):
 
 
 def test_the_page_of_errors_is_the_table():
-    assert (DOCS / "errors.md").read_text() == errors_page()
+    assert (DOCS / "reference" / "errors.md").read_text() == errors_page()
 
 
 @pytest.mark.parametrize(

@@ -312,7 +312,7 @@ def test_a_level_that_the_bank_does_not_have_is_refused_in_the_plan(demo, bank, 
 
 
 def test_a_sweep_that_the_projectors_would_not_show_is_refused(demo):
-    """Their wire has 65535 levels above 0 (docs/wire.md): 0.5 / 65535 is 7.63e-6."""
+    """Their wire has 65535 levels above 0 (docs/reference/wire.md): 0.5 / 65535 is 7.63e-6."""
     sweep = {"lights": (), "sentinels": False}
     resolve(CapturePlan(level={"scanline": 7.7e-6}, **sweep), demo)
     with pytest.raises(PlanError, match=r"level\.tracking: the projector controller") as error:
@@ -354,5 +354,5 @@ def test_the_longest_on_time_is_that_of_the_plain_search(gaps, window):
 
 
 def test_the_page_on_safety_names_every_limit():
-    page = (RIGS.parents[1] / "docs" / "safety.md").read_text()
+    page = (RIGS.parents[1] / "docs" / "how-to" / "safety.md").read_text()
     assert [f for f in SafetyLimits.model_fields if f"`{f}`" not in page] == []
