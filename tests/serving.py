@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
 import uvicorn
@@ -17,6 +19,9 @@ from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.config import RigFile
 from stage_service.service import Service
+
+URL = "http://127.0.0.1"
+"""Where `send` sends to."""
 
 
 class Client(httpx.Client):
@@ -66,3 +71,21 @@ def listening_app(app: FastAPI, port: int = 0) -> Iterator[str]:
 def slug(response: httpx.Response) -> str:
     """What a problem document says is wrong."""
     return str(response.json()["type"]).partition("#")[2]
+
+
+def send(app: FastAPI, what: str, headers: dict[str, str], **more: Any) -> httpx.Response:
+    """The answer to a request like "GET /captures"; of a service that has not started."""
+    method, path = what.split(" ")
+
+    async def answer() -> httpx.Response:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=URL) as http:
+            return await http.request(method, path, headers=headers, **more)
+
+    return asyncio.run(answer())
+
+
+def refused(response: httpx.Response, slug: str, status: int) -> dict[str, Any]:
+    """The problem document that a response is, of this kind and status."""
+    data: dict[str, Any] = response.json()
+    assert (data["type"], response.status_code) == (f"/docs/errors.md#{slug}", status), data
+    return data

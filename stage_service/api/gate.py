@@ -8,14 +8,17 @@ from __future__ import annotations
 import asyncio
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from reconstruction.reading import parse_json
-from stage_service.api.login import LOGIN, Logins
+from stage_service.api.login import LOGIN, cookies, place
 from stage_service.api.problems import PAGE, problem_response
+from stage_service.api.steering import RIGHT
+from stage_service.records.logins import Logins
 from stage_service.records.tokens import SCOPES, Identity, Tokens, UnknownToken
 from stage_service.web.pages import FOLDER, PAGES
 
@@ -24,6 +27,8 @@ VIEW, VIEW_PAGE = "/view", "/view/page/"
 OPEN = {PAGE, "/openapi.json", VIEW, *PAGES}
 """Says nothing of a stage: how to ask, for whoever may not yet. So do the pages' files."""
 ANYBODY = Identity(name="", scopes=SCOPES)
+DARK = ("POST", "/devices/blackout")
+"""The one request that a page's right to a blackout opens."""
 MOST_BODY = 1 << 20
 BODY_S = 20.0
 """A request's body is there within this time."""
@@ -56,15 +61,22 @@ class Access:
             return "foreign-origin", f"a page of {origin!r} may not ask this service", None
         return None
 
-    def identity(self, headers: Headers) -> Identity | None:
-        """Who asks; a token that is sent counts alone, not the cookie beside it."""
+    def identity(self, headers: Headers, secure: bool = False) -> Identity | None:
+        """Who asks, over TLS where `secure`; a token that is sent counts alone, not the cookie
+        beside it. Of several cookies the first good one counts."""
         if self.tokens is None:
             return ANYBODY
         if "authorization" in headers:
             kind, _, token = headers["authorization"].partition(" ")
             return self.tokens.find(token.strip()) if kind.lower() == "bearer" else None
-        behind = self.logins.token_of(headers)
-        return None if behind is None else self.tokens.behind(behind)
+        behind = self.logins.tokens_of(cookies(headers, secure), place(headers))
+        return next(filter(None, map(self.tokens.behind, behind)), None)
+
+    def darkens(self, headers: Headers) -> Identity | None:
+        """Who may black out, and nothing else, by what a page keeps of an earlier login; asks no
+        disk."""
+        name = self.logins.blackout_by(headers.get(RIGHT, ""))
+        return None if name is None else Identity(name=f"{name}, blackout right", scopes=())
 
     def of_token(self, token: str) -> Identity:
         """Whose token this is. Raises `UnknownToken`."""
@@ -90,9 +102,12 @@ class Gate:
         headers = Headers(scope=scope)
         refusal = self._access.refusal(headers)
         if refusal is None:
-            identity = self._access.identity(headers)
+            identify = partial(self._access.identity, secure=scope["scheme"] == "https")
+            identity = identify(headers)
+            if identity is None and (scope["method"], scope["path"]) == DARK:
+                identity = self._access.darkens(headers)
             state = scope.setdefault("state", {})
-            state["identity"], state["identify"] = identity, self._access.identity
+            state["identity"], state["identify"] = identity, identify
             if identity is None and not _open(scope):
                 detail = (
                     "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown, or "

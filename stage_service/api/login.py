@@ -2,55 +2,19 @@
 
 from __future__ import annotations
 
-import secrets
-import threading
-import time
-from collections import OrderedDict
 from typing import Annotated
 
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.datastructures import Headers
 
+from stage_service.api.problems import problem_response
 from stage_service.api.steering import Anybody, OnService
-from stage_service.records.tokens import Identity, Scope, hashed
+from stage_service.captures.control import Caller
+from stage_service.records import logins
+from stage_service.records.tokens import Identity, Scope
 
-LASTS_S = 12 * 3600.0
-"""A day's work at the stage."""
-MOST_LOGINS = 1000
 LOGIN = "/login"
-
-
-class Logins:
-    """Who has logged in, for `LASTS_S` at most; a restart, or `MOST_LOGINS` newer ones, end it.
-
-    What the cookie holds is no token: it opens nothing once its login has ended, here, and tells
-    nobody the token. A login opens what its token opens now, so nothing once that is revoked.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._begun: OrderedDict[str, tuple[str, float]] = OrderedDict()
-
-    def begin(self, token: str) -> str:
-        """Log in by a token, which was found good; returns what the cookie is to hold."""
-        held = secrets.token_urlsafe(32)
-        with self._lock:
-            self._begun[hashed(held)] = hashed(token), time.monotonic() + LASTS_S
-            while len(self._begun) > MOST_LOGINS:
-                self._begun.popitem(last=False)
-        return held
-
-    def token_of(self, headers: Headers) -> str | None:
-        """The hash of the token that a request's cookie stands for."""
-        with self._lock:
-            token, until = self._begun.get(_held(headers), ("", 0.0))
-        return token if time.monotonic() < until else None
-
-    def end(self, headers: Headers) -> None:
-        """Log out."""
-        with self._lock:
-            self._begun.pop(_held(headers), None)
 
 
 class LoginRequest(BaseModel):
@@ -62,10 +26,12 @@ class LoginRequest(BaseModel):
 
 
 class Who(BaseModel):
-    """Whose token it is ("" where nobody is asked for one), and what it opens."""
+    """Whose token it is ("" where nobody needs one), and what it opens; `blackout` is what a page
+    sends as the header `Hairstage-Blackout` to darken the stage whatever becomes of its login."""
 
     name: str
     scopes: tuple[Scope, ...]
+    blackout: str | None
 
 
 open_to_all = APIRouter(tags=["login"])
@@ -79,42 +45,66 @@ def log_in(body: LoginRequest, request: Request, response: Response, service: On
     access = request.app.state.access
     identity: Identity = access.of_token(body.token)
     if access.tokens is not None:
-        response.headers["Set-Cookie"] = _cookie(request, access.logins.begin(body.token), LASTS_S)
+        held = access.logins.begin(body.token, place(request.headers))
+        response.headers["Set-Cookie"] = _cookie(request, held, logins.LASTS_S)
         service.record_login(identity.name, request.client)
-    return Who(name=identity.name, scopes=identity.scopes)
+    return _who(request, identity)
 
 
 @router.get(LOGIN)
-async def who(by: Anybody) -> Who:
+async def who(request: Request, by: Anybody) -> Who:
     """Whom the service takes the caller for, by token or cookie, and what that opens."""
-    return Who(name=by.name, scopes=by.scopes)
+    return _who(request, by)
 
 
-@router.post("/logout")
-async def log_out(request: Request, response: Response, by: Anybody) -> Who:
-    """End the login: its cookie opens nothing any more, whoever kept it."""
-    request.app.state.access.logins.end(request.headers)
+@router.post("/logout", response_model=Who)
+def log_out(request: Request, response: Response, by: Anybody) -> Who | Response:
+    """End the login: its cookie opens nothing any more, whoever kept it. The right to a blackout
+    stays."""
+    access, held = request.app.state.access, cookies(request.headers, _secure(request))
+    answer: Who | Response = _who(request, by)
+    try:
+        access.logins.end(held, place(request.headers))
+    except logins.NotStored as error:
+        answer = response = problem_response(request.url.path, "not-stored", str(error))
     response.headers["Set-Cookie"] = _cookie(request, "", 0)
-    return Who(name=by.name, scopes=by.scopes)
+    return answer
+
+
+def place(headers: Headers) -> str:
+    """Host and port that a request names, to which a login is bound: a browser sends the cookies of
+    one port to all others of the host."""
+    return headers.get("host", "").lower()
+
+
+def cookies(headers: Headers, secure: bool) -> list[str]:
+    """What the login cookies of a request hold, as they came: another port of the host may have set
+    one of the same name, with a longer path, which comes first."""
+    name = _name(headers, secure)
+    parts = [part.strip() for line in headers.getlist("cookie") for part in line.split(";")]
+    return [value for part in parts for key, _, value in [part.partition("=")] if key == name]
+
+
+def _who(request: Request, by: Caller | Identity) -> Who:
+    access = request.app.state.access
+    right = None if access.tokens is None else access.logins.blackout_right(by.name)
+    return Who(name=by.name, scopes=by.scopes, blackout=right)
 
 
 def _cookie(request: Request, held: str, seconds: float) -> str:
     """`Set-Cookie`; an empty one takes it back."""
-    over_tls = "; Secure" if request.url.scheme == "https" else ""
+    over_tls = "; Secure" if _secure(request) else ""
     rules = f"Path=/; Max-Age={seconds:.0f}; HttpOnly; SameSite=Strict{over_tls}"
-    return f"{_name(request.headers)}={held}; {rules}"
+    return f"{_name(request.headers, _secure(request))}={held}; {rules}"
 
 
-def _name(headers: Headers) -> str:
-    """The cookie's: a browser does not keep those of two ports of one host apart."""
+def _name(headers: Headers, secure: bool) -> str:
+    """The cookie's. Over TLS a browser takes `__Host-` from this very host alone, and for TLS; the
+    port is in it, as a browser does not keep those of two ports of one host apart."""
     port = headers.get("host", "").rpartition(":")[2]
-    return f"hairstage-{port}" if port.isdigit() else "hairstage"
+    name = f"hairstage-{port}" if port.isdigit() else "hairstage"
+    return f"__Host-{name}" if secure else name
 
 
-def _held(headers: Headers) -> str:
-    """The hash of what the request's cookie holds."""
-    for part in headers.get("cookie", "").split(";"):
-        name, _, value = part.strip().partition("=")
-        if name == _name(headers):
-            return hashed(value)
-    return ""
+def _secure(request: Request) -> bool:
+    return request.url.scheme == "https"

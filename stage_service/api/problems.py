@@ -101,6 +101,8 @@ not-there 404 No such thing in the store
     `GET /models`, `/uploads` and `/trash` list what there is.
 disk-full 507 The disk has no room
     `detail` says how much is needed. `DELETE /trash` makes room.
+not-stored 507 The disk did not take it
+    It counts until the service ends. `detail` says what it means and what to do.
 leased 409 Somebody else steers the stage
     `holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are open to
     everybody.

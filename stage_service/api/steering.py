@@ -45,6 +45,8 @@ async def caller(
     return by
 
 
+RIGHT = "Hairstage-Blackout"
+"""The header with a page's right to a blackout."""
 OnService = Annotated[Service, Depends(on_service)]
 Anybody = Annotated[Caller, Security(caller)]
 """Any token will do."""
@@ -101,7 +103,14 @@ async def get_devices(service: OnService, lanes: OnLanes) -> dict[str, Any]:
 
 
 @router.post("/devices/blackout", tags=["devices"])
-async def blackout(service: OnService, lanes: OnLanes, by: Anybody) -> dict[str, Any]:
+async def blackout(
+    service: OnService,
+    lanes: OnLanes,
+    by: Anybody,
+    right: Annotated[
+        str | None, Header(alias=RIGHT, description="`blackout` of a login, in place of a token")
+    ] = None,
+) -> dict[str, Any]:
     """All lamps and projectors off, verified. Aborts a running capture."""
     return await lanes.dark(service.blackout, by)
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import hmac
 import json
 import os
 import pwd
 import secrets
 import threading
-import time
 from collections.abc import Iterator
-from concurrent.futures import Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -20,9 +19,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from reconstruction.capture.writer import utc_now
 from reconstruction.containment import is_file_name, plain_file
-from reconstruction.files.durable import writing
+from reconstruction.files.durable import flush, writing
 from reconstruction.reading import read_json
-from stage_service.background import beside
+from stage_service.records.watched import WatchedFile
 
 Scope = Literal["read", "steer", "arm", "jobs", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
@@ -69,20 +68,23 @@ class Tokens:
         self._path = path
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
-        self._read: tuple[tuple[int, int, int] | None, dict[str, Identity]] = (None, {})
-        self._looking = threading.Lock()
-        self._look: Future[dict[str, Identity]] | None = None
-        self._until = 0.0
+        self._file = WatchedFile[dict[str, Identity]](path, self._opened, {}, WAIT_S)
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""
         return self.behind(hashed(token))
 
     def behind(self, hash: str) -> Identity | None:
-        """Whose token has this hash."""
-        if hash == self._own:
-            return Identity(name=_user(), scopes=SCOPES)
-        return self._known().get(hash)
+        """Whose token has this hash. It is compared with each, in the same time whether one is
+        found or not."""
+        known = dict(self._file.value)
+        if self._own is not None:
+            known[self._own] = Identity(name=_user(), scopes=SCOPES)
+        found = None
+        for own, identity in known.items():
+            if hmac.compare_digest(own.encode(), hash.encode()):
+                found = identity
+        return found
 
     def entries(self) -> list[Entry]:
         """All of the file, the oldest first. Raises `TokenError`."""
@@ -123,27 +125,11 @@ class Tokens:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
-    def _known(self) -> dict[str, Identity]:
-        with self._looking:
-            if self._look is None or self._look.done():
-                self._look = beside(self._seen, "tokens")
-                self._until = time.monotonic() + WAIT_S
-            look, left = self._look, max(0.0, self._until - time.monotonic())
-        return look.result() if wait([look], left).done else self._read[1]
-
-    def _seen(self) -> dict[str, Identity]:
-        try:
-            found = self._path.stat()
-        except OSError:
-            return {}
-        version = (found.st_ino, found.st_mtime_ns, found.st_size)
-        if self._read[0] != version:
-            try:
-                entries = {e.sha256: Identity(name=e.name, scopes=e.scopes) for e in self.entries()}
-            except TokenError:
-                entries = {}
-            self._read = (version, entries)
-        return self._read[1]
+    def _opened(self) -> dict[str, Identity]:
+        """By hash; nothing where the file is missing or cannot be read."""
+        with suppress(TokenError):
+            return {e.sha256: Identity(name=e.name, scopes=e.scopes) for e in self.entries()}
+        return {}
 
     def _write(self, entries: list[Entry]) -> None:
         write_secret(self._path, json.dumps([e.model_dump() for e in entries], indent=1) + "\n")
@@ -177,10 +163,11 @@ def own_token() -> str:
 
 
 def write_secret(path: Path, text: str) -> None:
-    """Write a small file that its user alone may read."""
+    """Write a small file that its user alone may read; it and its name are on the disk then."""
     with writing(path) as temporary:
         temporary.touch(0o600)
         temporary.write_text(text)
+    flush(path.parent)
 
 
 def _user() -> str:

@@ -108,7 +108,6 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
         expected = "days above 0 and at most 10,000"
         raise BadArgument(f"--verify-days: expected {expected}, got {args.verify_days:g}")
     _check_certificate(args)
-    access = _access(args, {endpoint.name, *args.name}, output)
     rig_file = load_rig_file(args.rig, args.devices)
     try:
         service = Service(
@@ -129,6 +128,8 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             f"--root {args.root}: {error}: give another, or free this one. As no service can run, "
             f"lamps and projectors were to be put off: {off}"
         ) from error
+
+    access = _access(args, {endpoint.name, *args.name}, output)
 
     def ready(url: str) -> None:
         text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"
@@ -158,6 +159,7 @@ def _check_certificate(args: argparse.Namespace) -> None:
 
 def _access(args: argparse.Namespace, named: set[str], output: Output) -> Access:
     from stage_service.api.gate import OWN_NAMES, Access
+    from stage_service.records.logins import Logins
     from stage_service.records.tokens import Tokens, own_file, own_token
 
     names = OWN_NAMES | {name.lower() for name in named}
@@ -170,7 +172,7 @@ def _access(args: argparse.Namespace, named: set[str], output: Output) -> Access
     except OSError as error:
         own = None
         output.note(f"you have no token of your own here ({error}): make one by 'hairstage token'")
-    return Access(Tokens(args.root / TOKENS, own), names)
+    return Access(Tokens(args.root / TOKENS, own), names, Logins(args.root))
 
 
 def run_worker(args: argparse.Namespace, output: Output) -> None:

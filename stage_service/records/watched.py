@@ -1,0 +1,55 @@
+"""A small file that another process may change, for readers that must not wait for its disk."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from stage_service.background import beside
+
+T = TypeVar("T")
+Version = tuple[int, int, int] | None
+"""Inode, time of the last change (ns) and size of a file; None: there is none."""
+
+
+class WatchedFile(Generic[T]):
+    """What `read()` returns, called again on a thread of its own once `path` has changed.
+
+    `value` waits at most `wait_s` seconds for the disk, and returns the last value meanwhile.
+    """
+
+    def __init__(self, path: Path, read: Callable[[], T], first: T, wait_s: float) -> None:
+        self._path, self._read, self._wait_s = path, read, wait_s
+        self._last: tuple[Version, T] = (None, first)
+        self._looking = threading.Lock()
+        self._look: Future[T] | None = None
+        self._until = 0.0
+
+    @property
+    def value(self) -> T:
+        """The newest value; raises nothing that has to do with the disk."""
+        with self._looking:
+            if self._look is None or self._look.done():
+                self._look = beside(self._looked, self._path.name)
+                self._until = time.monotonic() + self._wait_s
+            look, left = self._look, max(0.0, self._until - time.monotonic())
+        return look.result() if wait([look], left).done else self._last[1]
+
+    def _looked(self) -> T:
+        version = version_of(self._path)
+        if version != self._last[0]:
+            self._last = (version, self._read())
+        return self._last[1]
+
+
+def version_of(path: Path) -> Version:
+    """What changes whenever the file does."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size
