@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,14 +9,13 @@ from typing import Any
 
 import httpx
 import pytest
-from serving import refused, send, serving
+from serving import refused, send
 
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.config import RigFile
-from stage_service.records import logins
 from stage_service.records.logins import Logins
-from stage_service.records.tokens import SCOPES, Tokens
+from stage_service.records.tokens import Tokens
 from stage_service.service import Service
 
 DARK = "POST /devices/blackout"
