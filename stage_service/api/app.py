@@ -34,6 +34,7 @@ from stage_service.api.problems import PAGE, Faults, Problem, errors_page, insta
 from stage_service.service import Service
 from stage_service.viewer import Viewing
 from stage_service.web import pages
+from stage_service.web.headers import SafeHeaders
 
 
 def create_app(service: Service, access: Access | None = None) -> FastAPI:
@@ -89,13 +90,14 @@ def create_viewer(models: Viewing, access: Access) -> FastAPI:
 
 
 def _completed(app: FastAPI, access: Access) -> FastAPI:
-    """What every application of ours has: the viewer, problem documents, the gate."""
+    """What every application of ours has: the viewer, problem documents, gate, safe headers."""
     install_problems(app)
     app.include_router(viewing.page)
     app.include_router(viewing.reading)
     app.add_middleware(Faults)
     app.add_middleware(Heads)
     app.add_middleware(Gate, access=access)
+    app.add_middleware(SafeHeaders)  # outside: what the gate refuses has them, too
     return app
 
 

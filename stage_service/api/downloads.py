@@ -22,6 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stage_service.api.problems import problem_response
 from stage_service.storage import InUse
+from stage_service.web.headers import attachment
 
 CHUNK = 1 << 20
 READERS = 8
@@ -45,7 +46,7 @@ class Ranged(Response):
         self.headers["etag"] = f'"{etag}"'
         self.headers["accept-ranges"] = "bytes"
         if name:
-            self.headers["content-disposition"] = f'attachment; filename="{name}"'
+            self.headers["content-disposition"] = attachment(name)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer 200, 206, 304 or 416."""
@@ -99,10 +100,10 @@ def file_response(file: Path, media_type: str) -> Ranged:
     return Ranged(found.st_size, _reader(file), etag, media_type)
 
 
-def bytes_response(data: bytes, media_type: str) -> Ranged:
-    """Bytes that are at hand."""
+def bytes_response(data: bytes, media_type: str, name: str) -> Ranged:
+    """Bytes that are at hand, to be saved as `name`."""
     etag = hashlib.sha256(data).hexdigest()
-    return Ranged(len(data), lambda first, last: data[first:last], etag, media_type)
+    return Ranged(len(data), lambda first, last: data[first:last], etag, media_type, name)
 
 
 def tar_response(name: str, files: Mapping[str, Path]) -> Ranged:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import mimetypes
 from functools import partial
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import quote
 
-from fastapi import APIRouter, Header, Query, Response, status
+from fastapi import APIRouter, Header, Query, Request, Response, status
 from fastapi.responses import FileResponse, PlainTextResponse
+from starlette.concurrency import run_in_threadpool
 
 from stage_service.acquisition.states import Outcome
 from stage_service.api.downloads import RANGES, bytes_response, file_response
@@ -16,6 +17,7 @@ from stage_service.api.frames import FrameFigures, figures_of, png_preview
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
 from stage_service.jobs.records import Job
+from stage_service.model_page.page import PAGE
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
 from stage_service.service_models import (
@@ -30,6 +32,7 @@ from stage_service.service_models import (
     StepView,
 )
 from stage_service.watching import text_of
+from stage_service.web.headers import presented, report_policy
 
 router = APIRouter()
 reading = APIRouter(dependencies=READS)
@@ -116,7 +119,7 @@ async def abort_capture(
 def get_frame(capture: str, step: int, camera: str, service: OnService) -> Response:
     """A frame as it was written: scene-linear radiance, W/(sr m²)."""
     data = service.frame(capture, step, camera, Path.read_bytes)
-    return bytes_response(data, "image/x-exr")
+    return bytes_response(data, "image/x-exr", f"{capture}-{step}-{camera}.exr")
 
 
 @reading.get(
@@ -141,7 +144,7 @@ def get_preview(
     that frames can be compared; sRGB, made smaller where `size` says so."""
     look = partial(png_preview, percentile=percentile, white=white, size=size, mark=mark)
     picture = service.frame(capture, step, camera, look)
-    return Response(picture, media_type="image/png", headers={"cache-control": "max-age=60"})
+    return Response(picture, media_type="image/png")
 
 
 @reading.get("/captures/{capture}/frames/{step}/{camera}.json", tags=["captures"])
@@ -208,11 +211,21 @@ async def list_artifacts(job: str, service: OnService, lanes: OnLanes) -> list[A
     responses=RANGES,
     tags=["jobs"],
 )
-async def get_artifact(job: str, path: str, service: OnService, lanes: OnLanes) -> Response:
-    """One file of the model folder."""
+async def get_artifact(
+    job: str, path: str, request: Request, service: OnService, lanes: OnLanes
+) -> Response:
+    """One file of the model folder. A browser shows pictures, JSON and, without scripts, the page
+    `index.html`; all else it saves."""
     file = await lanes.jobs(service.jobs.artifact, job, path)
-    kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
-    return file_response(file, kind)
+    if path == PAGE:
+        response = file_response(file, "text/html; charset=utf-8")
+        folder = request.url.path.removesuffix(PAGE)
+        response.headers.update(report_policy(request.headers["host"], quote(folder)))
+        return response
+    kind, headers = await run_in_threadpool(presented, file)
+    response = file_response(file, kind)
+    response.headers.update(headers)
+    return response
 
 
 @reading.get("/rig", tags=["service"])

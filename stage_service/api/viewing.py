@@ -17,10 +17,9 @@ from stage_service.api.gate import VIEW, VIEW_PAGE
 from stage_service.api.steering import READS
 from stage_service.viewer import BadLight, NothingToView, Viewed, Viewing
 from stage_service.viewer.viewed import MOST_PIXELS
+from stage_service.web.headers import PAGE
 
 FILES = Path(__file__).parents[1] / "viewer" / "page"
-POLICY = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'"
-"""The page loads nothing from another host."""
 BYTES: dict[str, Any] = {
     "response_class": Response,
     "responses": {200: {"content": {"application/octet-stream": {}}}},
@@ -112,8 +111,7 @@ def _file(name: str) -> Response:
     if name not in {p.name for p in FILES.iterdir()}:
         raise HTTPException(404, f"the viewer's page has no part {name!r}")
     response = file_response(FILES / name, mimetypes.guess_type(name)[0] or "text/plain")
-    response.headers["content-security-policy"] = POLICY
-    response.headers["cache-control"] = "no-cache"
+    response.headers.update(PAGE)
     return response
 
 

@@ -12,22 +12,12 @@ from pathlib import Path
 from fastapi import APIRouter, HTTPException
 from fastapi.responses import FileResponse
 
+from stage_service.web.headers import PAGE
+
 STATIC = Path(__file__).with_name("static")
 FILES = {path.name: path for path in STATIC.iterdir() if path.is_file()}
 FOLDER = "/web/"
 PAGES = {"/": "index.html", "/docs": "docs.html", "/favicon.ico": "icon.svg"}
-HEADERS = {
-    "cache-control": "no-cache",
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
-        "img-src 'self' data: blob:; frame-src 'self'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'none'"
-    ),
-    "referrer-policy": "no-referrer",
-    "x-content-type-options": "nosniff",
-}
-"""A page takes nothing from another host, and no page of another host has it in a frame."""
-
 router = APIRouter(include_in_schema=False)
 
 
@@ -37,7 +27,7 @@ def get_file(name: str) -> FileResponse:
     if name not in FILES:
         raise HTTPException(404, f"the console has no file {name!r}")
     kind = "text/javascript" if name.endswith(".js") else mimetypes.guess_type(name)[0]
-    return FileResponse(FILES[name], media_type=kind, headers=HEADERS)
+    return FileResponse(FILES[name], media_type=kind, headers=PAGE)
 
 
 @router.get("/")

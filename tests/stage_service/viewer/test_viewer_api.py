@@ -73,7 +73,8 @@ def test_the_address_holds_whatever_name_a_model_has(tmp_path, monkeypatch, caps
 
 def test_the_page_asks_no_other_host(http):
     policy = http.get("/view").headers["content-security-policy"]
-    assert "default-src 'self'" in policy
+    assert "default-src 'none'" in policy
+    assert "connect-src 'self'" in policy
     assert "http" not in policy
 
 

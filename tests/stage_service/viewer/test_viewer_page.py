@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from waiting import until
 
 from appearance import Exposure, HairAppearance, render_olat
 from appearance.model.fitted_model import FittedModel
@@ -116,10 +118,16 @@ def model(tmp_path, request):
 
 @pytest.fixture
 def seen(url: str) -> Iterator[Seen]:
+    with visited(url, bypass_csp=True) as seen:  # waiting for an expression needs eval
+        yield seen
+
+
+@contextmanager
+def visited(url: str, **more: Any) -> Iterator[Seen]:
     arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with api.sync_playwright() as p:
         browser = p.chromium.launch(executable_path=CHROMIUM, args=arguments, timeout=PATIENCE_MS)
-        page = browser.new_page(viewport={"width": 900, "height": 500}, bypass_csp=True)
+        page = browser.new_page(viewport={"width": 900, "height": 500}, **more)
         seen = Seen(page)
         page.on("console", lambda m: seen.complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda e: seen.complaints.append(str(e)))
@@ -127,6 +135,15 @@ def seen(url: str) -> Iterator[Seen]:
         page.goto(f"{url}/view#model=bristles&token=the%20key", timeout=PATIENCE_MS)
         yield seen
         browser.close()
+
+
+def test_the_page_needs_nothing_that_its_policy_refuses(url):
+    with visited(url) as seen:
+        done = "Boolean(window.viewer?.complete && viewer.picture.ready() && viewer.picture.frames)"
+        until(lambda: seen.page.evaluate(done), pause=0.1)
+        assert (seen.picture()[..., 3] > 0).any()
+        seen.page.select_option("select >> nth=0", "length")
+        assert seen.complaints == []
 
 
 def test_strands_are_drawn_turn_and_take_another_colour(seen, url):
